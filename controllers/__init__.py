@@ -1,0 +1,1 @@
+"""Where to go and how to get there."""

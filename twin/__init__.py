@@ -1,0 +1,1 @@
+"""A simulation-first digital twin of an underwater stereo survey."""

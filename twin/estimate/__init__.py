@@ -1,0 +1,1 @@
+"""The method: motion, positioning, alignment and mapping from frames alone."""

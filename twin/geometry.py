@@ -1,0 +1,129 @@
+"""Rigid motions: the one home of every rotation, quaternion and axis convention.
+
+A pose is a 4x4 homogeneous matrix named ``world_from_camera``; inner names cancel in products. A small motion is a
+6-vector ``[rotation, translation]`` (rad, m), applied on the right: ``pose @ exp(motion)``: gtsam's order.
+
+World: x east, y north, z up. Body: x forward, y left, z up. Camera: x right, y down, z forward. Pixel (0, 0) is the
+centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+#: A camera that looks straight down with the top of its image towards the bow: columns are its axes in the body.
+BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+#: The same camera in MuJoCo's and OpenGL's axes (x right, y up, looks along -z).
+CV_FROM_GL: Array = np.diag([1.0, -1.0, -1.0])
+
+
+def skew(v: Array) -> Array:
+    """The matrix whose product with x is the cross product v x x. (3,) -> (3, 3)."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def pose(rotation: Array, position: Array) -> Array:
+    """A pose from a (3, 3) rotation and a (3,) position [m]."""
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = position
+    return result
+
+
+def inverse(a_from_b: Array) -> Array:
+    """b_from_a, exactly rigid. (4, 4) -> (4, 4)."""
+    rotation = a_from_b[:3, :3].T
+    return pose(rotation, -rotation @ a_from_b[:3, 3])
+
+
+def so3_exp(w: Array) -> Array:
+    """Rotation matrix of a rotation vector [rad], by the formula of Rodrigues, exact near identity. (3,) -> (3, 3)."""
+    angle2 = float(w @ w)
+    angle = np.sqrt(angle2)
+    if angle < 1e-4:
+        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    k = skew(w)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: Array) -> Array:
+    """Rotation vector [rad] of a rotation matrix, angle in [0, pi]. (3, 3) -> (3,)."""
+    return Rotation.from_matrix(rotation).as_rotvec()
+
+
+def _left_jacobian(w: Array) -> Array:
+    angle2 = float(w @ w)
+    angle = np.sqrt(angle2)
+    if angle < 1e-3:
+        a, b = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    else:
+        a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
+    k = skew(w)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def exp(motion: Array) -> Array:
+    """Pose reached by a twist [rotation, translation] (rad, m) held for unit time. (6,) -> (4, 4)."""
+    return pose(so3_exp(motion[:3]), _left_jacobian(motion[:3]) @ motion[3:])
+
+
+def log(a_from_b: Array) -> Array:
+    """Twist [rotation, translation] of a pose: the inverse of `exp`. (4, 4) -> (6,)."""
+    w = so3_log(a_from_b[:3, :3])
+    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), a_from_b[:3, 3])])
+
+
+def adjoint(a_from_b: Array) -> Array:
+    """The 6x6 matrix that carries a motion in b into a: a_from_b exp(m) = exp(Ad m) a_from_b."""
+    rotation = a_from_b[:3, :3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[3:, :3] = skew(a_from_b[:3, 3]) @ rotation
+    return result
+
+
+def transform(a_from_b: Array, points_b: Array) -> Array:
+    """Points (n, 3) of b in a."""
+    return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """world_from_body rotation: yaw about z, then pitch about y, then roll about x (rad, intrinsic z-y'-x'')."""
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+
+
+def rpy_from_rotation(rotation: Array) -> Array:
+    """[roll, pitch, yaw] (rad) of world_from_body: the inverse of `rotation_from_rpy`. (3, 3) -> (3,)."""
+    return Rotation.from_matrix(rotation).as_euler("ZYX")[::-1].copy()
+
+
+def wrap_angle(angle: Array | float) -> Array:
+    """The same angle in [-pi, pi) (rad)."""
+    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+
+
+def quaternion_wxyz(rotation: Array) -> Array:
+    """MuJoCo's quaternion [w, x, y, z] of a rotation matrix, w >= 0."""
+    return Rotation.from_matrix(rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+
+
+def rotation_from_wxyz(quaternion: Array) -> Array:
+    """Rotation matrix of MuJoCo's quaternion [w, x, y, z]."""
+    return Rotation.from_quat(np.asarray(quaternion)[[1, 2, 3, 0]]).as_matrix()
+
+
+def quaternion_xyzw(rotation: Array) -> Array:
+    """Rerun's and TUM's quaternion [x, y, z, w] of a rotation matrix, w >= 0."""
+    return Rotation.from_matrix(rotation).as_quat(canonical=True)
+
+
+def heading_of_camera(world_from_camera: Array) -> Array:
+    """Heading of the bow [rad, counter-clockwise from east] of down-looking cameras. (..., 4, 4) -> (...)."""
+    forward = -world_from_camera[..., :3, 1]  # the top of the image
+    return np.arctan2(forward[..., 1], forward[..., 0])

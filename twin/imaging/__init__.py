@@ -1,0 +1,1 @@
+"""From albedo and range to what the camera sees."""

@@ -1,0 +1,1 @@
+"""The estimate against the truth."""

@@ -1,0 +1,243 @@
+"""What passes between the rooms: frames (all an estimator may see), truth beside them, estimates, and their files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import geometry
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """The rig as its maker believes it: two equal rectified pinhole cameras, the right one at +x of the left.
+
+    Args:
+        width_px, height_px: image size.
+        focal_px: focal length; the principal point is the image centre ((width - 1) / 2, (height - 1) / 2).
+        baseline_m: distance between the cameras.
+        frame_rate_hz: frames per second.
+        body_from_camera: (4, 4) pose of the left camera in the vehicle's body.
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    baseline_m: float
+    frame_rate_hz: float
+    body_from_camera: Array
+
+    @property
+    def cx_px(self) -> float:
+        return (self.width_px - 1) / 2
+
+    @property
+    def cy_px(self) -> float:
+        return (self.height_px - 1) / 2
+
+    @property
+    def matrix(self) -> Array:
+        """(3, 3) camera matrix K of both eyes [px]."""
+        return np.array([[self.focal_px, 0, self.cx_px], [0, self.focal_px, self.cy_px], [0, 0, 1.0]])
+
+    @property
+    def left_from_right(self) -> Array:
+        """(4, 4) pose of the right camera in the left."""
+        return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations of the navigation sensors as their data sheets give them."""
+
+    pressure_m: float
+    attitude_rad: float
+    heading_rad: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What the navigation sensors said with this frame; None where a sensor is not fitted.
+
+    Args:
+        pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
+        ahrs_rpy_rad: (3,) roll, pitch, yaw of the body in the world [rad].
+    """
+
+    pressure_z_m: float | None = None
+    ahrs_rpy_rad: Array | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All that an estimator gets: time, images (height, width, 3) uint8 RGB, readings. The right image is there at key points."""
+
+    index: int
+    time_s: float
+    left: Image
+    right: Image | None
+    readings: Readings
+
+
+class Estimate(NamedTuple):
+    """Where the vehicle believes it is.
+
+    Args:
+        time_s: time of the frame.
+        world_from_camera: (4, 4) pose of the left camera, online.
+        f2f_from_start: (4, 4) pose of the left camera by frame-to-frame motion alone.
+        camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
+        sigma_m: one standard deviation of the online position, root of the summed variances [m].
+        status: "ok", or why vision failed in this frame.
+    """
+
+    time_s: float
+    world_from_camera: Array
+    f2f_from_start: Array
+    camera_velocity: Array
+    sigma_m: float
+    status: str
+
+
+@dataclass
+class Trajectory:
+    """Poses of the left camera over time: times (n,) [s], world_from_camera (n, 4, 4)."""
+
+    times_s: Array
+    world_from_camera: Array
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    @property
+    def positions(self) -> Array:
+        """(n, 3) [m]"""
+        return self.world_from_camera[:, :3, 3]
+
+    def save(self, path: Path) -> None:
+        """Writes TUM: time x y z qx qy qz qw, a line a pose."""
+        rows = [
+            " ".join(f"{v:.9g}" for v in [*pose[:3, 3], *geometry.quaternion_xyzw(pose[:3, :3])])
+            for pose in self.world_from_camera
+        ]
+        path.write_text("".join(f"{t:.6f} {row}\n" for t, row in zip(self.times_s, rows, strict=True)))
+
+    @staticmethod
+    def load(path: Path) -> Trajectory:
+        """Reads a TUM file that `save` or another tool wrote."""
+        rows = np.loadtxt(path, ndmin=2)
+        poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        for k, row in enumerate(rows):
+            poses[k] = geometry.pose(geometry.rotation_from_wxyz(row[[7, 4, 5, 6]]), row[1:4])
+        return Trajectory(rows[:, 0], poses)
+
+
+class Link(NamedTuple):
+    """One connection of the key-point network: the measured motion between two nodes.
+
+    Args:
+        i, j: key-point numbers, i < j.
+        i_from_j: (4, 4) pose of camera j in camera i.
+        cov: (6, 6) covariance of [rotation, translation] in j (rad, m).
+        overlap: share of image j that is seen in image i (0 to 1).
+        n_points: matched points used.
+    """
+
+    i: int
+    j: int
+    i_from_j: Array
+    cov: Array
+    overlap: float
+    n_points: int
+
+
+class Alignment(NamedTuple):
+    """One global alignment: which track closed it, its cost in time and size."""
+
+    track: int
+    ms: float
+    nodes: int
+    edges: int
+    dropped: int
+
+
+@dataclass
+class SurveyResult:
+    """What the estimators leave behind: the three trajectories, the network and the map.
+
+    ``key_frames`` are the rows of the trajectories that are key points; ``track_of_key`` the track (from 1) each belongs to.
+    ``node_cov`` (n_keys, 6, 6) is the marginal covariance of each final key-point pose, in the camera.
+    ``before_ga``/``after_ga`` hold per track the key-point poses (n, 4, 4) just before and after its alignment.
+    """
+
+    f2f: Trajectory
+    online: Trajectory
+    final: Trajectory
+    key_frames: NDArray[np.int64]
+    track_of_key: NDArray[np.int64]
+    node_cov: Array
+    links: list[Link] = field(default_factory=list)
+    alignments: list[Alignment] = field(default_factory=list)
+    before_ga: list[Array] = field(default_factory=list)
+    after_ga: list[Array] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """The cells of every map of a survey: row 0 = north, (west_m, north_m) the outer corner of cell (0, 0)."""
+
+    west_m: float
+    north_m: float
+    cell_m: float
+    rows: int
+    cols: int
+
+    def centres(self) -> tuple[Array, Array]:
+        """x (cols,) and y (rows,) of the cell centres [m]."""
+        return (
+            self.west_m + (np.arange(self.cols) + 0.5) * self.cell_m,
+            self.north_m - (np.arange(self.rows) + 0.5) * self.cell_m,
+        )
+
+
+@dataclass
+class ElevationMap:
+    """A digital elevation model with its uncertainty and orthophoto on a `MapGrid`; NaN (black) where nothing was seen.
+
+    Args:
+        height_m, sigma_m: (rows, cols) float32.
+        mosaic: (rows, cols, 3) uint8 RGB.
+    """
+
+    grid: MapGrid
+    height_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    mosaic: Image
+
+
+@dataclass
+class Truth:
+    """What only a simulator has; it meets the estimate in `judge` and nowhere else.
+
+    Args:
+        trajectory: true poses of the left camera, one a frame.
+        reference: (n_frames, 3) planned positions of the left camera [m].
+        holding: (n_frames,) bool, true while keeping station.
+        track: (n_frames,) number of the track, from 1.
+        height_m: (rows, cols) float32, true height at the cell centres of the survey's grid.
+        seen: (rows, cols) bool, cells that at least one key point truly saw with both eyes.
+    """
+
+    trajectory: Trajectory
+    reference: Array
+    holding: NDArray[np.bool_]
+    track: NDArray[np.int64]
+    height_m: NDArray[np.float32]
+    seen: NDArray[np.bool_]
