@@ -1,0 +1,24 @@
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/ready
+
+.PHONY: env demo test slow
+
+env: $(READY) ## set up: a virtual environment with exact versions
+
+$(READY): pyproject.toml constraints.txt .ci/system-packages
+	PYTHON="$(PYTHON)" .ci/system-packages
+	[ -x $(BIN)/python ] || "$(PYTHON)" -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	touch $@
+
+demo: env ## a small complete survey
+	$(BIN)/twin demo
+
+test: env ## style and the fast tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest
+
+slow: env ## whole surveys and benchmarks
+	$(BIN)/python -m pytest -m slow

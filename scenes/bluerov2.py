@@ -1,0 +1,77 @@
+"""BlueROV2 Heavy in numbers.
+
+Source: von Benzon et al. 2022, "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot",
+J. Mar. Sci. Eng. 10, 1898, Table A1. That paper's body axes are x forward, y right, z down; here they are x forward,
+y left, z up, about the centre of gravity, so that y and z change sign (the horizontal thrusters sit 0.085 m BELOW it).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def _array(*rows: object) -> Array:
+    values = np.array(rows, dtype=np.float64)
+    values.setflags(write=False)
+    return values
+
+
+def _thruster_positions_m() -> Array:
+    x, y, z = 0.156, 0.111, -0.085
+    fore, side = 0.12, 0.218
+    horizontal = [[x, -y, z], [x, y, z], [-x, -y, z], [-x, y, z]]
+    vertical = [[fore, -side, 0.0], [fore, side, 0.0], [-fore, -side, 0.0], [-fore, side, 0.0]]
+    return _array(*horizontal, *vertical)
+
+
+def _thruster_directions() -> Array:
+    c = np.sqrt(0.5)  # vectored at 45 deg, the front pair inwards, the rear pair outwards
+    horizontal = [[c, c, 0.0], [c, -c, 0.0], [c, -c, 0.0], [c, c, 0.0]]
+    return _array(*horizontal, *([[0.0, 0.0, 1.0]] * 4))
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A vehicle's rigid body, hydrodynamics and thrusters; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
+
+    Args:
+        mass_kg, displaced_volume_m3: dry mass, displaced water.
+        inertia_kgm2: (3,) principal moments about the centre of gravity, along the body axes.
+        centre_of_buoyancy_m: (3,) from the centre of gravity, in the body.
+        added_mass: (6,) diagonal of M_A [kg, kg m2].
+        linear_damping, quadratic_damping: (6,) diagonals of D(nu) = D_l + D_q |nu|.
+        thruster_positions_m, thruster_directions: (8, 3) in the body: four horizontal (front right, front left, rear
+            right, rear left), four vertical in the same order. Positive thrust pushes the vehicle along its direction.
+        thrust_coefficients: of u^9, u^7, u^5, u^3, u: thrust [N] of the T200 at command u in [-1, 1].
+        thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) of the transfer function from command to thrust.
+        size_m: (3,) length, width, height of the hull.
+    """
+
+    mass_kg: float = 13.5
+    displaced_volume_m3: float = 0.0134
+    inertia_kgm2: Array = field(default_factory=lambda: _array(0.26, 0.23, 0.37))
+    centre_of_buoyancy_m: Array = field(default_factory=lambda: _array(0.0, 0.0, 0.01))
+    added_mass: Array = field(default_factory=lambda: _array(6.36, 7.12, 18.68, 0.189, 0.135, 0.222))
+    linear_damping: Array = field(default_factory=lambda: _array(13.7, 0.0, 33.0, 0.0, 0.8, 0.0))
+    quadratic_damping: Array = field(default_factory=lambda: _array(141.0, 217.0, 190.0, 1.19, 0.47, 1.5))
+    thruster_positions_m: Array = field(default_factory=_thruster_positions_m)
+    thruster_directions: Array = field(default_factory=_thruster_directions)
+    thrust_coefficients: Array = field(default_factory=lambda: _array(-140.3, 389.9, -404.1, 176.0, 8.9))
+    thruster_lag: tuple[Array, Array] = field(
+        default_factory=lambda: (_array(6136.0, 108700.0), _array(1.0, 89.0, 9258.0, 108700.0))
+    )
+    size_m: Array = field(default_factory=lambda: _array(0.457, 0.575, 0.254))
+
+    @property
+    def allocation(self) -> Array:
+        """(6, 8) wrench [N, N m] about the centre of gravity per newton of each thruster."""
+        torque = np.cross(self.thruster_positions_m, self.thruster_directions)
+        return np.vstack([self.thruster_directions.T, torque.T])
+
+
+BLUEROV2_HEAVY = Vehicle()

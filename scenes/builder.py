@@ -1,0 +1,126 @@
+"""The world as a MuJoCo model: the floor, a free-floating BlueROV2, its cameras and lamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.bluerov2 import BLUEROV2_HEAVY, Vehicle
+from scenes.floor import add_floor
+from scenes.gl import mujoco
+from terrains import Terrain
+
+Array = NDArray[np.float64]
+VEHICLE_GROUP = 2  #: of geoms that the survey's cameras do not draw
+CAMERAS = ("left", "right")
+
+
+@dataclass(frozen=True)
+class World:
+    """A compiled model and where its parts are.
+
+    Args:
+        model: MuJoCo's model; mj_data is its user's.
+        terrain: the floor it was built from.
+        tile_geom_ids: (n,) geoms of the floor's tiles.
+        tile_low_m, tile_high_m: (n, 3) opposite corners of the tiles' boxes in the world.
+        body_id: the vehicle; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
+        camera_ids: left, right.
+        thruster_site_ids: (8,), in the order of the vehicle's allocation; a site's z axis is the direction of thrust.
+        lamp_site_ids: in the order given.
+    """
+
+    model: mujoco.MjModel
+    terrain: Terrain
+    tile_geom_ids: NDArray[np.int64]
+    tile_low_m: Array
+    tile_high_m: Array
+    body_id: int
+    camera_ids: tuple[int, int]
+    thruster_site_ids: NDArray[np.int64]
+    lamp_site_ids: NDArray[np.int64]
+
+
+def build(
+    terrain: Terrain,
+    image_width_px: int,
+    image_height_px: int,
+    vfov_deg: float,
+    baseline_m: float,
+    body_from_camera: Array,
+    timestep_s: float,
+    lamp_positions_m: Sequence[Sequence[float]] | Array = (),
+) -> World:
+    """Floor and vehicle as one model, with gravity; buoyancy, drag and thrust are the physics' part.
+
+    Args:
+        vfov_deg: vertical field of view of both cameras.
+        baseline_m: the right camera's distance at +x of the left.
+        body_from_camera: (4, 4) pose of the left camera in the body, x right, y down, z forward.
+        lamp_positions_m: (n, 3) in the body.
+    """
+    spec = _empty_model(image_width_px, image_height_px, timestep_s)
+    tiles = add_floor(spec, terrain)
+    body = _add_vehicle(spec, BLUEROV2_HEAVY)
+    _add_cameras(body, baseline_m, body_from_camera, vfov_deg)
+    for k, position in enumerate(lamp_positions_m):
+        body.add_site(name=f"lamp_{k}", pos=np.asarray(position, dtype=np.float64), group=VEHICLE_GROUP)
+    model = spec.compile()
+    return World(
+        model=model,
+        terrain=terrain,
+        tile_geom_ids=np.array([model.geom(tile.name).id for tile in tiles]),
+        tile_low_m=np.array([tile.low_m for tile in tiles]),
+        tile_high_m=np.array([tile.high_m for tile in tiles]),
+        body_id=model.body("vehicle").id,
+        camera_ids=(model.camera(CAMERAS[0]).id, model.camera(CAMERAS[1]).id),
+        thruster_site_ids=np.array([model.site(f"thruster_{k}").id for k in range(8)]),
+        lamp_site_ids=np.array([model.site(f"lamp_{k}").id for k in range(len(lamp_positions_m))], dtype=np.int64),
+    )
+
+
+def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = "seabed"
+    spec.option.timestep = timestep_s
+    spec.stat.extent = 1.0  # MuJoCo multiplies the clipping distances by it
+    spec.visual.headlight.active = 0
+    spec.visual.quality.offsamples = 0  # resolving samples would shift depth by a fraction of a pixel
+    spec.visual.quality.shadowsize = 0
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = image_width_px, image_height_px
+    return spec
+
+
+def _add_vehicle(spec: mujoco.MjSpec, vehicle: Vehicle) -> mujoco.MjsBody:
+    """The rigid body about its centre of gravity, with sites at its thrusters and a simple hull to look at."""
+    body = spec.worldbody.add_body(name="vehicle")
+    body.add_freejoint(name="vehicle")
+    body.explicitinertial = True
+    body.mass, body.ipos, body.inertia = vehicle.mass_kg, np.zeros(3), vehicle.inertia_kgm2
+    _add_hull(body, vehicle)
+    pairs = zip(vehicle.thruster_positions_m, vehicle.thruster_directions, strict=True)
+    for k, (position, direction) in enumerate(pairs):
+        site = body.add_site(name=f"thruster_{k}", pos=position, size=[0.04, 0.02, 0.02], group=VEHICLE_GROUP)
+        site.alt.zaxis = direction
+    return body
+
+
+def _add_hull(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
+    """Float and frame as two boxes, blue over black; massless, since the body's inertia is given."""
+    length, width, height = vehicle.size_m / 2
+    looks = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
+    body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **looks)
+    body.add_geom(name="frame", size=[length, width / 2, height / 2], pos=[0, 0, -0.03], rgba=[0.1] * 3 + [1], **looks)
+
+
+def _add_cameras(body: mujoco.MjsBody, baseline_m: float, body_from_camera: Array, vfov_deg: float) -> None:
+    """The stereo pair; MuJoCo's cameras have y up and look along -z."""
+    rotation = body_from_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
+    for name, offset_m in zip(CAMERAS, (0.0, baseline_m), strict=True):
+        position = body_from_camera[:3, 3] + offset_m * body_from_camera[:3, 0]
+        body.add_camera(name=name, pos=position, quat=quaternion, fovy=vfov_deg)

@@ -1,0 +1,122 @@
+"""The floor as drawn: a terrain cut into textured tiles, so that only what a camera sees need be drawn.
+
+A tile is a mesh and not a height field: MuJoCo draws it twice as fast (shared vertices), places its texture exactly
+(its own texture coordinates) and gives it no walls.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.gl import mujoco
+from terrains import Terrain
+
+TILE_CELLS = 48  #: measured: smaller tiles cost state changes, larger ones vertices that no camera sees
+MAX_TILES = 900  #: MuJoCo draws at most 1000 textures
+MARGIN_TEXELS = 16  #: of neighbouring texture around each tile: enough for filtering 4 mip-map levels down
+FLOOR_GROUP = 0
+
+
+class Tile(NamedTuple):
+    """One piece of the floor: its name and its corners low, high (3,) in the world [m]."""
+
+    name: str
+    low_m: NDArray[np.float64]
+    high_m: NDArray[np.float64]
+
+
+def add_floor(spec: mujoco.MjSpec, terrain: Terrain) -> list[Tile]:
+    """Adds the terrain to the model's world as fixed, glowing tiles without contact."""
+    ny, nx = terrain.height_m.shape
+    cells = tile_cells(ny - 1, nx - 1)
+    tiles = []
+    for r0 in range(0, ny - 1, cells):
+        for c0 in range(0, nx - 1, cells):
+            rows, cols = slice(r0, min(r0 + cells, ny - 1) + 1), slice(c0, min(c0 + cells, nx - 1) + 1)
+            tiles.append(_add_tile(spec, terrain, rows, cols))
+    return tiles
+
+
+def tile_cells(n_rows: int, n_cols: int) -> int:
+    """Cells along a tile's side: the usual number, or as many more as keep the number of tiles down."""
+    cells = TILE_CELLS
+    while -(-n_rows // cells) * -(-n_cols // cells) > MAX_TILES:
+        cells += 16
+    return cells
+
+
+def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
+    name = f"floor_{rows.start}_{cols.start}"
+    texture, texcoord = _tile_texture(terrain, rows, cols)
+    image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
+    image.height, image.width = texture.shape[:2]
+    image.data = texture.tobytes()
+    # emission alone: with no light in the scene the drawn colour is the texture's
+    material = spec.add_material(name=name, emission=1.0, specular=0.0, shininess=0.0, reflectance=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    vertices = _add_mesh(spec, name, terrain, rows, cols, texcoord)
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=name,
+        group=FLOOR_GROUP,
+        contype=0,
+        conaffinity=0,
+    )
+    return Tile(name, vertices.min(axis=0), vertices.max(axis=0))
+
+
+def _add_mesh(
+    spec: mujoco.MjSpec, name: str, terrain: Terrain, rows: slice, cols: slice, texcoord: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Adds a tile's triangles, two a cell along (r, c)-(r + 1, c + 1); returns its vertices (n, 3) in the world [m]."""
+    heights = terrain.height_m[rows, cols]
+    x_m = terrain.west_m + terrain.spacing_m * np.arange(cols.start, cols.stop)
+    y_m = terrain.south_m + terrain.spacing_m * np.arange(rows.start, rows.stop)
+    grid_x, grid_y = np.meshgrid(x_m, y_m)
+    vertices = np.stack([grid_x, grid_y, heights], axis=-1).reshape(-1, 3).astype(np.float64)
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert = vertices.ravel()
+    mesh.userface = _faces(*heights.shape).ravel()
+    mesh.usertexcoord = texcoord.ravel()
+    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit: one normal lets the driver share vertices
+    return vertices
+
+
+def _faces(n_rows: int, n_cols: int) -> NDArray[np.int32]:
+    """(2 * cells, 3) vertex numbers, counter-clockwise from above."""
+    node = np.arange(n_rows * n_cols, dtype=np.int32).reshape(n_rows, n_cols)
+    sw, se, ne, nw = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
+    return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
+
+
+def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """A tile's cut of the texture with margins, and where each node lies on it.
+
+    The margins belong to the neighbours: filtering reads the same texels on both sides of a border, so none shows. The
+    cut starts and ends at multiples of 16 texels, which keeps the mip-map levels aligned from tile to tile as well.
+
+    Returns:
+        (h, w, 3) uint8; (nodes, 2) texture coordinates, 0 to 1, from the cut's north-west corner.
+    """
+    ny, nx = terrain.height_m.shape
+    h, w = terrain.texture.shape[:2]
+    across = np.arange(cols.start, cols.stop) * (w / (nx - 1))
+    down = (ny - 1 - np.arange(rows.start, rows.stop)) * (h / (ny - 1))  # texture rows run south
+    left, right = _aligned(across[0], across[-1])
+    top, bottom = _aligned(down[-1], down[0])
+    inner = terrain.texture[max(top, 0) : min(bottom, h), max(left, 0) : min(right, w)]
+    borders = (max(-top, 0), max(bottom - h, 0), max(-left, 0), max(right - w, 0))
+    texture = cv2.copyMakeBorder(inner, *borders, cv2.BORDER_REPLICATE) if any(borders) else inner
+    u, v = np.meshgrid((across - left) / (right - left), (down - top) / (bottom - top))
+    return np.ascontiguousarray(texture, dtype=np.uint8), np.stack([u, v], axis=-1).reshape(-1, 2)
+
+
+def _aligned(low: float, high: float) -> tuple[int, int]:
+    step = MARGIN_TEXELS
+    return int(np.floor(low / step) - 1) * step, int(np.ceil(high / step) + 1) * step

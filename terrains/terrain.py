@@ -1,0 +1,97 @@
+"""The sea floor as numbers: a grid of heights, joined by triangles, under a texture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+#: What fits into memory on an ordinary machine: the drawn model needs about 400 bytes a node and 9 bytes a texel.
+MAX_NODES = 6_000_000
+MAX_TEXELS = 250_000_000
+
+
+class TerrainFault(ValueError):  # noqa: N818 (a fault, as in the scenario's)
+    """A floor that cannot be had: the scenario key, what is wrong, what would be right."""
+
+    def __init__(self, field: str, problem: str, allowed: str = ""):
+        self.field, self.problem, self.allowed = field, problem, allowed
+        super().__init__(f"{field}: {problem}" + (f" (allowed: {allowed})" if allowed else ""))
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A floor over the rectangle from (west_m, south_m), x east, y north, z up [m].
+
+    Args:
+        height_m: (ny, nx) float32 heights of the nodes; row 0 = SOUTH, column 0 = west; outer nodes on the edge.
+        spacing_m: distance of neighbouring nodes along x and y.
+        west_m, south_m: position of node (0, 0).
+        texture: (h, w, 3) uint8 RGB albedo over exactly the extent; row 0 = NORTH.
+        texture_px_m: size of a texel.
+        n_filled: nodes that had no height and were filled.
+    """
+
+    height_m: NDArray[np.float32]
+    spacing_m: float
+    west_m: float
+    south_m: float
+    texture: NDArray[np.uint8]
+    texture_px_m: float
+    n_filled: int = 0
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Extent along x and y [m]."""
+        ny, nx = self.height_m.shape
+        return (nx - 1) * self.spacing_m, (ny - 1) * self.spacing_m
+
+    @property
+    def east_m(self) -> float:
+        return self.west_m + self.size_m[0]
+
+    @property
+    def north_m(self) -> float:
+        return self.south_m + self.size_m[1]
+
+    @property
+    def lowest_m(self) -> float:
+        return float(self.height_m.min())
+
+    @property
+    def highest_m(self) -> float:
+        return float(self.height_m.max())
+
+    def height_at(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
+        """Height [m] of the floor at (x, y) of any, equal shape; NaN outside.
+
+        Linear on the two triangles of each cell, split along its diagonal from node (r, c) to (r + 1, c + 1): the very
+        surface that is drawn and that rays meet.
+        """
+        ny, nx = self.height_m.shape
+        col = (np.asarray(x_m, dtype=np.float64) - self.west_m) / self.spacing_m
+        row = (np.asarray(y_m, dtype=np.float64) - self.south_m) / self.spacing_m
+        inside = (col >= 0) & (col <= nx - 1) & (row >= 0) & (row <= ny - 1)
+        c = np.clip(np.nan_to_num(col), 0, nx - 2).astype(np.int64)
+        r = np.clip(np.nan_to_num(row), 0, ny - 2).astype(np.int64)
+        u, v = col - c, row - r
+        h00, h01, h10, h11 = (self.height_m[r + i, c + j].astype(np.float64) for i in (0, 1) for j in (0, 1))
+        south_east = h00 + u * (h01 - h00) + v * (h11 - h01)
+        north_west = h00 + v * (h10 - h00) + u * (h11 - h10)
+        return np.where(inside, np.where(u >= v, south_east, north_west), np.nan)
+
+
+def texture_shape(height_shape: tuple[int, ...], spacing_m: float, texture_px_m: float) -> tuple[int, int]:
+    """Rows and columns of a texture over all the cells of a height grid; at least 2 by 2.
+
+    Raises:
+        TerrainFault: more nodes or texels than memory holds.
+    """
+    ny, nx = height_shape
+    if nx * ny > MAX_NODES:
+        raise TerrainFault("terrain.grid_m", f"{nx} x {ny} height nodes", f"at most {MAX_NODES} nodes")
+    rows, cols = (max(2, round((n - 1) * spacing_m / texture_px_m)) for n in (ny, nx))
+    if rows * cols > MAX_TEXELS:
+        raise TerrainFault("terrain.texture_px_m", f"{cols} x {rows} texels", f"at most {MAX_TEXELS} texels")
+    return rows, cols

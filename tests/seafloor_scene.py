@@ -1,0 +1,156 @@
+"""A small ray-caster of height fields: truth for the tests of `twin.estimate` that needs no GL and shares no code with it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+
+from twin import geometry
+from twin.records import StereoRig
+
+
+class Seafloor(NamedTuple):
+    """Heights at nodes [m] (row 0 = south, col 0 = west), bilinear between them, under a tiled grey texture."""
+
+    height_m: np.ndarray
+    spacing_m: float
+    west_m: float
+    south_m: float
+    texture: np.ndarray
+    texture_px_m: float
+
+    def height_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """True height of points of any (equal) shape [m]."""
+        shape = np.broadcast(x_m, y_m).shape
+        x, y = np.broadcast_to(x_m, shape).ravel(), np.broadcast_to(y_m, shape).ravel()
+        return _heights(self.height_m, self.spacing_m, self.west_m, self.south_m, x, y).reshape(shape)
+
+
+def smooth_texture(seed: int, size_px: int = 512, blur_px: float = 1.6) -> np.ndarray:
+    """A tileable random texture, grey level 127, standard deviation 40."""
+    noise = np.random.default_rng(seed).normal(size=(size_px, size_px))
+    soft = cv2.GaussianBlur(np.tile(noise, (3, 3)), (0, 0), blur_px)[size_px : 2 * size_px, size_px : 2 * size_px]
+    return np.clip(127 + 40 * soft / soft.std(), 0, 255).astype(np.float32)
+
+
+def plane(slope_x: float = 0.0, slope_y: float = 0.0, texture_px_m: float = 0.006, seed: int = 0) -> Seafloor:
+    """The floor z = slope_x x + slope_y y, 16 m x 16 m."""
+    nodes = np.linspace(-8, 8, 33)
+    height = slope_x * nodes[None, :] + slope_y * nodes[:, None]
+    return Seafloor(height, 0.5, -8.0, -8.0, smooth_texture(seed), texture_px_m)
+
+
+def down_camera(x_m: float, y_m: float, z_m: float, rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """world_from_camera of a down-looking camera at a position, its body turned by roll, pitch, yaw."""
+    return geometry.pose(
+        geometry.rotation_from_rpy(*rpy_rad) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([x_m, y_m, z_m])
+    )
+
+
+def small_rig(width_px: int = 320, height_px: int = 240, hfov_deg: float = 60.0, baseline_m: float = 0.15) -> StereoRig:
+    """The rig of the reef survey, or one like it."""
+    focal_px = width_px / 2 / np.tan(np.deg2rad(hfov_deg / 2))
+    return StereoRig(width_px, height_px, focal_px, baseline_m, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
+
+
+def look(floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Grey image (H, W) float32, area-sampled, and true depth (H, W) [m] at pixel centres of one camera."""
+    pose = np.ascontiguousarray(world_from_camera)
+    args = (
+        np.ascontiguousarray(floor.height_m, dtype=np.float64),
+        floor.spacing_m,
+        floor.west_m,
+        floor.south_m,
+        floor.texture,
+        floor.texture_px_m,
+        pose[:3, :3].copy(),
+        pose[:3, 3].copy(),
+        rig.focal_px,
+        rig.width_px,
+        rig.height_px,
+    )
+    image = _cast(*args, samples)[0]
+    return image, _cast(*args, 1)[1]
+
+
+def stereo_pair(
+    floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, rng: np.random.Generator, noise: float = 2.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Left and right grey uint8 with noise [grey levels], and the left camera's true depth [m]."""
+    left, depth = look(floor, rig, world_from_camera)
+    right, _ = look(floor, rig, world_from_camera @ rig.left_from_right)
+    return digitise(left, rng, noise), digitise(right, rng, noise), depth
+
+
+def digitise(image: np.ndarray, rng: np.random.Generator, noise: float) -> np.ndarray:
+    """What a sensor of that noise [grey levels] makes of an image."""
+    return np.clip(np.round(image + rng.normal(size=image.shape) * noise), 0, 255).astype(np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def _height(z, spacing, west, south, x, y):
+    c = min(max((x - west) / spacing, 0.0), z.shape[1] - 1.000001)
+    r = min(max((y - south) / spacing, 0.0), z.shape[0] - 1.000001)
+    i, j = int(r), int(c)
+    a, b = r - i, c - j
+    return (1 - a) * ((1 - b) * z[i, j] + b * z[i, j + 1]) + a * ((1 - b) * z[i + 1, j] + b * z[i + 1, j + 1])
+
+
+@njit(cache=True, nogil=True)
+def _heights(z, spacing, west, south, x, y):
+    out = np.empty(x.size)
+    for n in range(x.size):
+        out[n] = _height(z, spacing, west, south, x[n], y[n])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _colour(texture, px, x, y):
+    n, m = texture.shape
+    c, r = x / px, y / px
+    j, i = int(np.floor(c)), int(np.floor(r))
+    a, b = r - i, c - j
+    i0, i1, j0, j1 = i % n, (i + 1) % n, j % m, (j + 1) % m
+    return (1 - a) * ((1 - b) * texture[i0, j0] + b * texture[i0, j1]) + a * (
+        (1 - b) * texture[i1, j0] + b * texture[i1, j1]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _cast(z, spacing, west, south, texture, px, rotation, position, focal, width, height, samples):
+    image = np.zeros((height, width), np.float32)
+    depth = np.full((height, width), np.nan)
+    top = z.max() + 1e-6
+    bottom = z.min() - 1.0
+    for v in range(height):
+        for u in range(width):
+            for s in range(samples * samples):
+                du = (s % samples + 0.5) / samples - 0.5
+                dv = (s // samples + 0.5) / samples - 0.5
+                rx, ry = (u + du - (width - 1) / 2) / focal, (v + dv - (height - 1) / 2) / focal
+                dx = rotation[0, 0] * rx + rotation[0, 1] * ry + rotation[0, 2]
+                dy = rotation[1, 0] * rx + rotation[1, 1] * ry + rotation[1, 2]
+                dz = rotation[2, 0] * rx + rotation[2, 1] * ry + rotation[2, 2]
+                near = max((position[2] - top) / -dz, 0.0)
+                step = 0.4 * spacing / max(abs(dx), abs(dy), 0.4 * abs(dz))
+                t = near
+                while True:
+                    x, y, h = position[0] + t * dx, position[1] + t * dy, position[2] + t * dz
+                    if h <= _height(z, spacing, west, south, x, y) or h < bottom:
+                        break
+                    t += step
+                low, high = max(t - step, 0.0), t
+                for _ in range(26):
+                    mid = 0.5 * (low + high)
+                    x, y, h = position[0] + mid * dx, position[1] + mid * dy, position[2] + mid * dz
+                    if h <= _height(z, spacing, west, south, x, y):
+                        high = mid
+                    else:
+                        low = mid
+                image[v, u] += _colour(texture, px, x, y) / (samples * samples)
+                if samples == 1:
+                    depth[v, u] = high
+    return image, depth

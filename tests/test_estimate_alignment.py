@@ -1,0 +1,116 @@
+"""Global alignment against eq. (7) solved directly with Lagrange multipliers, and what it does with wrong links."""
+
+import numpy as np
+
+from twin import geometry
+from twin.estimate.alignment import align
+from twin.estimate.key_points import KeyPoint
+from twin.records import Link, Readings, SensorNoise, StereoRig
+
+RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
+NOISE = SensorNoise(0.01, 0.003, 0.01)
+ANCHOR = {0: np.eye(6) * 1e-16}
+
+
+def small_network(rng, n=6, share_of_sigma=0.3):
+    """A loop of nodes with chords; residuals small enough that no robust weight departs from 1."""
+    poses = [geometry.exp(np.array([0.05 * k, -0.1 * k, 0.2 * k, 0.5 * k, 0.1 * k * k, 0.02 * k])) for k in range(n)]
+    pairs = [(k, k + 1) for k in range(n - 1)] + [(0, 3), (1, 4), (2, 5), (0, 5)]
+    links = []
+    for i, j in pairs:
+        root = rng.normal(size=(6, 6)) * 2e-3
+        cov = root @ root.T + np.diag([1e-6] * 6)
+        error = np.linalg.cholesky(cov) @ rng.normal(size=6) * share_of_sigma
+        links.append(Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error), cov, 1.0, 100))
+    return poses, links
+
+
+def key_points(poses, readings=None):
+    readings = readings or [Readings()] * len(poses)
+    return [KeyPoint(k, k, 1, pose.copy(), None, r) for k, (pose, r) in enumerate(zip(poses, readings, strict=True))]
+
+
+def numeric(function, at, step=1e-6):
+    return np.column_stack([(function(at + d) - function(at - d)) / (2 * step) for d in np.eye(len(at)) * step])
+
+
+def mixed_adjustment(start, links, iterations=6):
+    """Minimises eq. (7) by its bordered system, first pose held: poses and the covariance of nodes 1 to n - 1."""
+    poses, motions = [p.copy() for p in start], [link.i_from_j.copy() for link in links]
+    n, m = 6 * (len(poses) - 1), 6 * len(links)
+    c_inverse = np.zeros((m, m))
+    for k, link in enumerate(links):
+        c_inverse[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = np.linalg.inv(link.cov)
+
+    def constraint(x, v):
+        moved = [poses[0]] + [p @ geometry.exp(x[6 * k : 6 * k + 6]) for k, p in enumerate(poses[1:])]
+        rows = []
+        for k, link in enumerate(links):
+            motion = motions[k] @ geometry.exp(v[6 * k : 6 * k + 6])
+            rows.append(geometry.log(geometry.inverse(motion) @ geometry.inverse(moved[link.i]) @ moved[link.j]))
+        return np.concatenate(rows)
+
+    for _ in range(iterations):
+        a = numeric(lambda x: constraint(x, np.zeros(m)), np.zeros(n))
+        b = numeric(lambda v: constraint(np.zeros(n), v), np.zeros(m))
+        residual = np.concatenate(
+            [geometry.log(geometry.inverse(link.i_from_j) @ motion) for link, motion in zip(links, motions, strict=True)]
+        )
+        w = constraint(np.zeros(n), np.zeros(m))
+        system = np.block(
+            [[np.zeros((n, n)), np.zeros((n, m)), a.T], [np.zeros((m, n)), c_inverse, b.T], [a, b, np.zeros((m, m))]]
+        )
+        right = np.concatenate([np.zeros(n), -c_inverse @ residual, -w])
+        solution = np.linalg.solve(system, right)
+        poses = [poses[0]] + [p @ geometry.exp(solution[6 * k : 6 * k + 6]) for k, p in enumerate(poses[1:])]
+        motions = [q @ geometry.exp(solution[n + 6 * k : n + 6 * k + 6]) for k, q in enumerate(motions)]
+    inner = np.linalg.inv(b @ np.linalg.inv(c_inverse) @ b.T)
+    return np.array(poses), np.linalg.inv(a.T @ inner @ a)
+
+
+def test_alignment_agrees_with_eq_7_solved_with_lagrange_multipliers():
+    rng = np.random.default_rng(0)
+    poses, links = small_network(rng)
+    start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 0.02) for p in poses[1:]]
+    direct, cov = mixed_adjustment(start, links)
+    aligned = align(key_points(start), links, ANCHOR, RIG, NOISE)
+    np.testing.assert_allclose(aligned.poses, direct, atol=2e-6)
+    for k in range(1, len(poses)):
+        block = cov[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k]
+        np.testing.assert_allclose(aligned.covs[k], block, atol=0.02 * np.abs(block).max())
+
+
+def test_exact_links_return_the_true_poses():
+    poses, links = small_network(np.random.default_rng(1), share_of_sigma=0.0)
+    start = [poses[0]] + [p @ geometry.exp(np.full(6, 0.05)) for p in poses[1:]]
+    aligned = align(key_points(start), links, ANCHOR, RIG, NOISE)
+    np.testing.assert_allclose(aligned.poses, poses, atol=1e-6)
+    assert not aligned.dropped
+
+
+def test_a_wrong_link_is_dropped_and_told():
+    poses, links = small_network(np.random.default_rng(2))
+    wrong = links[6]._replace(i_from_j=links[6].i_from_j @ geometry.exp(np.array([0, 0, 0.2, 0.5, 0, 0])))
+    aligned = align(key_points(poses), links[:6] + [wrong] + links[7:], ANCHOR, RIG, NOISE)
+    assert [(link.i, link.j) for link in aligned.dropped] == [(wrong.i, wrong.j)]
+    np.testing.assert_allclose(aligned.poses, align(key_points(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5)
+
+
+def test_pressure_and_attitude_bound_what_links_alone_cannot():
+    """A chain of 40 links whose bias bends it by 2 mrad a step; the readings hold height and attitude."""
+    n = 40
+    step = geometry.exp(np.array([0, 0, 0, 0, -0.3, 0.0]))
+    start_pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    true = [start_pose]
+    for _ in range(n - 1):
+        true.append(true[-1] @ step)
+    bias = geometry.exp(np.array([0.002, 0, 0, 0, 0, 0]))
+    cov = np.diag([0.002**2] * 3 + [0.001**2] * 3)
+    links = [Link(k, k + 1, step @ bias, cov, 1.0, 100) for k in range(n - 1)]
+    free = align(key_points(true), links, ANCHOR, RIG, NOISE).poses[-1]
+    level = Readings(2.0, np.zeros(3))
+    held = align(key_points(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
+    assert abs(free[2, 3] - 2.0) > 0.3
+    assert abs(held[2, 3] - 2.0) < 0.01
+
+

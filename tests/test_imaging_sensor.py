@@ -1,0 +1,92 @@
+"""The sensor: noise by its line, exposure with its lag, streams that do not mix."""
+
+import numpy as np
+import pytest
+
+from twin.config import Imaging, Scenario
+from twin.imaging.camera import StereoCamera
+from twin.imaging.sensor import Exposure, expose
+from twin.timing import Stopwatch
+
+
+def test_variance_of_noise_grows_in_a_line_with_the_signal():
+    imaging = Imaging(noise_sd=0.02, shot_noise=0.05)
+    for signal in (0.2, 0.4, 0.7):
+        light = np.full((300, 400, 3), signal * 50, np.float32)
+        image = expose(light, 1 / 50, imaging, np.random.default_rng(3)) / 255
+        expected = 0.02**2 + 0.05**2 * signal + 1 / 12 / 255**2  # rounding to 8 bits
+        # 360,000 draws: one sigma of a variance is 0.24 %
+        assert image.var() == pytest.approx(expected, rel=0.01)
+        assert image.mean() == pytest.approx(signal, abs=4 * np.sqrt(expected / image.size))
+
+
+def test_noise_is_normal_and_white():
+    imaging = Imaging(noise_sd=0.1, shot_noise=0.0)
+    image = expose(np.full((300, 400, 3), 0.5, np.float32), 1.0, imaging, np.random.default_rng(4)) / 255 - 0.5
+    z = image.ravel() / image.std()
+    assert np.mean(z**4) == pytest.approx(3.0, abs=0.05)  # 360,000 draws: sigma 0.016
+    assert abs(np.mean(z[1:] * z[:-1])) < 0.01 and abs(np.mean(image[1:] * image[:-1]) / image.var()) < 0.01
+
+
+def test_light_saturates_and_never_wraps():
+    imaging = Imaging(noise_sd=0.3)
+    light = np.linspace(0, 5, 3000, dtype=np.float32).reshape(-1, 10, 3)
+    image = expose(light, 1.0, imaging, np.random.default_rng(0))
+    assert (image[-30:] == 255).all() and image[0].min() < 80
+
+
+def test_the_same_stream_gives_the_same_image():
+    light = np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32)
+    a, b, c = (expose(light, 1.0, Imaging(), np.random.default_rng(k)) for k in (1, 1, 2))
+    assert (a == b).all() and (a != c).any()
+
+
+def test_exposure_meters_the_first_frame_then_follows_by_its_lag():
+    exposure = Exposure(0.45, frame_rate_hz=30.0)
+    dim, bright = (np.full((4, 4, 3), x, np.float32) for x in (10.0, 40.0))
+    assert exposure.gain(dim) == pytest.approx(0.045)
+    assert exposure.gain(bright) == pytest.approx(0.045)  # the change is seen in the next frames only
+    gains = [exposure.gain(bright) for _ in range(15)]
+    assert all(a > b for a, b in zip(gains, gains[1:], strict=False))
+    # after the lag of 0.5 s (15 frames) 1/e of the change is left, on the scale of stops
+    assert np.log(gains[-1] / 0.01125) / np.log(4) == pytest.approx(np.exp(-1), abs=1e-6)
+
+
+def test_exposure_goes_by_the_brightest_channel():
+    green = np.zeros((4, 4, 3), np.float32)
+    green[..., 1] = 10.0
+    assert Exposure(0.45, 30.0).gain(green) == pytest.approx(0.045)
+
+
+class FlatFloor:
+    """A renderer of a plane two metres away."""
+
+    def render(self, world_from_camera):
+        rng = np.random.default_rng(int(1000 * world_from_camera[0, 3]))
+        return rng.integers(50, 200, (48, 64, 3), dtype=np.uint8), np.full((48, 64), 2.0, np.float32)
+
+
+def shots(stereo):
+    scenario = Scenario.model_validate(
+        {
+            "rig": {"image_width_px": 64, "image_height_px": 48},
+            "lamps": [{"position_m": (0.2, 0.3, 0.0)}],
+        }
+    )
+    left, right = np.random.default_rng(7).spawn(2)
+    camera = StereoCamera(FlatFloor(), scenario, left, right, Stopwatch())
+    poses = [np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3) for k in range(5)]
+    return [camera.shoot(pose, flag) for pose, flag in zip(poses, stereo, strict=True)]
+
+
+def test_left_images_do_not_depend_on_when_the_right_eye_is_used():
+    alone, both, some = shots([False] * 5), shots([True] * 5), shots([True, False, False, True, False])
+    for a, b, c in zip(alone, both, some, strict=True):
+        assert a.right is None and a.depth_right is None and b.right is not None
+        np.testing.assert_array_equal(a.left, b.left)
+        np.testing.assert_array_equal(a.left, c.left)
+
+
+def test_the_right_eye_has_noise_and_place_of_its_own():
+    shot = shots([True] * 5)[0]
+    assert shot.right.shape == shot.left.shape and (shot.right != shot.left).mean() > 0.5

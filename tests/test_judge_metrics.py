@@ -1,0 +1,212 @@
+"""Map, consistency, control, overlap, requirements: closed forms, statistics, and surveys that broke off."""
+
+import copy
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from judge_synthetic import SCENARIO, evaluated, survey
+
+from twin import geometry
+from twin.errors import TwinError
+from twin.judge.consistency import consistency_metrics, nees
+from twin.judge.control import control_metrics
+from twin.judge.map_error import map_metrics
+from twin.judge.metrics import check_require, evaluate, unflown
+from twin.judge.overlap import overlap_metrics
+from twin.judge.path import leg_numbers, travel_direction
+from twin.judge.require import more_is_better, number_paths
+from twin.records import ElevationMap, MapGrid, Trajectory, Truth
+
+RESULT, ELEVATION, TRUTH, RIG = survey()
+
+
+def map_of(error: np.ndarray, sigma: float = 1.0) -> tuple[ElevationMap, Truth]:
+    """A map with the given errors over a flat truth that is seen everywhere."""
+    grid = MapGrid(0, 0, 0.1, *error.shape)
+    flat = np.full(error.shape, 2.0, np.float32)
+    height = (flat + error).astype(np.float32)
+    mosaic = np.zeros((*error.shape, 3), np.uint8)
+    truth = dataclasses.replace(TRUTH, height_m=flat, seen=np.ones(error.shape, bool))
+    return ElevationMap(grid, height, np.full(error.shape, sigma, np.float32), mosaic), truth
+
+
+def test_percentiles_of_uniform_errors_have_their_closed_form():
+    error = np.linspace(-1, 1, 100_001).reshape(1, -1)  # |e| is uniform on 0 to 1
+    figures = map_metrics(*map_of(error))
+    expected = dict(p85_m=0.85, le90_m=0.90, le95_m=0.95, max_m=1, rmse_m=1 / np.sqrt(3), nmad_m=1.4826 / 2, bias_m=0)
+    for key, value in expected.items():
+        assert figures[key] == pytest.approx(value, abs=2e-5), key
+
+
+def test_nmad_forgives_a_bias_and_rmse_does_not():
+    error = np.random.default_rng(0).normal(0, 0.02, (300, 300))
+    plain, shifted = map_metrics(*map_of(error)), map_metrics(*map_of(error + 0.5))
+    assert shifted["nmad_m"] == pytest.approx(plain["nmad_m"], rel=1e-4)
+    assert plain["nmad_m"] == pytest.approx(0.02, rel=0.02)  # 90,000 draws: 0.4 % standard error
+    assert shifted["rmse_m"] == pytest.approx(np.hypot(0.5, 0.02), rel=1e-3)
+    assert shifted["bias_m"] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_sigma_ratio_is_one_where_sigma_tells_the_truth_and_scales_with_it():
+    error = np.random.default_rng(1).normal(0, 0.02, (300, 300))
+    assert map_metrics(*map_of(error, sigma=0.02))["sigma_ratio"] == pytest.approx(1, rel=0.02)
+    assert map_metrics(*map_of(error, sigma=0.01))["sigma_ratio"] == pytest.approx(2, rel=0.02)
+
+
+def test_completeness_counts_seen_cells_with_an_estimate_and_nothing_else():
+    error = np.zeros((10, 10))
+    error[0, :7] = np.nan
+    elevation, truth = map_of(error)
+    truth.seen[5:] = False
+    elevation.height_m[9] = 99.0  # an estimate where nothing was seen: not judged
+    figures = map_metrics(elevation, truth)
+    assert figures["completeness"] == pytest.approx((50 - 7) / 50)
+    assert figures["max_m"] == 0
+
+
+def test_nees_of_errors_drawn_from_their_covariance_is_three():
+    rng = np.random.default_rng(2)
+    root = rng.normal(0, 1, (20_000, 3, 3))
+    error = np.einsum("nij,nj->ni", root, rng.normal(0, 1, (20_000, 3)))
+    values = nees(error, root @ root.transpose(0, 2, 1))
+    assert values.mean() == pytest.approx(3, abs=5 * np.sqrt(6 / 20_000))  # chi2 with 3 degrees: variance 6
+
+
+def gaussian_final(seed: int, spread: np.ndarray):
+    """The survey with final key points displaced in camera axes by normal errors, and the covariance that says so."""
+    rng = np.random.default_rng(seed)
+    poses = TRUTH.trajectory.world_from_camera.copy()
+    for frame in RESULT.key_frames[1:]:
+        poses[frame] = poses[frame] @ geometry.pose(np.eye(3), rng.normal(0, spread))
+    result = copy.copy(RESULT)
+    result.final = Trajectory(TRUTH.trajectory.times_s, poses)
+    cov = np.diag(np.concatenate([[1e-6] * 3, spread**2]))
+    result.node_cov = np.tile(cov, (len(RESULT.key_frames), 1, 1))
+    return result
+
+
+def test_key_point_consistency_is_judged_in_camera_axes_without_the_anchored_one():
+    spread = np.array([0.001, 0.03, 0.2])  # so unequal that wrong axes would show
+    figures = [consistency_metrics(gaussian_final(k, spread), None, TRUTH) for k in range(8)]
+    n = 8 * (len(RESULT.key_frames) - 1)
+    assert np.mean([f["nees_position_mean"] for f in figures]) == pytest.approx(3, abs=4 * np.sqrt(6 / n))
+    share = np.mean([f["within_2sigma_position"] for f in figures])
+    assert share == pytest.approx(0.9545, abs=4 * np.sqrt(0.9545 * 0.0455 / (3 * n)))
+    assert figures[0]["within_2sigma_map"] is None
+
+
+def test_key_points_without_a_covariance_are_left_out_of_consistency():
+    result = gaussian_final(0, np.array([0.01, 0.01, 0.01]))
+    result.node_cov = result.node_cov.copy()
+    result.node_cov[2::2] = np.nan
+    assert consistency_metrics(result, None, TRUTH)["nees_position_mean"] == pytest.approx(3, abs=1.6)
+    result.node_cov[:] = 0
+    assert consistency_metrics(result, None, TRUTH)["nees_position_mean"] is None
+
+
+def test_control_errors_are_taken_across_the_direction_of_travel():
+    diagonal = np.array([1.0, 1.0]) / np.sqrt(2)
+    n = 100
+    reference = np.column_stack([np.outer(np.arange(n) * 0.1, diagonal), np.full(n, 2.0)])
+    holding = np.arange(n) >= 80
+    reference[80:] = reference[80]
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    ahead, port = np.array([*diagonal, 0]), np.array([-diagonal[1], diagonal[0], 0])
+    poses[:, :3, 3] = reference + 5 * ahead + 0.03 * port + [0, 0, 0.04]
+    poses[80:, :3, 3] = reference[80:] + [0.3, 0, 0.4]
+    truth = dataclasses.replace(
+        TRUTH, trajectory=Trajectory(np.arange(n) * 1.0, poses), reference=reference, holding=holding
+    )
+    figures = control_metrics(truth)
+    assert figures["cross_track_rmse_m"] == pytest.approx(0.03)
+    assert figures["station_keeping_rmse_m"] == pytest.approx(0.5)
+    assert figures["altitude_rmse_m"] == pytest.approx(np.sqrt((80 * 0.04**2 + 20 * 0.4**2) / 100))
+
+
+def test_legs_are_told_from_short_segments_and_holds():
+    legs = leg_numbers(TRUTH.reference)
+    assert legs.max() == 3
+    on_leg = TRUTH.reference[legs == 1]
+    assert np.ptp(on_leg[:, 0]) == pytest.approx(4, abs=0.1) and np.ptp(on_leg[:, 1]) == pytest.approx(0, abs=0.03)
+    np.testing.assert_allclose(np.linalg.norm(travel_direction(TRUTH.reference), axis=1), 1)
+
+
+def test_overlap_over_a_flat_floor_is_the_planned_geometry():
+    times, reference = TRUTH.trajectory.times_s, TRUTH.reference
+    poses = np.tile(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), (len(times), 1, 1))
+    poses[:, :3, 3] = reference
+    flat = dataclasses.replace(TRUTH, trajectory=Trajectory(times, poses), height_m=np.full_like(TRUTH.height_m, 0.2))
+    figures = overlap_metrics(RESULT, flat, RIG, ELEVATION.grid, {"overlap_along": 0.9, "overlap_across": 0.8})
+    depth = 2.0
+    step = np.median(np.linalg.norm(np.diff(reference[RESULT.key_frames], axis=0), axis=1))
+    assert figures["along_median"] == pytest.approx(1 - step / (RIG.height_px * depth / RIG.focal_px), abs=1e-6)
+    # the reference reaches the next leg's line to within one step (2.5 cm)
+    assert figures["across_median"] == pytest.approx(1 - 0.5 / (RIG.width_px * depth / RIG.focal_px), abs=0.012)
+    assert (figures["along_planned"], figures["across_planned"]) == (0.9, 0.8)
+
+
+def test_overlap_is_lost_where_the_floor_rises():
+    high = dataclasses.replace(TRUTH, height_m=TRUTH.height_m + 1.0)
+    low, raised = (overlap_metrics(RESULT, t, RIG, ELEVATION.grid, {}) for t in (TRUTH, high))
+    assert raised["across_median"] < low["across_median"] - 0.1
+    assert raised["along_median"] < low["along_median"] - 0.05
+
+
+def test_requirements_bound_errors_from_above_and_quality_from_below():
+    metrics = evaluate(
+        RESULT, ELEVATION, TRUTH, RIG, {}, {}, {}, {"map.le90_m": 0.05, "map.completeness": 1.0, "map.max_m": 1e-9}
+    )
+    verdicts = {name: row["passed"] for name, row in metrics["require"].items()}
+    assert verdicts == {"map.le90_m": True, "map.completeness": False, "map.max_m": False}
+    assert more_is_better("overlap.across_p05") and not more_is_better("timing.wall_s")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("map.le9_m", "did you mean .*map.le90_m"),
+        ("flags", "no such metric"),
+        ("seed", "no such metric"),
+        ("trajectory.final.ate", "did you mean trajectory.final.ate_"),
+        ("tracks.0.ga_ms", "no such metric"),
+    ],
+)
+def test_an_unknown_requirement_is_refused_by_name(name, says):
+    with pytest.raises(TwinError, match=says) as caught:
+        check_require({name: 1.0})
+    assert caught.value.field == f"require.{name}"
+
+
+def test_a_survey_that_broke_off_still_has_every_key_and_no_nan():
+    whole = evaluated(RESULT, ELEVATION, TRUTH, RIG)
+    for n_frames, n_keys in [(0, 0), (1, 0), (1, 1), (2, 1), (9, 2), (8, 2)]:
+        part = evaluate(*broken_off(n_frames, n_keys), RIG, {}, {}, {"status": "aborted"}, SCENARIO.require)
+        json.dumps(part, allow_nan=False)
+        assert set(number_paths(part)) >= {p for p in number_paths(whole) if not p.startswith("timing.stages")}
+        assert part["map"]["rmse_m"] is None and part["require"]["map.le90_m"]["passed"] is False
+    assert set(number_paths(unflown())) == {p for p in number_paths(whole) if not p.startswith("require.")}
+
+
+def broken_off(n_frames: int, n_keys: int):
+    """The survey as far as it got, without a map and before any alignment."""
+    cut = {k: Trajectory(t.times_s[:n_frames], t.world_from_camera[:n_frames]) for k, t in vars(RESULT).items()
+           if isinstance(t, Trajectory)}  # fmt: skip
+    result = dataclasses.replace(
+        RESULT, **cut, key_frames=RESULT.key_frames[:n_keys], track_of_key=RESULT.track_of_key[:n_keys],
+        node_cov=np.zeros((0, 6, 6)), links=[], alignments=[], before_ga=[], after_ga=[],
+    )  # fmt: skip
+    flown = TRUTH.trajectory
+    truth = dataclasses.replace(
+        TRUTH, trajectory=Trajectory(flown.times_s[:n_frames], flown.world_from_camera[:n_frames]),
+        reference=TRUTH.reference[:n_frames], holding=TRUTH.holding[:n_frames], track=TRUTH.track[:n_frames],
+        seen=np.zeros_like(TRUTH.seen),
+    )  # fmt: skip
+    return result, None, truth
+
+
+def test_a_map_without_a_single_estimate_is_judged_as_empty_not_as_nan():
+    empty = dataclasses.replace(ELEVATION, height_m=np.full_like(ELEVATION.height_m, np.nan))
+    figures = evaluate(RESULT, empty, TRUTH, RIG, {}, {}, {})["map"]
+    assert figures["completeness"] == 0 and figures["rmse_m"] is None and figures["max_m"] is None

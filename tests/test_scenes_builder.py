@@ -1,0 +1,96 @@
+"""The model is the vehicle of the data sheet, over the floor of the terrain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import terrains
+from scenes.bluerov2 import BLUEROV2_HEAVY
+from scenes.builder import World, build
+from scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
+from scenes.gl import mujoco
+from twin import geometry
+
+BODY_FROM_LEFT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.02, 0.1, -0.15]))
+LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, 0.02, 3)
+    return build(terrain, 160, 120, 45.0, 0.2, BODY_FROM_LEFT, 0.004, LAMPS)
+
+
+def settled(world: World, position: np.ndarray, rotation: np.ndarray) -> mujoco.MjData:
+    data = mujoco.MjData(world.model)
+    data.qpos[:3], data.qpos[3:7] = position, geometry.quaternion_wxyz(rotation)
+    mujoco.mj_forward(world.model, data)
+    return data
+
+
+def test_eight_thrusters_control_all_six_degrees_of_freedom() -> None:
+    allocation = BLUEROV2_HEAVY.allocation
+    assert np.linalg.matrix_rank(allocation) == 6
+    # lever of a horizontal thruster in yaw: (0.156 + 0.111) / sqrt(2), all four alike
+    assert np.abs(allocation[5, :4]) == pytest.approx(np.full(4, (0.156 + 0.111) * np.sqrt(0.5)))
+    assert np.linalg.norm(BLUEROV2_HEAVY.thruster_directions, axis=1) == pytest.approx(np.ones(8))
+
+
+def test_thrust_curve_meets_the_published_points() -> None:
+    u = np.array([0.25, 0.5, 0.75, 1.0])
+    thrust_n = sum(c * u**p for c, p in zip(BLUEROV2_HEAVY.thrust_coefficients, (9, 7, 5, 3, 1), strict=True))
+    assert thrust_n == pytest.approx([4.6, 16.6, 26.5, 30.4], abs=0.06)
+
+
+def test_thrusters_push_where_their_sites_point(world: World) -> None:
+    data = settled(world, np.array([0, 0, 2.0]), np.eye(3))
+    axes = data.site_xmat[world.thruster_site_ids].reshape(8, 3, 3)[:, :, 2]
+    assert axes == pytest.approx(BLUEROV2_HEAVY.thruster_directions, abs=1e-12)
+    assert data.site_xpos[world.thruster_site_ids] - [0, 0, 2] == pytest.approx(BLUEROV2_HEAVY.thruster_positions_m)
+    assert data.site_xpos[world.lamp_site_ids] - [0, 0, 2] == pytest.approx(np.array(LAMPS))
+
+
+def test_the_stereo_pair_is_mounted_as_calibrated(world: World) -> None:
+    rotation = geometry.rotation_from_rpy(0.1, -0.2, 0.7)
+    data = settled(world, np.array([0.3, -0.4, 2.0]), rotation)
+    world_from_left = geometry.pose(rotation, np.array([0.3, -0.4, 2.0])) @ BODY_FROM_LEFT
+    right_from = geometry.pose(np.eye(3), np.array([0.2, 0, 0]))
+    for camera, expected in zip(world.camera_ids, (world_from_left, world_from_left @ right_from), strict=True):
+        assert data.cam_xpos[camera] == pytest.approx(expected[:3, 3], abs=1e-9)
+        assert data.cam_xmat[camera].reshape(3, 3) @ geometry.CV_FROM_GL == pytest.approx(expected[:3, :3], abs=1e-9)
+    assert np.all(world.model.cam_fovy == 45.0)
+
+
+def test_the_vehicle_weighs_and_turns_as_in_the_data_sheet_and_falls_freely(world: World) -> None:
+    model = world.model
+    assert model.body_mass[world.body_id] == 13.5 and model.body_mass.sum() == 13.5
+    assert model.body_inertia[world.body_id] == pytest.approx([0.26, 0.23, 0.37])
+    assert model.body_ipos[world.body_id] == pytest.approx(np.zeros(3))
+    assert model.body_iquat[world.body_id] == pytest.approx([1, 0, 0, 0])
+    data = settled(world, np.zeros(3), np.eye(3))  # in the floor: there is no contact
+    assert data.ncon == 0 and data.qacc[:3] == pytest.approx([0, 0, -9.81]) and model.opt.timestep == 0.004
+
+
+def test_tiles_cover_the_floor_without_gap_or_overlap(world: World) -> None:
+    areas = np.prod((world.tile_high_m - world.tile_low_m)[:, :2], axis=1)
+    assert areas.sum() == pytest.approx(np.prod(world.terrain.size_m))
+    assert world.tile_low_m.min(axis=0) == pytest.approx([-3.0, world.terrain.south_m, 0.2])
+    assert len(areas) == 6  # 120 x 74 cells by 48
+
+
+def test_rays_meet_the_floor_where_the_terrain_says(world: World) -> None:
+    data = settled(world, np.array([0, 0, 50.0]), np.eye(3))
+    rng = np.random.default_rng(0)
+    low, high = np.array([-3.0, world.terrain.south_m]) + 1e-6, np.array([3.0, world.terrain.north_m]) - 1e-6
+    points = rng.uniform(low, high, (300, 2))
+    down, geom = np.array([0, 0, -1.0]), np.zeros(1, np.int32)
+    hits = [3 - mujoco.mj_ray(world.model, data, np.array([*p, 3.0]), down, None, 1, -1, geom, None) for p in points]
+    # the model keeps vertices in single precision, turned into each mesh's own axes: 1e-7 of 3 m, times the slope
+    assert np.array(hits) == pytest.approx(world.terrain.height_at(*points.T), abs=5e-6)
+
+
+@pytest.mark.parametrize("n", (1, 48, 800, 4000, 30000))
+def test_tiles_of_any_floor_stay_within_mujoco_s_limit(n: int) -> None:
+    cells = tile_cells(n, n)
+    assert cells >= TILE_CELLS and (-(-n // cells)) ** 2 <= MAX_TILES

@@ -1,0 +1,187 @@
+"""The command `twin`: each command a few lines in front of a function that does the work.
+
+Exit status: 0 done; 1 the survey failed or missed a requirement; 2 bad usage or scenario; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from twin import console
+from twin.errors import TwinError
+
+if TYPE_CHECKING:
+    from twin.config import Scenario
+    from twin.results import RunResult
+
+app = typer.Typer(
+    help="A digital twin of an underwater stereo survey: fly one, and be told how far off it was.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="A name in scenes/ or the path of a TOML file.")]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")]
+SetOption = Annotated[
+    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as plan.tracks=2; may be repeated.")
+]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/NAME-SEED where not given.")]
+LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as JSON and nothing else.")]
+
+
+def main() -> None:
+    """Runs the command line; a fault of the user ends it with exit status 2 and a line for each."""
+    try:
+        app()
+    except TwinError as error:
+        console.fault(str(error))
+        sys.exit(2)
+
+
+@app.command()
+def demo(out: OutOption = None) -> None:
+    """Fly a small complete survey (under 2 minutes) and show its errors."""
+    result = _survey("quickstart", [], out, live=False)
+    console.errors(result.metrics)
+    print(f"Report: {result.folder / 'report.html'}\nOpen the recording: twin view {result.folder}")
+    raise typer.Exit(exit_status(result))
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    overrides: SetOption = [],  # noqa: B006  typer copies it
+    seed: SeedOption = None,
+    out: OutOption = None,
+    live: LiveOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly one survey and leave its folder: map, trajectories, report, recording, metrics."""
+    result = _survey(scene, overrides + ([] if seed is None else [f"seed={seed}"]), out, live)
+    if as_json:
+        print(json.dumps(result.metrics, indent=1))
+    else:
+        console.errors(result.metrics)
+        print(f"Report: {result.folder / 'report.html'}")
+    raise typer.Exit(exit_status(result))
+
+
+@app.command()
+def plan(
+    scene: SceneArgument,
+    overrides: SetOption = [],  # noqa: B006  typer copies it
+    out: Annotated[Path | None, typer.Option("--out", help="The picture, a PNG; NAME-plan.png where not given.")] = None,
+) -> None:
+    """Show the numbers and a picture of a survey; nothing is simulated."""
+    from twin import plan as planning
+    from twin.config import load_scenario
+    from twin.mission import prepare
+
+    mission = prepare(*load_scenario(scene, overrides))
+    console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
+    print(f"Picture: {planning.draw(mission, out or Path(f'runs/{mission.scenario.name}-plan.png'))}")
+
+
+@app.command()
+def report(folder: RunArgument) -> None:
+    """Write the report of a run again from its folder."""
+    from twin.judge.report import write_report
+
+    print(f"Report: {write_report(_existing_run(folder))}")
+
+
+@app.command()
+def view(
+    folder: RunArgument,
+    web: Annotated[bool, typer.Option("--web", help="Serve it to a browser on this machine.")] = False,
+) -> None:
+    """Open the recording of a run in Rerun."""
+    recording = _existing_run(folder) / "run.rrd"
+    if not recording.is_file():
+        raise TwinError("RUN", f"{folder} has no recording", "a run that came to its end")
+    serve = ["--serve-web", "--bind", "127.0.0.1"] if web else []
+    raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun", str(recording), *serve]))
+
+
+@app.command()
+def doctor() -> None:
+    """Tell what this machine renders with and what it lacks, with the line that installs it."""
+    from twin.doctor import examine
+
+    findings = examine(Path.cwd())
+    for finding in findings:
+        print(finding)
+    raise typer.Exit(0 if all(finding.ok for finding in findings) else 2)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of the scenario; editors complete from it."""
+    from twin.config import Scenario
+
+    print(json.dumps(Scenario.model_json_schema(), indent=1))
+
+
+def exit_status(result: RunResult) -> int:
+    """What the shell is told of a survey."""
+    if result.metrics["reason"] == "interrupted":
+        return 130
+    missed = [r for r in result.metrics["require"].values() if not r["passed"]]
+    return 1 if result.status != "complete" or missed else 0
+
+
+def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
+    from twin.config import load_scenario
+    from twin.doctor import graphics
+
+    scenario, source = load_scenario(scene, overrides)
+    folder = _new_folder(scenario, out)
+    drawing = graphics()
+    if not drawing.ok:
+        console.fault(str(drawing))
+        raise typer.Exit(2)
+    from twin import survey  # only now: it needs OpenGL
+
+    with console.progress_bar() as progress:
+        return survey.run(scenario, source, folder, progress, live)
+
+
+def _new_folder(scenario: Scenario, out: Path | None) -> Path:
+    """The folder to write: what was asked for, or the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is free."""
+    if out is not None:
+        return _checked(out)
+    first = Path("runs") / f"{scenario.name}-{scenario.seed}"
+    folder, count = first, 1
+    while folder.exists() and not _empty(folder):
+        count += 1
+        folder = first.with_name(f"{first.name}-{count}")
+    return _checked(folder)
+
+
+def _checked(folder: Path) -> Path:
+    parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    if folder.exists() and not _empty(folder):
+        raise TwinError("--out", f"{folder} is there and not empty", "a new or an empty folder")
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise TwinError("--out", f"{parent} cannot be written to", "a folder that can")
+    return folder
+
+
+def _empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
+
+
+def _existing_run(folder: Path) -> Path:
+    if not (folder / "scenario.resolved.toml").is_file():
+        raise TwinError("RUN", f"{folder} is not the folder of a run", "one that twin run has written")
+    return folder

@@ -1,0 +1,87 @@
+"""The key points of a survey: what is kept of each in memory, and their images spooled to disk."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.estimate import matching
+from twin.estimate.stereo import StereoPoints
+from twin.geometry import Array
+from twin.records import Image, Readings
+
+_CACHE_BYTES = 192 * 2**20
+
+
+@dataclass
+class KeyPoint:
+    """One stereo pair of the path.
+
+    Args:
+        number: counts the key points from 0.
+        row: index of its frame in the trajectories.
+        track: number of its track, from 1.
+        world_from_camera: (4, 4) best pose so far.
+        points: matched points of the pair; None where stereo failed.
+        readings: of the navigation sensors.
+    """
+
+    number: int
+    row: int
+    track: int
+    world_from_camera: Array
+    points: StereoPoints | None
+    readings: Readings
+
+
+class ImageSpool:
+    """Stereo pairs on disk as lossless PNG, the latest normalised ones in memory too.
+
+    Memory stays bounded however long the survey is.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self._normalised: OrderedDict[int, tuple[matching.Image, matching.Image]] = OrderedDict()
+
+    def put(self, row: int, left: Image, right: Image, normalised: tuple[matching.Image, matching.Image]) -> None:
+        """Stores the pair (height, width, 3) of the key point at this frame.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        for side, image in (("left", left), ("right", right)):
+            ok, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            if not ok:
+                raise OSError(f"frame {row} cannot be encoded")
+            self._path(row, side).write_bytes(data.tobytes())
+        self._remember(row, normalised)
+
+    def pair(self, row: int) -> tuple[Image, Image]:
+        """Left and right image as recorded."""
+        return self._read(row, "left"), self._read(row, "right")
+
+    def normalised(self, row: int) -> tuple[matching.Image, matching.Image]:
+        """Left and right image, locally normalised."""
+        if row not in self._normalised:
+            left, right = self.pair(row)
+            self._remember(row, (matching.normalise(left), matching.normalise(right)))
+        self._normalised.move_to_end(row)
+        return self._normalised[row]
+
+    def _remember(self, row: int, pair: tuple[matching.Image, matching.Image]) -> None:
+        self._normalised[row] = pair
+        while len(self._normalised) * 2 * pair[0].nbytes > _CACHE_BYTES:
+            self._normalised.popitem(last=False)
+
+    def _path(self, row: int, side: str) -> Path:
+        return self.folder / f"{row:06d}_{side}.png"
+
+    def _read(self, row: int, side: str) -> NDArray[np.uint8]:
+        return cv2.imdecode(np.fromfile(self._path(row, side), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]

@@ -1,0 +1,89 @@
+"""Finding the same patch again: local normalisation, corners, and Lucas-Kanade with one window for stereo and flow alike.
+
+Stereo and flow must average the relief over the same support: with different windows the flow sees less parallax than
+the depth promises, and the least squares trades translation for pitch until the path bends. So every match of the
+method goes through `track`, with the same patch.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Points = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
+_GRAY_PER_SIGMA = 36.0
+_FLAT_GRAY = 2.0  # deviations below this are sensor noise, not texture
+_ROUND_TRIP_PX = 0.5
+
+
+def normalise(rgb: Image) -> Image:
+    """Grey image with local mean and contrast removed: the lamp pattern moves with the vehicle and must not be tracked.
+
+    Args:
+        rgb: (height, width, 3).
+
+    Returns:
+        (height, width) uint8, local mean 128, local deviation about 36 grey levels.
+    """
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    size = (gray.shape[1] // 8 | 1,) * 2
+    mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
+    variance = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT) - mean * mean
+    deviation = np.sqrt(np.maximum(variance, 0.0)) + _FLAT_GRAY
+    return cv2.convertScaleAbs(np.maximum((gray - mean) / deviation * _GRAY_PER_SIGMA + 128.0, 0.0))
+
+
+def corners(image: Image, count: int, patch_px: int) -> Points:
+    """Well-textured points, spread over the image, each with its whole patch inside. -> (n, 2) float32 [px]"""
+    height, width = image.shape
+    margin = patch_px // 2 + 2
+    inside = np.zeros_like(image)
+    inside[margin : height - margin, margin : width - margin] = 255
+    spacing_px = 0.7 * np.sqrt(height * width / count)
+    found = cv2.goodFeaturesToTrack(image, count, 0.01, spacing_px, mask=inside, blockSize=7)
+    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+
+
+def track(source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1) -> tuple[Points, Mask]:
+    """Where patches of one image are in another, by Lucas-Kanade there and back.
+
+    Args:
+        source, target: normalised images of one shape.
+        points: (n, 2) [px] in the source.
+        guess: (n, 2) [px], where they are expected in the target.
+        patch_px: window.
+        levels: pyramid levels above the full image.
+
+    Returns:
+        (n, 2) [px] in the target, and which came back within half a pixel and lie inside.
+    """
+    if len(points) == 0:
+        return points.copy(), np.zeros(0, bool)
+    options = dict(winSize=(patch_px, patch_px), criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    points, guess = points.astype(np.float32), guess.astype(np.float32)
+    found, there, _ = cv2.calcOpticalFlowPyrLK(source, target, points, guess.copy(), maxLevel=levels, **options)
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(target, source, found, points.copy(), maxLevel=0, **options)
+    round_trip_px = np.linalg.norm(returned - points, axis=1)
+    ok = (there.ravel() > 0) & (back.ravel() > 0) & (round_trip_px < _ROUND_TRIP_PX)
+    return found, ok & inside(found, source.shape, patch_px // 2)
+
+
+def inside(points: Points, shape: tuple[int, ...], margin_px: float) -> Mask:
+    """Which points (n, 2) keep this distance from the image border."""
+    x, y = points[:, 0], points[:, 1]
+    return (x >= margin_px) & (y >= margin_px) & (x < shape[1] - margin_px) & (y < shape[0] - margin_px)
+
+
+def robust_sigma(values: NDArray[np.floating]) -> float:
+    """Standard deviation by the median absolute deviation from zero; infinite for fewer than 8 values."""
+    return float(1.4826 * np.median(np.abs(values))) if len(values) >= 8 else float("inf")
+
+
+def correlation(n_points: int, patch_px: int, shape: tuple[int, ...]) -> float:
+    """By how much a covariance of independent points is too small: overlapping patches share their pixels."""
+    return max(1.0, n_points * patch_px**2 / (shape[0] * shape[1]))

@@ -1,0 +1,203 @@
+"""The local 2.5-D mosaic and the registration of a frame with it (F2M, P7): six degrees of freedom over any relief.
+
+The mosaic is a raster in the world: brightness (locally normalised) and elevation per cell. A cell keeps what was seen
+there first: the oldest view has drifted least. A frame is registered by direct alignment: cells with texture are
+projected into it, and the pose is moved until their brightness agrees (Gauss-Newton with Huber weights).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin import geometry
+from twin.estimate import matching, motion
+from twin.geometry import Array
+from twin.records import StereoRig
+
+_MAX_CELLS = 4000
+_MIN_CELLS = 300
+_MIN_GRADIENT = 4.0  # grey levels per cell
+_MAX_RESIDUAL = 40.0  # grey levels; matched images of unit contrast (36) leave far less
+_ITERATIONS = 8
+
+
+class Mosaic:
+    """Brightness and elevation of the floor around the vehicle.
+
+    Args:
+        west_m, south_m: corner of the raster.
+        cell_m: cell size, about a pixel's footprint.
+        shape: (rows, columns); row 0 = south.
+    """
+
+    def __init__(self, west_m: float, south_m: float, cell_m: float, shape: tuple[int, int]):
+        self.west_m, self.south_m, self.cell_m = west_m, south_m, cell_m
+        self.brightness = np.zeros(shape, np.uint8)
+        self.height_m = np.full(shape, np.nan, np.float32)
+
+    def clear(self) -> None:
+        """Forgets everything: after a global alignment the mosaic is laid anew."""
+        self.height_m.fill(np.nan)
+
+    def add(self, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig) -> None:
+        """Lays a frame with its depth (height, width), NaN where unknown, into the empty cells."""
+        reach_m = float(np.nanmax(depth_m, initial=0.0)) * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
+        window, left, top = self._window(world_from_camera[:3, 3], reach_m)
+        _lay(
+            image, depth_m, world_from_camera, geometry.inverse(world_from_camera), rig.focal_px, rig.cx_px, rig.cy_px,
+            self.west_m + left * self.cell_m, self.south_m + top * self.cell_m, self.cell_m,
+            self.brightness[window], self.height_m[window],
+        )  # fmt: skip
+
+    def register(self, image: matching.Image, world_from_camera: Array, footprint_m: float, rig: StereoRig) -> motion.Motion | None:
+        """Pose correction of a frame: predicted_from_true, with its covariance; None where too little agrees.
+
+        Args:
+            image: normalised frame.
+            world_from_camera: (4, 4) predicted pose.
+            footprint_m: half the extent of the floor to use, around the camera.
+        """
+        cells = self._textured_cells(world_from_camera[:3, 3], footprint_m)
+        if cells is None:
+            return None
+        points, brightness = cells
+        frame = image.astype(np.float32)
+        current = world_from_camera
+        for _ in range(_ITERATIONS):
+            camera_from_world = geometry.inverse(current)
+            normal, right, sigma, n_used = _normal_equations(
+                points, brightness, frame, camera_from_world, rig.focal_px, rig.cx_px, rig.cy_px, _MAX_RESIDUAL
+            )
+            if n_used < _MIN_CELLS:
+                return None
+            step = np.linalg.solve(normal, right)
+            current = current @ geometry.exp(step)
+            if np.abs(step).max() < 1e-6:
+                break
+        correction = geometry.inverse(world_from_camera) @ current
+        return motion.Motion(correction, np.linalg.inv(normal) * sigma**2, n_used, sigma)
+
+    def _window(self, centre: Array, half_m: float) -> tuple[tuple[slice, slice], int, int]:
+        """The cells within a square, with the column and row of their first."""
+        row, col = (int((centre[1] - self.south_m) / self.cell_m), int((centre[0] - self.west_m) / self.cell_m))
+        half = int(np.ceil(half_m / self.cell_m))
+        top, left = max(row - half, 0), max(col - half, 0)
+        return (slice(top, max(row + half, 0)), slice(left, max(col + half, 0))), left, top
+
+    def _textured_cells(self, centre: Array, half_m: float) -> tuple[Array, NDArray[np.float32]] | None:
+        """World points (n, 3) and brightness (n,) of cells with a gradient, within a square."""
+        window, left, top = self._window(centre, half_m)
+        height, bright = self.height_m[window], self.brightness[window].astype(np.float32)
+        if min(height.shape) < 8:
+            return None
+        strength = _gradient(bright, height)
+        rows, cols = np.nonzero(strength > _MIN_GRADIENT)
+        if len(rows) < _MIN_CELLS:
+            return None
+        keep = slice(None, None, max(1, len(rows) // _MAX_CELLS))
+        rows, cols = rows[keep], cols[keep]
+        x = self.west_m + (left + cols + 0.5) * self.cell_m
+        y = self.south_m + (top + rows + 0.5) * self.cell_m
+        return np.column_stack([x, y, height[rows, cols].astype(np.float64)]), bright[rows, cols]
+
+
+def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Brightness change per cell; zero where a neighbour is unknown."""
+    strength = np.zeros_like(bright)
+    across, along = bright[1:-1, 2:] - bright[1:-1, :-2], bright[2:, 1:-1] - bright[:-2, 1:-1]
+    known = height[1:-1, 2:] + height[1:-1, :-2] + height[2:, 1:-1] + height[:-2, 1:-1] + height[1:-1, 1:-1]
+    strength[1:-1, 1:-1] = np.where(np.isfinite(known), np.hypot(across, along) / 2, 0)
+    return strength
+
+
+@njit(cache=True, nogil=True)
+def _lay(image, depth, pose, inverse, focal, cx, cy, west, south, cell, brightness, height):
+    """Fills empty cells: the mean height of the pixels that fall in, the brightness where the cell's centre projects.
+
+    Taking a pixel's own brightness would shift the picture by the pixel's place in the cell: 5 mm of bias in position.
+    """
+    total = np.zeros(height.shape, np.float32)
+    count = np.zeros(height.shape, np.int32)
+    rows, cols = height.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = depth[v, u]
+            if not z > 0:
+                continue
+            x, y = (u - cx) / focal * z, (v - cy) / focal * z
+            col = int(np.floor((pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3] - west) / cell))
+            row = int(np.floor((pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3] - south) / cell))
+            if 0 <= row < rows and 0 <= col < cols:
+                total[row, col] += pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+                count[row, col] += 1
+    for row in range(rows):
+        for col in range(cols):
+            if count[row, col] == 0 or not np.isnan(height[row, col]):
+                continue
+            x, y, z = west + (col + 0.5) * cell, south + (row + 0.5) * cell, total[row, col] / count[row, col]
+            depth_here = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2] * z + inverse[2, 3]
+            u = focal * (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2] * z + inverse[0, 3]) / depth_here + cx
+            v = focal * (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2] * z + inverse[1, 3]) / depth_here + cy
+            i, j = int(np.floor(v)), int(np.floor(u))
+            if i < 0 or j < 0 or i >= image.shape[0] - 1 or j >= image.shape[1] - 1:
+                continue
+            a, b = v - i, u - j
+            top = image[i, j] * (1 - b) + image[i, j + 1] * b
+            bottom = image[i + 1, j] * (1 - b) + image[i + 1, j + 1] * b
+            height[row, col] = z
+            brightness[row, col] = np.uint8(top * (1 - a) + bottom * a + 0.5)
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(points, brightness, frame, camera_from_world, focal, cx, cy, max_residual):
+    """Normal matrix and right side of the pose step, robust deviation, and cells used."""
+    n = len(points)
+    residuals = np.empty(n, np.float64)
+    rows = np.empty((n, 6), np.float64)
+    rotation, translation = np.ascontiguousarray(camera_from_world[:3, :3]), camera_from_world[:3, 3].copy()
+    used = 0
+    for k in range(n):
+        p = rotation @ points[k] + translation
+        if p[2] <= 0.05:
+            continue
+        x, y = p[0] / p[2], p[1] / p[2]
+        u, v = focal * x + cx, focal * y + cy
+        i, j = int(np.floor(v)), int(np.floor(u))
+        if i < 1 or j < 1 or i >= frame.shape[0] - 2 or j >= frame.shape[1] - 2:
+            continue
+        a, b = v - i, u - j
+        top = frame[i, j] * (1 - b) + frame[i, j + 1] * b
+        bottom = frame[i + 1, j] * (1 - b) + frame[i + 1, j + 1] * b
+        residual = brightness[k] - (top * (1 - a) + bottom * a)
+        if abs(residual) > max_residual:
+            continue
+        grad_u = focal * (
+            (1 - a) * ((1 - b) * (frame[i, j + 1] - frame[i, j - 1]) + b * (frame[i, j + 2] - frame[i, j]))
+            + a * ((1 - b) * (frame[i + 1, j + 1] - frame[i + 1, j - 1]) + b * (frame[i + 1, j + 2] - frame[i + 1, j]))
+        ) / 2
+        grad_v = focal * (
+            (1 - b) * ((1 - a) * (frame[i + 1, j] - frame[i - 1, j]) + a * (frame[i + 2, j] - frame[i, j]))
+            + b * ((1 - a) * (frame[i + 1, j + 1] - frame[i - 1, j + 1]) + a * (frame[i + 2, j + 1] - frame[i, j + 1]))
+        ) / 2
+        rows[used, 0] = grad_u * x * y + grad_v * (1 + y * y)
+        rows[used, 1] = -grad_u * (1 + x * x) - grad_v * x * y
+        rows[used, 2] = grad_u * y - grad_v * x
+        rows[used, 3] = -grad_u / p[2]
+        rows[used, 4] = -grad_v / p[2]
+        rows[used, 5] = (grad_u * x + grad_v * y) / p[2]
+        residuals[used] = residual
+        used += 1
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    if used < 6:
+        return normal, right, 0.0, 0
+    sigma = 1.4826 * np.median(np.abs(residuals[:used])) + 1e-3
+    for k in range(used):
+        size = abs(residuals[k]) / sigma
+        weight = 1.0 if size < 1.5 else 1.5 / size
+        for i in range(6):
+            right[i] += weight * rows[k, i] * residuals[k]
+            for j in range(6):
+                normal[i, j] += weight * rows[k, i] * rows[k, j]
+    return normal, right, sigma, used

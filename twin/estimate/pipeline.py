@@ -1,0 +1,246 @@
+"""The method in the paper's order: F2F at every frame; at key points stereo, F2M, mosaic and network; GA at the end of a track."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin import geometry
+from twin.config import Estimation
+from twin.estimate import matching, network, stereo
+from twin.estimate.alignment import Aligned, align
+from twin.estimate.disparity import dense_disparity
+from twin.estimate.f2f import FrameToFrame
+from twin.estimate.key_points import ImageSpool, KeyPoint
+from twin.estimate.mosaic import Mosaic
+from twin.estimate.pose_filter import PoseFilter
+from twin.estimate.trajectory import interpolate_between_keys
+from twin.geometry import Array
+from twin.records import Alignment, Estimate, Frame, Link, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
+
+_REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
+_HELD_COV = np.eye(6) * 1e-10  # nodes older than the window are held
+_F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # what the mosaic's own sampling leaves [rad, m]
+
+
+class Navigator:
+    """Positions the vehicle from frames alone.
+
+    Args:
+        rig, noise: calibration as believed.
+        settings: the scenario's [estimate].
+        start: (4, 4) world_from_camera of the reference position, where the survey begins by plan.
+        grid: the survey's map cells; their extent bounds the mosaic.
+        cell_m: cell of the mosaic, about a pixel's footprint.
+        folder: where the key points' images are spooled.
+        watch: context manager per stage name.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        noise: SensorNoise,
+        settings: Estimation,
+        start: Array,
+        grid: MapGrid,
+        cell_m: float,
+        folder: Path,
+        watch: Callable[[str], AbstractContextManager[None]],
+    ):
+        self.rig, self.noise, self.settings, self.watch = rig, noise, settings, watch
+        self.spool = ImageSpool(folder)
+        self.f2f = FrameToFrame(rig, settings.patch_px)
+        self.filter = PoseFilter(start.copy(), rig, noise)
+        shape = (int(np.ceil(grid.rows * grid.cell_m / cell_m)), int(np.ceil(grid.cols * grid.cell_m / cell_m)))
+        self.mosaic = Mosaic(grid.west_m, grid.north_m - shape[0] * cell_m, cell_m, shape)
+        self.matcher = network.PairMatch(rig, self.spool, settings.patch_px)
+        self.f2f_pose = start.copy()
+        self.since_node = (np.eye(4), np.zeros((6, 6)))
+        self.max_disparity_px: float | None = None
+        self.keys: list[KeyPoint] = []
+        self.nodes: list[KeyPoint] = []
+        self.links: list[Link] = []
+        self.depth_of_key: dict[int, NDArray[np.float16]] = {}
+        self.times_s: list[float] = []
+        self.f2f_poses: list[Array] = []
+        self.online_poses: list[Array] = []
+        self.alignments: list[Alignment] = []
+        self.before_ga: list[Array] = []
+        self.after_ga: list[Array] = []
+
+    def update(self, frame: Frame, track: int) -> Estimate:
+        """Takes one frame; a frame with a right image is a key point of the track (from 1)."""
+        with self.watch("f2f"):
+            image = matching.normalise(frame.left)
+            motion, status = self.f2f.step(image)
+        self.filter.predict(motion.a_from_b, motion.cov)
+        self.f2f_pose = self.f2f_pose @ motion.a_from_b
+        carry = geometry.adjoint(geometry.inverse(motion.a_from_b))
+        relative, cov = self.since_node
+        self.since_node = (relative @ motion.a_from_b, carry @ cov @ carry.T + motion.cov)
+        self.filter.aid(frame.readings)
+        if frame.right is not None:
+            status = self._visit_key_point(frame, image, track, status)
+        return self._record(frame, geometry.log(motion.a_from_b) * self.rig.frame_rate_hz, status)
+
+    def align_track(self, track: int) -> None:
+        """Global alignment over the window that ends with this track; the vehicle keeps station meanwhile."""
+        if not self.settings.use_ga or len(self.nodes) < 2:
+            return
+        self.before_ga.append(self._key_poses())
+        first = track - self.settings.window_tracks
+        with self.watch("ga") as _:
+            started = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
+        self._rebase(started)
+        self._relay_mosaic(track)
+        self.after_ga.append(self._key_poses())
+
+    def finish(self) -> SurveyResult:
+        """The truly global alignment over all tracks, and the trajectories."""
+        cov = np.tile(self.filter.cov, (len(self.keys), 1, 1))
+        if self.settings.use_ga and len(self.nodes) >= 2:
+            with self.watch("ga"):
+                aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
+            owner = np.searchsorted([n.number for n in self.nodes], [k.number for k in self.keys], side="right") - 1
+            cov = aligned.covs[owner]
+        times = np.array(self.times_s)
+        f2f, online = np.array(self.f2f_poses), np.array(self.online_poses)
+        rows = np.array([k.row for k in self.keys], dtype=np.int64)
+        final = interpolate_between_keys(f2f, rows, self._key_poses()) if self.settings.use_ga else online
+        return SurveyResult(
+            f2f=Trajectory(times, f2f),
+            online=Trajectory(times, online),
+            final=Trajectory(times, final),
+            key_frames=rows,
+            track_of_key=np.array([k.track for k in self.keys], dtype=np.int64),
+            node_cov=cov,
+            links=self.links,
+            alignments=self.alignments,
+            before_ga=self.before_ga,
+            after_ga=self.after_ga,
+        )
+
+    def _visit_key_point(self, frame: Frame, image: matching.Image, track: int, status: str) -> str:
+        """Stereo, F2M, mosaic and network at a key point; fresh points for F2F."""
+        assert frame.right is not None
+        with self.watch("stereo"):
+            right = matching.normalise(frame.right)
+            dense_px, _ = dense_disparity(image, right, self._disparity_limit())
+            points = stereo.points_of_pair(image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px)
+        if len(points.xyz) < 12:
+            return "too few points in stereo"
+        self.max_disparity_px = float(np.nanpercentile(dense_px, 99.5))
+        with np.errstate(invalid="ignore"):
+            depth_m = (self.rig.focal_px * self.rig.baseline_m / dense_px).astype(np.float32)
+        with self.watch("f2m"):
+            self._register_with_mosaic(image, points)
+        key = KeyPoint(
+            len(self.keys), len(self.times_s), track, self.filter.world_from_camera.copy(), points, frame.readings
+        )
+        self.keys.append(key)
+        self.spool.put(key.row, frame.left, frame.right, (image, right))
+        self.depth_of_key[key.number] = depth_m.astype(np.float16)
+        with self.watch("f2m"):
+            self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
+        if key.number % self.settings.node_stride == 0:
+            self._connect(key)
+        self.f2f.restart(image, points)
+        return status
+
+    def _disparity_limit(self) -> int:
+        """Largest disparity to search: that of the last key point with a margin (P12), wide at first."""
+        limit_px = 0.4 * self.rig.width_px
+        return int(limit_px if self.max_disparity_px is None else min(limit_px, self.max_disparity_px * 1.3 + 16))
+
+    def _register_with_mosaic(self, image: matching.Image, points: stereo.StereoPoints) -> None:
+        """Corrects the position by the mosaic (F2M)."""
+        if not self.settings.use_f2m:
+            return
+        half_m = 0.6 * float(points.xyz[:, 2].max()) * self.rig.width_px / self.rig.focal_px
+        correction = self.mosaic.register(image, self.filter.world_from_camera, half_m, self.rig)
+        if correction is not None:
+            cov = correction.cov + np.diag(_F2M_SIGMA**2)
+            self.filter.correct_pose(self.filter.world_from_camera @ correction.a_from_b, cov)
+
+    def _connect(self, node: KeyPoint) -> None:
+        """Links a new node to earlier ones by measured motions; to the last one by F2F where that fails."""
+        s = self.settings
+        with self.watch("network"):
+            window = [k for k in self.nodes if k.track >= node.track - s.window_tracks]
+            chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
+        measured = [link for other, share in chosen if (link := self._measure(node, other, share)) is not None]
+        if self.nodes and not any(link.i == self.nodes[-1].number for link in measured):
+            relative, cov = self.since_node
+            measured.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))
+        self.links += measured
+        self.nodes.append(node)
+        self.since_node = (np.eye(4), np.zeros((6, 6)))
+
+    def _measure(self, node: KeyPoint, other: KeyPoint, share: float) -> Link | None:
+        with self.watch("flow"):
+            matched = self.matcher.flow(node, other)
+        if matched is None:
+            return None
+        with self.watch("network"):
+            result = self.matcher.motion(node, other, matched)
+        return None if result is None else network.to_link(node, other, share, result)
+
+    def _align(self, nodes: list[KeyPoint], track: int, marginals: list[int] | None) -> Aligned:
+        """Aligns nodes (with those older ones that they are linked to, held) and moves all key points along."""
+        inside = {k.number for k in nodes}
+        links = [link for link in self.links if link.j in inside]
+        held = {link.i for link in links} - inside
+        everyone = [k for k in self.nodes if k.number in held] + nodes
+        anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
+        return self._timed_align(everyone, links, anchors, track, marginals)
+
+    def _timed_align(self, nodes, links, anchors, track, marginals) -> Aligned:
+        import time
+
+        begun = time.perf_counter()
+        aligned = align(nodes, links, anchors, self.rig, self.noise, marginals)
+        ms = (time.perf_counter() - begun) * 1e3
+        self.alignments.append(Alignment(track, ms, len(nodes), len(links), len(aligned.dropped)))
+        dropped = {(link.i, link.j) for link in aligned.dropped}
+        self.links = [link for link in self.links if (link.i, link.j) not in dropped]
+        self._move_keys({k.number: pose for k, pose in zip(nodes, aligned.poses, strict=True)})
+        return aligned
+
+    def _move_keys(self, poses: dict[int, Array]) -> None:
+        """Gives the nodes their new poses; key points between them move along with the node before."""
+        shift = np.eye(4)
+        for key in self.keys:
+            if key.number in poses:
+                shift = poses[key.number] @ geometry.inverse(key.world_from_camera)
+            key.world_from_camera = shift @ key.world_from_camera
+
+    def _rebase(self, aligned: Aligned) -> None:
+        """Moves the online position along with the last key point."""
+        last = self.keys[-1]
+        last_from_now = geometry.inverse(self.online_poses[last.row]) @ self.filter.world_from_camera
+        carry = geometry.adjoint(geometry.inverse(last_from_now))
+        self.filter.reset(last.world_from_camera @ last_from_now, carry @ aligned.covs[-1] @ carry.T)
+
+    def _relay_mosaic(self, track: int) -> None:
+        """Lays the mosaic anew with the aligned key points of the last track; older ones are forgotten."""
+        self.mosaic.clear()
+        self.depth_of_key = {n: d for n, d in self.depth_of_key.items() if self.keys[n].track >= track}
+        for number, depth in self.depth_of_key.items():
+            image = self.spool.normalised(self.keys[number].row)[0]
+            self.mosaic.add(image, depth.astype(np.float32), self.keys[number].world_from_camera, self.rig)
+
+    def _key_poses(self) -> Array:
+        return np.array([k.world_from_camera for k in self.keys]).reshape(-1, 4, 4)
+
+    def _record(self, frame: Frame, velocity: Array, status: str) -> Estimate:
+        self.times_s.append(frame.time_s)
+        self.f2f_poses.append(self.f2f_pose.copy())
+        self.online_poses.append(self.filter.world_from_camera.copy())
+        sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
+        return Estimate(
+            frame.time_s, self.online_poses[-1], self.f2f_poses[-1], velocity, sigma_m, status
+        )

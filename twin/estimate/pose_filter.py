@@ -1,0 +1,63 @@
+"""The online position: frame-to-frame motion predicts, registration with the mosaic and navigation sensors correct."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin import geometry
+from twin.geometry import Array
+from twin.records import Readings, SensorNoise, StereoRig
+
+_GATE = 30.0  # chi2 beyond which a 6-DOF correction contradicts the prediction
+
+
+class PoseFilter:
+    """Extended Kalman filter of one pose; the error is a motion [w, t] in the camera, applied on the right."""
+
+    def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
+        self.world_from_camera = world_from_camera
+        self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
+        self.camera_from_body = geometry.inverse(rig.body_from_camera)
+        self.noise = noise
+
+    def predict(self, a_from_b: Array, cov: Array) -> None:
+        """Composes a relative motion with its covariance, eqs. (3) to (5)."""
+        carry = geometry.adjoint(geometry.inverse(a_from_b))
+        self.world_from_camera = self.world_from_camera @ a_from_b
+        self.cov = carry @ self.cov @ carry.T + cov
+
+    def correct_pose(self, measured: Array, cov: Array) -> bool:
+        """Fuses a measured pose; refused (False) where it contradicts the prediction beyond both uncertainties."""
+        residual = geometry.log(geometry.inverse(self.world_from_camera) @ measured)
+        if residual @ np.linalg.solve(self.cov + cov, residual) > _GATE:
+            return False
+        self._update(residual, np.eye(6), cov)
+        return True
+
+    def aid(self, readings: Readings) -> None:
+        """Fuses what the navigation sensors said."""
+        if readings.pressure_z_m is not None:
+            jacobian = np.concatenate([np.zeros(3), self.world_from_camera[2, :3]])[None]
+            residual = np.array([readings.pressure_z_m - self.world_from_camera[2, 3]])
+            self._update(residual, jacobian, np.array([[self.noise.pressure_m**2]]))
+        if readings.ahrs_rpy_rad is not None:
+            measured, cov = attitude(readings.ahrs_rpy_rad, self.camera_from_body, self.noise)
+            residual = geometry.so3_log(self.world_from_camera[:3, :3].T @ measured)
+            self._update(residual, np.eye(3, 6), cov)
+
+    def reset(self, world_from_camera: Array, cov: Array) -> None:
+        """Takes the pose and covariance of a global alignment."""
+        self.world_from_camera, self.cov = world_from_camera, cov
+
+    def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
+        gain = np.linalg.solve(jacobian @ self.cov @ jacobian.T + cov, jacobian @ self.cov).T
+        self.world_from_camera = self.world_from_camera @ geometry.exp(gain @ residual)
+        keep = np.eye(6) - gain @ jacobian
+        self.cov = keep @ self.cov @ keep.T + gain @ cov @ gain.T
+
+
+def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
+    """Rotation of the camera in the world by an AHRS reading, with its covariance (3, 3) in the camera."""
+    rotation = geometry.rotation_from_rpy(*rpy_rad) @ camera_from_body[:3, :3].T
+    body_cov = np.diag([noise.attitude_rad**2, noise.attitude_rad**2, noise.heading_rad**2])
+    return rotation, camera_from_body[:3, :3] @ body_cov @ camera_from_body[:3, :3].T

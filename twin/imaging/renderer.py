@@ -1,0 +1,152 @@
+"""What a camera would see in perfectly clear, evenly lit water: albedo and depth of the floor, in one MuJoCo pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.builder import World
+from scenes.floor import FLOOR_GROUP
+from scenes.gl import GlError, mujoco, offscreen_context
+from twin.errors import TwinError
+
+Array = NDArray[np.float64]
+
+
+class Renderer:
+    """Draws a world's floor from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
+
+    Holds an OpenGL context: make one per process and thread, and `close` it.
+
+    Args:
+        width_px, height_px, vfov_deg: the camera; square pixels, its axis through the middle of the image.
+        znear_m, zfar_m: nothing nearer or farther is drawn.
+    Raises:
+        TwinError: no OpenGL on this machine.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        width_px: int,
+        height_px: int,
+        vfov_deg: float,
+        znear_m: float = 0.05,
+        zfar_m: float = 100.0,
+    ):
+        self._world = world
+        self._near, self._far = np.float32(znear_m), np.float32(zfar_m)
+        self._rect = mujoco.MjrRect(0, 0, width_px, height_px)
+        self._tan = np.tan(np.deg2rad(vfov_deg) / 2) * np.array([width_px / height_px, 1.0])
+        self._rgb = np.empty((height_px, width_px, 3), np.uint8)
+        self._z = np.empty((height_px, width_px), np.float32)
+        self._gl, self._context = _open(world.model, width_px, height_px)
+        self._scene = _floor_scene(world.model)
+        self._set_projection()
+        order = {geom: k for k, geom in enumerate(world.tile_geom_ids)}
+        drawn = [self._scene.geoms[k] for k in range(self._scene.ngeom)]
+        self._tiles = sorted(drawn, key=lambda geom: order[geom.objid])
+        self._meshes = [tile.dataid for tile in self._tiles]
+        self._shown = np.ones(len(self._tiles), dtype=bool)
+
+    def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Albedo (h, w, 3) uint8 RGB and depth (h, w) float32 [m] along the optical axis, inf where no floor is.
+
+        Args:
+            world_from_camera: (4, 4) pose of the camera.
+        """
+        self._gl.make_current()
+        self._place(world_from_camera)
+        self._show(visible_tiles(self._world, world_from_camera, self._tan))
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._rgb, self._z, self._rect, self._context)
+        return self._rgb[::-1].copy(), linear_depth(self._z[::-1], self._near, self._far)  # OpenGL's rows run upwards
+
+    def close(self) -> None:
+        """Gives the OpenGL context back; closing twice does no harm."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._context.free()
+            self._gl.free()
+            self._gl = None
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _set_projection(self) -> None:
+        for camera in self._scene.camera:  # two eyes, of which MuJoCo takes the mean
+            camera.frustum_near, camera.frustum_far = self._near, self._far
+            camera.frustum_center, camera.frustum_width = 0.0, self._near * self._tan[0]
+            camera.frustum_top, camera.frustum_bottom = self._near * self._tan[1], -self._near * self._tan[1]
+            camera.orthographic = 0
+
+    def _place(self, world_from_camera: Array) -> None:
+        for camera in self._scene.camera:
+            camera.pos[:] = world_from_camera[:3, 3]
+            camera.forward[:] = world_from_camera[:3, 2]
+            camera.up[:] = -world_from_camera[:3, 1]
+
+    def _show(self, visible: NDArray[np.bool_]) -> None:
+        """Hides tiles by taking their mesh away: a geom without one costs next to nothing."""
+        for k in np.flatnonzero(visible != self._shown):
+            self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
+        self._shown = visible
+
+
+def _open(model: mujoco.MjModel, width_px: int, height_px: int):  # noqa: ANN202 (OpenGL's types vary by platform)
+    try:
+        gl = offscreen_context(width_px, height_px)
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+    except GlError as error:
+        raise TwinError(error.field, error.problem, error.allowed) from error
+    except mujoco.FatalError as error:
+        raise TwinError("rendering", f"OpenGL fails: {error}", "OpenGL 1.5 with frame buffer objects") from error
+    mujoco.mjr_resizeOffscreen(width_px, height_px, context)
+    context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR  # keeps all digits: 32-bit floats are densest at zero
+    return gl, context
+
+
+def _floor_scene(model: mujoco.MjModel) -> mujoco.MjvScene:
+    """The floor's tiles, and no effect that changes a colour."""
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = 0
+    option.geomgroup[FLOOR_GROUP] = 1
+    option.flags[mujoco.mjtVisFlag.mjVIS_STATIC] = 1
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mjv_updateScene(model, data, option, None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_STATIC, scene)
+    scene.flags[:] = 0
+    scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 1
+    return scene
+
+
+def visible_tiles(world: World, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
+    """Which tiles' boxes reach into the camera's pyramid of view: a box is out if it lies beyond one of the four sides.
+
+    Args:
+        half_tangents: (2,) tangents of half the horizontal and vertical field of view.
+    """
+    tx, ty = half_tangents
+    inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
+    low, high = world.tile_low_m - world_from_camera[:3, 3], world.tile_high_m - world_from_camera[:3, 3]
+    # the corner of a box that lies farthest inwards of a side takes, along each axis, the end the normal points to
+    farthest = high @ np.maximum(inward, 0).T + low @ np.minimum(inward, 0).T
+    return np.all(farthest >= 0, axis=1)
+
+
+def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.float32) -> NDArray[np.float32]:
+    """Depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far): 1 / depth = z (1/near - 1/far) + 1/far."""
+    inverse = z_buffer * np.float32(1 / near_m - 1 / far_m) + np.float32(1 / far_m)
+    return np.where(z_buffer > 0, np.reciprocal(inverse), np.float32(np.inf))
+
+
+def pixel_rays(width_px: int, height_px: int, vfov_deg: float) -> Array:
+    """(height, width, 3) directions of the pixel centres in the camera, scaled to z = 1: times depth, points."""
+    focal_px = height_px / 2 / np.tan(np.deg2rad(vfov_deg) / 2)
+    u, v = np.meshgrid(np.arange(width_px) - (width_px - 1) / 2, np.arange(height_px) - (height_px - 1) / 2)
+    return np.stack([u / focal_px, v / focal_px, np.ones_like(u)], axis=-1)

@@ -1,0 +1,45 @@
+"""What each global alignment gained: key-point errors just before and just after it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.judge.numbers import number, rms
+from twin.judge.trajectory import anchor
+from twin.records import Alignment, Array, SurveyResult, Truth
+
+
+def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
+    """`tracks[]` of metrics.json, a row for each alignment at the end of a track.
+
+    `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`; an alignment beyond them (the truly global one at the
+    end) has no row. Their n poses are the last n key points up to the end of the track (all of them, or those of the
+    moving window), anchored at the first true pose like the trajectories.
+    """
+    rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
+    return [_row(alignment, before, after, result, truth) for alignment, before, after in rows]
+
+
+def _row(alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth) -> dict[str, Any]:
+    frames = result.key_frames[result.track_of_key <= alignment.track]
+    return {
+        "track": int(alignment.track),
+        "before_ga_rmse_m": _key_point_rmse(before, frames, result, truth),
+        "after_ga_rmse_m": _key_point_rmse(after, frames, result, truth),
+        "ga_ms": number(alignment.ms),
+        "nodes": int(alignment.nodes),
+        "edges": int(alignment.edges),
+    }
+
+
+def _key_point_rmse(poses: Array | None, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
+    """RMSE of the last key points of `frames` whose poses are given [m]."""
+    n = min(len(poses), len(frames))
+    if n == 0:
+        return None
+    true_from_estimated = anchor(result.online.world_from_camera[0], truth.trajectory.world_from_camera[0])
+    moved = (true_from_estimated @ poses[-n:])[:, :3, 3]
+    return rms(np.linalg.norm(moved - truth.trajectory.positions[frames[-n:]], axis=1))

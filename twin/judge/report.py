@@ -1,0 +1,104 @@
+"""report.html: one self-contained page that tells how a survey went, rebuilt from its run folder alone."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.judge import wording
+from twin.judge.budget import budget
+from twin.judge.figures import draw_all
+from twin.judge.run_folder import Run, load_run
+from twin.judge.style import COLOURS, ESTIMATES, LABELS
+
+#: Longest side of a photograph in the report [px].
+PHOTO_PX = 1400
+SAMPLES = 4
+
+
+def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
+    """Writes report.html into a run folder and returns its path.
+
+    Args:
+        folder: the run.
+        metrics: its figures, where metrics.json is still to be written.
+
+    Raises:
+        TwinError: the folder is no run, or one of its files is broken.
+    """
+    page = Path(folder) / "report.html"
+    page.write_text(render(load_run(folder, metrics)), encoding="utf-8")
+    return page
+
+
+def render(run: Run) -> str:
+    """The page as HTML."""
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters.update(
+        length=wording.length,
+        percent=wording.percent,
+        plain=wording.plain,
+        ms=wording.milliseconds,
+        angle=wording.angle,
+    )
+    source = files("twin.judge").joinpath("report.html.j2").read_text(encoding="utf-8")
+    return environment.from_string(source).render(**context(run))
+
+
+def context(run: Run) -> dict[str, Any]:
+    """All that the page shows."""
+    metrics = run.metrics or {}
+    return {
+        "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
+        "finished": run.finished,
+        "headline": wording.headline(run.metrics, run.scenario),
+        "metrics": metrics,
+        "cards": wording.key_figures(metrics),
+        "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
+        "budget": budget(metrics, run.scenario, run.key_points.n_per_key) if metrics else [],
+        "figures": draw_all(run),
+        "mosaic": mosaic_photo(run),
+        "samples": sample_photos(run),
+        "scenario": (run.folder / "scenario.resolved.toml").read_text(encoding="utf-8"),
+        "environment": {key: _text(value) for key, value in run.environment.items()},
+        "colours": COLOURS,
+    }
+
+
+def mosaic_photo(run: Run) -> str | None:
+    """The photo mosaic as an inlined JPEG."""
+    return jpeg_uri(run.rasters["mosaic"].values) if "mosaic" in run.rasters else None
+
+
+def sample_photos(run: Run) -> list[tuple[int, str, str | None]]:
+    """Frame number, left and right image of key points spread over the survey."""
+    frames = run.imaged_frames()
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames))).round().astype(int))
+    return [(frames[k], *_pair(run, frames[k])) for k in chosen]
+
+
+def _pair(run: Run, frame: int) -> tuple[str, str | None]:
+    left, right = (cv2.imread(str(run.image_file(frame, eye)), cv2.IMREAD_COLOR_RGB) for eye in ("left", "right"))
+    return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
+
+
+def jpeg_uri(image: NDArray[np.uint8]) -> str:
+    """An RGB image as an inlined JPEG, no side over `PHOTO_PX`."""
+    scale = PHOTO_PX / max(image.shape[:2])
+    if scale < 1:
+        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value) if isinstance(value, Mapping | list) else str(value)

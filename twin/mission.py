@@ -1,0 +1,148 @@
+"""What is to be flown, checked before anything is: scenario, floor, plan and the cells of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+import terrains
+from controllers import lawnmower
+from controllers.forecast import least_clearance
+from twin import geometry
+from twin.config import Scenario, Source
+from twin.errors import ScenarioError, TwinError
+from twin.geometry import Array
+from twin.judge.metrics import check_require
+from twin.records import MapGrid, StereoRig
+
+
+class Step(NamedTuple):
+    """One frame of the survey: where the left camera shall be, whether it is a key point, whether it keeps station."""
+
+    reference: lawnmower.Reference
+    key_point: bool
+    holding: bool
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A checked survey."""
+
+    scenario: Scenario
+    terrain: terrains.Terrain
+    plan: lawnmower.SurveyPlan
+    rig: StereoRig
+    grid: MapGrid
+
+    @property
+    def start(self) -> Array:
+        """(4, 4) reference position: world_from_camera where the survey begins, level, bow to the east."""
+        return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
+
+    def fly(self, track: int) -> Iterator[Step]:
+        """The frames of a track (from 1); every N-th is a key point, and the last one."""
+        n = round(self.plan.track_duration_s(track) * self.plan.frame_rate_hz)
+        for k in range(n + 1):
+            key_point = k % self.plan.n_frames_per_key == 0 or k == n
+            yield Step(self.plan.reference(track, k / self.plan.frame_rate_hz), key_point, False)
+
+    def hold(self, track: int) -> Iterator[Step]:
+        """The frames of half the station keeping after a track."""
+        end = self.plan.reference(track, self.plan.track_duration_s(track))
+        for _ in range(max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))):
+            yield Step(end, False, True)
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the whole survey."""
+        return sum(sum(1 for _ in self.fly(t)) + 2 * sum(1 for _ in self.hold(t)) for t in self.tracks)
+
+    @property
+    def tracks(self) -> range:
+        """Numbers of the tracks, from 1."""
+        return range(1, self.plan.n_tracks + 1)
+
+
+def prepare(scenario: Scenario, source: Source) -> Mission:
+    """Loads the floor and plans the survey.
+
+    Raises:
+        ScenarioError: all that stands in the way, each with file and line.
+    """
+    faults: list[str] = []
+    terrain = _attempt(lambda: load_terrain(scenario), source, faults)
+    plan = _attempt(lambda: make_plan(scenario), source, faults)
+    _attempt(lambda: check_require(scenario.require), source, faults)
+    if terrain is not None and plan is not None:
+        _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
+    if faults or terrain is None or plan is None:
+        raise ScenarioError(faults)
+    return Mission(scenario, terrain, plan, scenario.believed_rig(), _grid(scenario, plan))
+
+
+def _attempt(build, source: Source, faults: list[str]):
+    """What `build` returns, or None with its fault told."""
+    try:
+        return build()
+    except (terrains.TerrainFault, lawnmower.PlanFault) as fault:
+        faults.append(source.fault(TwinError(fault.field, fault.problem, fault.allowed)))
+    except TwinError as fault:
+        faults.append(source.fault(fault))
+    return None
+
+
+def load_terrain(scenario: Scenario) -> terrains.Terrain:
+    """The floor of the scenario, generated or read."""
+    t = scenario.terrain
+    if t.kind != "file":
+        if t.height_file or t.texture_file:
+            key = "height_file" if t.height_file else "texture_file"
+            raise TwinError(f"terrain.{key}", f"is not read by a generated floor ({t.kind})", 'terrain.kind = "file"')
+        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, t.texture_px_m, scenario.seed)
+    if t.height_file is None:
+        raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
+    return terrains.load(
+        t.height_file, t.texture_file, t.texture_px_m, t.height_spacing_m, t.height_range_m, scenario.seed
+    )
+
+
+def make_plan(scenario: Scenario) -> lawnmower.SurveyPlan:
+    """The plan of the scenario."""
+    p, rig = scenario.plan, scenario.believed_rig()
+    return lawnmower.plan(
+        p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
+        rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz,
+    )  # fmt: skip
+
+
+def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: lawnmower.SurveyPlan) -> None:
+    """The plan stays over the floor and clear of it."""
+    size = terrain.size_m
+    if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
+        shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
+        raise TwinError("plan.area_m", f"{shown} m is larger than the terrain", f"up to {size[0]:.2f} x {size[1]:.2f} m")
+    clearance = least_clearance(plan, terrain.height_at)
+    if not clearance.inside:
+        raise TwinError("plan.area_m", "the path leaves the terrain", f"a path inside {size[0]:.2f} x {size[1]:.2f} m")
+    if clearance.least_m < scenario.plan.clearance_m:
+        needed = scenario.plan.altitude_m - clearance.least_m + scenario.plan.clearance_m
+        raise TwinError(
+            "plan.altitude_m",
+            f"{scenario.plan.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
+            f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
+            f"at least {needed:.2f} for {scenario.plan.clearance_m:g} m of clearance",
+        )
+
+
+def _grid(scenario: Scenario, plan: lawnmower.SurveyPlan) -> MapGrid:
+    """Cells that cover all that the plan can see at the reference plane, and half a metre more."""
+    corners = np.concatenate([plan.waypoints(t) for t in range(1, plan.n_tracks + 1)])[:, :2]
+    across_m, along_m = plan.footprint_m
+    margin = np.array([along_m, across_m]) / 2 + 0.5
+    cell = scenario.map.cell_m
+    west, south = np.floor((corners.min(axis=0) - margin) / cell) * cell
+    east, north = np.ceil((corners.max(axis=0) + margin) / cell) * cell
+    return MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))

@@ -1,0 +1,64 @@
+"""Thrusters: from commands to thrust, with their lag."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from scenes.bluerov2 import Vehicle as Vessel
+from twin.simulate.hydrodynamics import angular_first
+
+Array = NDArray[np.float64]
+
+
+def steady_thrust_n(command: Array, coefficients: Array) -> Array:
+    """Thrust [N] at rest of commands in [-1, 1]: an odd polynomial, coefficients from the highest power down to u."""
+    square = command * command
+    return command * np.polyval(coefficients, square)
+
+
+class LaggedThrusters:
+    """The thrusters of a vessel: each follows its commanded steady thrust with the vessel's linear lag.
+
+    The lag is discretised exactly for commands that are held over a step.
+
+    Args:
+        vessel: positions, directions, thrust curve and lag.
+        timestep_s: step.
+    """
+
+    def __init__(self, vessel: Vessel, timestep_s: float):
+        numerator, denominator = vessel.thruster_lag
+        self._a, self._b = _held(denominator, timestep_s)
+        self._c = np.zeros(len(self._a))
+        self._c[-len(numerator) :] = numerator
+        self._effects = angular_first(vessel.allocation)
+        self._coefficients = vessel.thrust_coefficients
+        self._state = np.zeros((len(self._a), self._effects.shape[1]))
+
+    def thrust_n(self) -> Array:
+        """Thrust of each at this instant (n,)."""
+        return self._c @ self._state
+
+    def wrench(self) -> Array:
+        """Their wrench on the body at this instant, [moment, force] in the body (6,) [N m, N]."""
+        return self._effects @ self.thrust_n()
+
+    def step(self, command: Array) -> None:
+        """Holds commands (n,), cut to [-1, 1], over one step."""
+        steady_n = steady_thrust_n(np.clip(command, -1, 1), self._coefficients)
+        self._state = self._a @ self._state + self._b * steady_n
+
+
+def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
+    """Controllable canonical form of 1 / denominator (leading coefficient 1), exact for inputs held over a step.
+
+    exp([[A, B], [0, 0]] dt) holds both matrices of the step (Van Loan 1978). (n + 1,) -> (n, n), (n, 1).
+    """
+    n = len(denominator) - 1
+    rates = np.zeros((n + 1, n + 1))
+    rates[0, :n], rates[0, n] = -denominator[1:], 1.0
+    rates[1:n, : n - 1] = np.eye(n - 1)
+    step = expm(rates * timestep_s)
+    return step[:n, :n], step[:n, n:]

@@ -1,0 +1,44 @@
+"""How long every stage took."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+#: The stages of a survey, in the order of the data.
+STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map")
+
+
+class Stopwatch:
+    """Collects the durations of named stages; `with watch("f2f"): ...`."""
+
+    def __init__(self) -> None:
+        self._durations_s: dict[str, list[float]] = defaultdict(list)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._durations_s[stage].append(time.perf_counter() - start)
+
+    def summary(self) -> dict[str, dict[str, float | int | None]]:
+        """Per stage: count, mean and 95th percentile [ms], total [s]."""
+        return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
+
+
+def _summary(durations_s: list[float]) -> dict[str, float | int | None]:
+    if not durations_s:
+        return {"count": 0, "mean_ms": None, "p95_ms": None, "total_s": 0.0}
+    ms = np.array(durations_s) * 1e3
+    return {
+        "count": len(ms),
+        "mean_ms": float(ms.mean()),
+        "p95_ms": float(np.percentile(ms, 95)),
+        "total_s": float(ms.sum() / 1e3),
+    }
