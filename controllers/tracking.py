@@ -38,7 +38,8 @@ class HullModel(NamedTuple):
         The Munk moment turns a hull broadside. At survey speed it outweighs this vehicle's righting moment in pitch.
         """
         drag = (self.linear_drag[3:] + self.quadratic_drag[3:] * np.abs(velocity)) * velocity
-        return np.concatenate([np.cross(velocity, self.added_mass * velocity), drag])
+        (u, v, w), (m_x, m_y, m_z) = velocity, self.added_mass
+        return np.array([(m_z - m_y) * v * w, (m_x - m_z) * w * u, (m_y - m_x) * u * v, *drag])
 
 
 class Gains(NamedTuple):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scenes.bluerov2 import BLUEROV2_HEAVY, Vehicle
 from scenes.floor import add_floor
-from scenes.gl import mujoco
+from scenes.gl import MjModel, MjsBody, MjSpec, mujoco
 from terrains import Terrain
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class World:
         lamp_site_ids: in the order given.
     """
 
-    model: mujoco.MjModel
+    model: MjModel
     terrain: Terrain
     tile_geom_ids: NDArray[np.int64]
     tile_low_m: Array
@@ -82,7 +82,7 @@ def build(
     )
 
 
-def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -> mujoco.MjSpec:
+def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -> MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "seabed"
     spec.option.timestep = timestep_s
@@ -94,7 +94,7 @@ def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -
     return spec
 
 
-def _add_vehicle(spec: mujoco.MjSpec, vehicle: Vehicle) -> mujoco.MjsBody:
+def _add_vehicle(spec: MjSpec, vehicle: Vehicle) -> MjsBody:
     """The rigid body about its centre of gravity, with sites at its thrusters and a simple hull to look at."""
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint(name="vehicle")
@@ -103,12 +103,13 @@ def _add_vehicle(spec: mujoco.MjSpec, vehicle: Vehicle) -> mujoco.MjsBody:
     _add_hull(body, vehicle)
     pairs = zip(vehicle.thruster_positions_m, vehicle.thruster_directions, strict=True)
     for k, (position, direction) in enumerate(pairs):
-        site = body.add_site(name=f"thruster_{k}", pos=position, size=[0.04, 0.02, 0.02], group=VEHICLE_GROUP)
-        site.alt.zaxis = direction
+        quaternion = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quaternion, direction)
+        body.add_site(name=f"thruster_{k}", pos=position, quat=quaternion, size=[0.04] * 3, group=VEHICLE_GROUP)
     return body
 
 
-def _add_hull(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
+def _add_hull(body: MjsBody, vehicle: Vehicle) -> None:
     """Float and frame as two boxes, blue over black; massless, since the body's inertia is given."""
     length, width, height = vehicle.size_m / 2
     looks = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
@@ -116,7 +117,7 @@ def _add_hull(body: mujoco.MjsBody, vehicle: Vehicle) -> None:
     body.add_geom(name="frame", size=[length, width / 2, height / 2], pos=[0, 0, -0.03], rgba=[0.1] * 3 + [1], **looks)
 
 
-def _add_cameras(body: mujoco.MjsBody, baseline_m: float, body_from_camera: Array, vfov_deg: float) -> None:
+def _add_cameras(body: MjsBody, baseline_m: float, body_from_camera: Array, vfov_deg: float) -> None:
     """The stereo pair; MuJoCo's cameras have y up and look along -z."""
     rotation = body_from_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     quaternion = np.zeros(4)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.gl import mujoco
+from scenes.gl import MjSpec, mujoco
 from terrains import Terrain
 
 TILE_CELLS = 48  #: measured: smaller tiles cost state changes, larger ones vertices that no camera sees
@@ -29,7 +29,7 @@ class Tile(NamedTuple):
     high_m: NDArray[np.float64]
 
 
-def add_floor(spec: mujoco.MjSpec, terrain: Terrain) -> list[Tile]:
+def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
     """Adds the terrain to the model's world as fixed, glowing tiles without contact."""
     ny, nx = terrain.height_m.shape
     cells = tile_cells(ny - 1, nx - 1)
@@ -49,7 +49,7 @@ def tile_cells(n_rows: int, n_cols: int) -> int:
     return cells
 
 
-def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
+def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
     name = f"floor_{rows.start}_{cols.start}"
     texture, texcoord = _tile_texture(terrain, rows, cols)
     image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
@@ -72,7 +72,7 @@ def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, rows: slice, cols: slice) -
 
 
 def _add_mesh(
-    spec: mujoco.MjSpec, name: str, terrain: Terrain, rows: slice, cols: slice, texcoord: NDArray[np.float64]
+    spec: MjSpec, name: str, terrain: Terrain, rows: slice, cols: slice, texcoord: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Adds a tile's triangles, two a cell along (r, c)-(r + 1, c + 1); returns its vertices (n, 3) in the world [m]."""
     heights = terrain.height_m[rows, cols]

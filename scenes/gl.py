@@ -8,12 +8,12 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 INSTALL_LINE = "apt-get install -y libegl1 libgl1-mesa-dri"
 
 
-class GlError(RuntimeError):
+class GlMissing(RuntimeError):  # noqa: N818 (said as it is)
     """No OpenGL to draw with: the field, what is wrong, what would be right."""
 
     def __init__(self, problem: str):
@@ -42,26 +42,31 @@ def _prepare() -> str:
 
 _why_missing = _prepare()
 
-import mujoco  # noqa: E402
+import mujoco as _mujoco  # noqa: E402
 
-__all__ = ["INSTALL_LINE", "GlError", "mujoco", "offscreen_context"]
+mujoco: Any = _mujoco  #: its names come from compiled modules, which type checkers cannot see into
+#: For signatures: MuJoCo's model, its source and a body of that, what is drawn.
+MjModel: TypeAlias = Any
+MjSpec: TypeAlias = Any
+MjsBody: TypeAlias = Any
+MjvScene: TypeAlias = Any
 
 
 def offscreen_context(width_px: int, height_px: int) -> Any:
     """A current OpenGL context without a window; ``free()`` gives it back.
 
     Raises:
-        GlError: with the line that installs what is missing.
+        GlMissing: with the line that installs what is missing.
     """
     if _why_missing:
-        raise GlError(_why_missing)
+        raise GlMissing(_why_missing)
     try:
         if os.environ.get("MUJOCO_GL", "").strip().lower() == "egl":
             from mujoco.egl import GLContext  # also where somebody imported mujoco before this module
         else:
-            GLContext = mujoco.GLContext  # pyright: ignore[reportAttributeAccessIssue]
+            GLContext = mujoco.GLContext
         context = GLContext(width_px, height_px)
         context.make_current()
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise GlError(f"{type(error).__name__}: {error}") from error
+        raise GlMissing(f"{type(error).__name__}: {error}") from error
     return context

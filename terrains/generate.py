@@ -37,7 +37,8 @@ def generate(
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
     shape = texture_shape((ny, nx), grid_m, texture_px_m)
     form, colours = np.random.default_rng(seed).spawn(2)
-    height_m = span(KINDS[kind]((ny, nx), grid_m, relief_m, form), relief_m, base_m)
+    form_of = KINDS[kind] if relief_m > 0 else _flat
+    height_m = span(form_of((ny, nx), grid_m, relief_m, form), relief_m, base_m)
     texel_m = (nx - 1) * grid_m / shape[1]
     texture = paint(kind, height_m, shape, texel_m, colours)
     return Terrain(height_m, grid_m, -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2, texture, texel_m)
@@ -87,7 +88,7 @@ def _staircase(level: Heights) -> Heights:
     """Whole steps with smooth risers."""
     step = np.floor(level)
     share = np.clip((level - step - 0.35) / 0.3, 0, 1)
-    return step + share * share * (3 - 2 * share)
+    return (step + share * share * (3 - 2 * share)).astype(np.float32)
 
 
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
@@ -115,11 +116,10 @@ def _soften(height: Heights, relief_m: float, grid_m: float) -> Heights:
     """The floor smoothed just as far as its steepest half percent, once spanned to the relief, keeps to 60 deg."""
     sigma_px = 0.5
     for _ in range(12):
-        spanned = span(height, relief_m, 0.0)
-        slope = np.hypot(*np.gradient(spanned, grid_m)) if min(height.shape) > 1 else np.zeros(1)
-        if np.percentile(slope, 99.5) <= STEEPEST:
+        north, east = np.gradient(span(height, relief_m, 0.0), grid_m)
+        if np.percentile(np.hypot(north, east), 99.5) <= STEEPEST:
             return height
-        height = cv2.GaussianBlur(height, (0, 0), sigma_px)
+        height = np.asarray(cv2.GaussianBlur(height, (0, 0), sigma_px), np.float32)
         sigma_px *= 1.3
     return height
 

@@ -33,7 +33,8 @@ def _stretch(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: float
     """Noise cells drawn out to scale_px each, smoothly."""
     affine = np.array([[1 / scale_px, 0, 1], [0, 1 / scale_px, 1]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
+    drawn = cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(drawn, np.float32)
 
 
 def grain(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -53,4 +54,4 @@ def grain(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.
         value = cv2.resize(value, (cols, rows), interpolation=cv2.INTER_LINEAR)
         noise = np.frombuffer(rng.bytes(rows * cols), np.uint8).reshape(rows, cols)
         value = cv2.addWeighted(value, 1.0, noise, spread, -128 * spread)
-    return value
+    return np.asarray(value, np.uint8)

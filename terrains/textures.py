@@ -53,13 +53,13 @@ def _cover(
     north_up = np.ascontiguousarray(height_m[::-1])
     span = max(float(np.ptp(north_up)), 1e-6)
     spacing_px = shape[1] / (height_m.shape[1] - 1)
-    slope = np.hypot(*np.gradient(north_up)) / (spacing_px * texel_m)
+    down, right = np.gradient(north_up, spacing_px * texel_m)
     patch_px = 1.0 / (spacing_px * texel_m)  # patches of a metre and less
     patches = fractal_field(height_m.shape, patch_px, 0.6, rng)
     level = (north_up - north_up.min()) / span
-    cover = 40 + 110 * level + 60 * np.clip(slope, 0, 1.5) + 26 * patches
+    cover = 40 + 110 * level + 60 * np.clip(np.hypot(down, right), 0, 1.5) + 26 * patches
     small = np.clip(cv2.GaussianBlur(cover, (0, 0), 1.0), 0, 255).astype(np.uint8)
-    return cv2.resize(small, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def _palette(materials: tuple[tuple[tuple[int, int, int], ...], ...]) -> NDArray[np.uint8]:
@@ -69,8 +69,8 @@ def _palette(materials: tuple[tuple[tuple[int, int, int], ...], ...]) -> NDArray
     return np.rint(np.concatenate(ramps)).astype(np.uint8)
 
 
-def _colour(index: NDArray[np.uint8], palette: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return cv2.merge([cv2.LUT(index, np.ascontiguousarray(palette[:, k])) for k in range(3)])
+def _colour(index: cv2.typing.MatLike, palette: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.merge([cv2.LUT(index, np.ascontiguousarray(palette[:, k])) for k in range(3)]), np.uint8)
 
 
 def read_image(file: Path) -> NDArray[np.uint8]:

@@ -166,6 +166,7 @@ def _write_network(file: Path, result: SurveyResult) -> None:
 def _write_key_points(folder: Path, result: SurveyResult, rig: StereoRig) -> None:
     rng = np.random.default_rng(1)
     index = {"frames": result.key_frames.tolist(), "tracks": result.track_of_key.tolist(), "n_per_key": 8}
+    index["timing_ms"] = {"f2f": [12.0] * len(result.online), "stereo": [35.0] * len(result.key_frames)}
     (folder / "index.json").write_text(json.dumps(index))
     ground = cv2.GaussianBlur(rng.normal(0, 1, (600, 900)), (0, 0), 1.5)
     ground = np.clip(110 + 45 * ground / ground.std(), 0, 255).astype(np.uint8)

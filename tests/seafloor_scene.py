@@ -1,4 +1,4 @@
-"""A small ray-caster of height fields: truth for the tests of `twin.estimate` that needs no GL and shares no code with it."""
+"""A small ray-caster of height fields: truth for tests of `twin.estimate`, without GL and sharing no code with it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ def plane(slope_x: float = 0.0, slope_y: float = 0.0, texture_px_m: float = 0.00
     return Seafloor(height, 0.5, -8.0, -8.0, smooth_texture(seed), texture_px_m)
 
 
-def down_camera(x_m: float, y_m: float, z_m: float, rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def down_camera(
+    x_m: float, y_m: float, z_m: float, rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
     """world_from_camera of a down-looking camera at a position, its body turned by roll, pitch, yaw."""
     return geometry.pose(
         geometry.rotation_from_rpy(*rpy_rad) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([x_m, y_m, z_m])
@@ -53,10 +55,14 @@ def down_camera(x_m: float, y_m: float, z_m: float, rpy_rad: tuple[float, float,
 def small_rig(width_px: int = 320, height_px: int = 240, hfov_deg: float = 60.0, baseline_m: float = 0.15) -> StereoRig:
     """The rig of the reef survey, or one like it."""
     focal_px = width_px / 2 / np.tan(np.deg2rad(hfov_deg / 2))
-    return StereoRig(width_px, height_px, focal_px, baseline_m, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
+    return StereoRig(
+        width_px, height_px, focal_px, baseline_m, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
+    )
 
 
-def look(floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, samples: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def look(
+    floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, samples: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     """Grey image (H, W) float32, area-sampled, and true depth (H, W) [m] at pixel centres of one camera."""
     pose = np.ascontiguousarray(world_from_camera)
     args = (

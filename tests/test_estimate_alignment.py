@@ -74,7 +74,8 @@ def test_alignment_agrees_with_eq_7_solved_with_lagrange_multipliers():
     start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 0.02) for p in poses[1:]]
     direct, cov = mixed_adjustment(start, links)
     aligned = align(key_points(start), links, ANCHOR, RIG, NOISE)
-    np.testing.assert_allclose(aligned.poses, direct, atol=2e-6)
+    # the bordered system adds residuals as vectors: of 1e-3 rad they err by 5e-4 of themselves, 3e-6 at 5 m
+    np.testing.assert_allclose(aligned.poses, direct, atol=5e-6)
     for k in range(1, len(poses)):
         block = cov[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k]
         np.testing.assert_allclose(aligned.covs[k], block, atol=0.02 * np.abs(block).max())

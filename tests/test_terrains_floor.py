@@ -35,6 +35,12 @@ def test_a_flat_floor_is_flat_at_its_base() -> None:
     assert np.all(floor("flat").height_m == np.float32(0.15))
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_floor_without_relief_is_flat_and_one_of_a_single_cell_is_a_floor(kind: str) -> None:
+    assert np.all(terrains.generate(kind, (2.0, 1.0), 0.0, 0.15, 0.1, 0.05, 0).height_m == np.float32(0.15))
+    assert np.isfinite(terrains.generate(kind, (0.1, 0.1), 0.2, 0.0, 0.1, 0.05, 0).height_m).all()
+
+
 @pytest.mark.parametrize("kind", ("flat", *KINDS))
 def test_a_seed_fixes_the_floor_and_its_texture(kind: str) -> None:
     one, same, other = floor(kind, 1), floor(kind, 1), floor(kind, 2)
@@ -87,9 +93,7 @@ def test_height_at_the_nodes_is_the_grid_and_nan_outside() -> None:
     ],
 )
 def test_a_floor_that_cannot_be_had_names_its_key(change: dict[str, object], field: str) -> None:
-    wanted = {
-        "kind": "flat", "size_m": (6.0, 4.0), "relief_m": 0.1, "base_m": 0.0, "grid_m": 0.1, "texture_px_m": 0.01, "seed": 0,
-    }  # fmt: skip
+    wanted = dict(kind="flat", size_m=(6.0, 4.0), relief_m=0.1, base_m=0.0, grid_m=0.1, texture_px_m=0.01, seed=0)
     with pytest.raises(TerrainFault) as fault:
         terrains.generate(**(wanted | change))  # pyright: ignore[reportArgumentType]
     assert fault.value.field == field and fault.value.allowed

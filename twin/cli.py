@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,6 +34,7 @@ SetOption = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all randomness.")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/NAME-SEED where not given.")]
+PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-plan.png where not given.")]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as JSON and nothing else.")]
 
@@ -80,7 +80,7 @@ def run(
 def plan(
     scene: SceneArgument,
     overrides: SetOption = [],  # noqa: B006  typer copies it
-    out: Annotated[Path | None, typer.Option("--out", help="The picture, a PNG; NAME-plan.png where not given.")] = None,
+    out: PictureOption = None,
 ) -> None:
     """Show the numbers and a picture of a survey; nothing is simulated."""
     from twin import plan as planning
@@ -97,20 +97,15 @@ def report(folder: RunArgument) -> None:
     """Write the report of a run again from its folder."""
     from twin.judge.report import write_report
 
-    print(f"Report: {write_report(_existing_run(folder))}")
+    print(f"Report: {write_report(folder)}")
 
 
 @app.command()
-def view(
-    folder: RunArgument,
-    web: Annotated[bool, typer.Option("--web", help="Serve it to a browser on this machine.")] = False,
-) -> None:
+def view(folder: RunArgument) -> None:
     """Open the recording of a run in Rerun."""
-    recording = _existing_run(folder) / "run.rrd"
-    if not recording.is_file():
-        raise TwinError("RUN", f"{folder} has no recording", "a run that came to its end")
-    serve = ["--serve-web", "--bind", "127.0.0.1"] if web else []
-    raise typer.Exit(subprocess.call([sys.executable, "-m", "rerun", str(recording), *serve]))
+    from twin.view import open_viewer
+
+    raise typer.Exit(open_viewer(folder))
 
 
 @app.command()
@@ -179,9 +174,3 @@ def _checked(folder: Path) -> Path:
 
 def _empty(folder: Path) -> bool:
     return folder.is_dir() and not any(folder.iterdir())
-
-
-def _existing_run(folder: Path) -> Path:
-    if not (folder / "scenario.resolved.toml").is_file():
-        raise TwinError("RUN", f"{folder} is not the folder of a run", "one that twin run has written")
-    return folder

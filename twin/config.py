@@ -213,7 +213,7 @@ class Source(BaseModel):
     overrides: tuple[str, ...] = ()
 
     def fault(self, error: TwinError) -> str:
-        """`FILE:LINE: key: what is wrong (allowed: ...)`; the line of the nearest enclosing key that is written down."""
+        """`FILE:LINE: key: what is wrong (allowed: ...)`; the line is of the nearest enclosing key that is there."""
         if any(o.split("=", 1)[0].strip() == error.field for o in self.overrides):
             return f"--set: {error}"
         key = error.field
@@ -384,10 +384,27 @@ def _explain(item: Any) -> TwinError:
         return TwinError(where, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
     value = item.get("input")
     shown = "" if isinstance(value, dict) else f"{value!r}: "
-    message = item["msg"].removeprefix("Input should be ")
     if item["type"] == "missing":
         return TwinError(where, "missing", "a value must be given")
-    return TwinError(where, f"{shown}not allowed", message)
+    return TwinError(where, f"{shown}not allowed", _ALLOWED.get(item["type"]) or item["msg"].removeprefix(_PREFIX))
+
+
+_PREFIX = "Input should be "
+#: What pydantic says in words of its own, in the words of a scenario.
+_ALLOWED = {
+    "model_type": "a section",
+    "tuple_type": "a list",
+    "dict_type": "a section",
+    "string_type": "a text",
+    "string_too_short": "a text that is not empty",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+}
 
 
 def _fields(location: Iterable[Any]) -> list[str]:

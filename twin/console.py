@@ -28,8 +28,8 @@ def progress_bar() -> Iterator[Callable[[Progress], None]]:
     if not console.is_terminal:
         yield lambda _: None
         return
-    columns = (TextColumn("{task.description:>7}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    with Bar(*columns, console=console) as bar:
+    stage, words = TextColumn("{task.description:>7}"), TextColumn("{task.fields[note]}")
+    with Bar(stage, BarColumn(), TaskProgressColumn(), words, console=console) as bar:
         task = bar.add_task("survey", total=1.0, note="")
         yield lambda now: bar.update(task, completed=now.share, description=now.stage, note=note(now))
 

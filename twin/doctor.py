@@ -33,7 +33,8 @@ class Finding(NamedTuple):
     remedy: str = ""
 
     def __str__(self) -> str:
-        return f"ok       {self.name}: {self.found}" if self.ok else f"LACKING  {self.name}: {self.found}\n    {self.remedy}"
+        line = f"{'ok' if self.ok else 'LACKING':<8} {self.name}: {self.found}"
+        return line if self.ok else f"{line}\n{'':<8} mend it by: {self.remedy}"
 
 
 def examine(folder: Path) -> list[Finding]:

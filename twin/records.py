@@ -77,7 +77,7 @@ class Readings:
 
 @dataclass(frozen=True)
 class Frame:
-    """All that an estimator gets: time, images (height, width, 3) uint8 RGB, readings. The right image is there at key points."""
+    """All that an estimator gets: time, images (H, W, 3) uint8 RGB, readings; the right image at key points."""
 
     index: int
     time_s: float
@@ -172,7 +172,7 @@ class Alignment(NamedTuple):
 class SurveyResult:
     """What the estimators leave behind: the three trajectories, the network and the map.
 
-    ``key_frames`` are the rows of the trajectories that are key points; ``track_of_key`` the track (from 1) each belongs to.
+    ``key_frames`` are the rows of the trajectories that are key points; ``track_of_key`` the track (from 1) of each.
     ``node_cov`` (n_keys, 6, 6) is the marginal covariance of each final key-point pose, in the camera.
     ``before_ga``/``after_ga`` hold per track the key-point poses (n, 4, 4) just before and after its alignment.
     """

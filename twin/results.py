@@ -7,7 +7,7 @@ import os
 import platform
 import resource
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twin import config, view
-from twin.estimate.depth_filter import KeyPointImages, build_map
+from twin.estimate.map_builder import KeyPointImages, build_map
 from twin.estimate.pipeline import Navigator
 from twin.exchange import geotiff, mesh, posegraph
 from twin.judge.metrics import evaluate
@@ -84,7 +84,9 @@ def conclude(
     """Final alignment, map, judgement, report and recording; what fails on a full disk is told in `reason`."""
     result = navigator.finish()
     for link in navigator.dropped:
-        log.write("link dropped", i=link.i, j=link.j)
+        log.write("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
+    for alignment in result.alignments:
+        log.write("aligned", **alignment._asdict())
     elevation = None
     if len(result.key_frames):
         with watch("map"):
@@ -107,12 +109,10 @@ def conclude(
 def _map(mission: Mission, navigator: Navigator, result: SurveyResult, say: Callable[[float], None]) -> ElevationMap:
     poses = result.final.world_from_camera[result.key_frames]
 
-    def images() -> Iterator[KeyPointImages]:
-        for k, row in enumerate(result.key_frames):
-            say(k / len(result.key_frames))
-            yield KeyPointImages(*navigator.spool.pair(int(row)))
-
-    return build_map(images(), poses, result.node_cov, mission.rig, mission.grid)
+    pairs = (KeyPointImages(*navigator.spool.pair(int(row))) for row in result.key_frames)
+    return build_map(
+        pairs, poses, result.node_cov, mission.rig, mission.grid, progress=lambda k: say(k / len(result.key_frames))
+    )
 
 
 def _judge(mission, result, elevation, truth, watch, wall_s, status, reason) -> dict[str, Any]:
@@ -151,13 +151,12 @@ def _write_files(
     }
     (folder / "keypoints" / "index.json").write_text(json.dumps(index))
     grid = mission.grid
-    geotiff.write(folder / "dem_truth.tif", grid, truth.height_m)
+    geotiff.write_layer(folder / "dem_truth.tif", truth.height_m, grid, "true elevation [m]")
     if elevation is not None:
-        geotiff.write(folder / "dem.tif", grid, elevation.height_m)
-        geotiff.write(folder / "dem_sigma.tif", grid, elevation.sigma_m)
-        geotiff.write(folder / "dem_error.tif", grid, np.where(truth.seen, elevation.height_m - truth.height_m, np.nan))
-        geotiff.write(folder / "mosaic.tif", grid, elevation.mosaic)
-        mesh.write(folder / "mesh.glb", elevation)
+        geotiff.write_map(folder, elevation)
+        error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
+        geotiff.write_layer(folder / "dem_error.tif", error_m, grid, "estimated minus true elevation [m]")
+        mesh.write_glb(folder / "mesh.glb", elevation)
 
 
 def _finish_folder(folder: Path, metrics: dict[str, Any]) -> None:

@@ -38,10 +38,10 @@ class DepthMap(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """The fused map of the new key point, and which pixels of the old map went into it."""
+    """The fused map of the new key point, and which of its pixels took information of the old map in."""
 
     fused: DepthMap
-    kept: Mask
+    taken: Mask
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
@@ -52,7 +52,7 @@ def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
 
 
 def fuse(prior: DepthMap, seen: DepthMap) -> DepthMap:
-    """Scalar Kalman update of every pixel that passes the gate (z - h)^2 < GATE (P + R); one that fails keeps its prior.
+    """Scalar Kalman update of every pixel that passes the gate (z - h)^2 < GATE (P + R); others keep their prior.
 
     Where only one of the two knows, that one stands.
     """
@@ -79,8 +79,7 @@ def carry(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, ri
     prior = DepthMap(*_pull(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args))
     depth, variance = new.depth_m.copy(), new.variance_m2.copy()
     taken = _fuse(depth, variance, prior.depth_m, prior.variance_m2, GATE)
-    kept = _kept(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), depth, taken, *args)
-    return Carried(DepthMap(depth, variance), kept)
+    return Carried(DepthMap(depth, variance), taken)
 
 
 def motion_depth(
@@ -100,7 +99,14 @@ def motion_depth(
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
     flow = epipolar.refine(gray, old_gray, np.float32(focal_baseline) / current.depth_m, view, iterations=1)
-    pose_variance = _pose_variance(flow.disparity_px, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, rig.focal_px, focal_baseline)
+    pose_variance = _pose_variance(
+        flow.disparity_px,
+        old_from_new[:3, :3].copy(),
+        old_from_new[:3, 3].copy(),
+        step_cov,
+        rig.focal_px,
+        focal_baseline,
+    )
     sigma = np.sqrt(flow.sigma_px**2 + pose_variance + np.float32(MOTION_FLOOR_PX**2))
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
 
@@ -172,7 +178,9 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
     s, t = x - j, y - i
     wa, wb, wc, we = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
     inverse = wa / a + wb / b + wc / c + we / e
-    return 1 / inverse, wa * variance[i, j] + wb * variance[i, j + 1] + wc * variance[i + 1, j] + we * variance[i + 1, j + 1]
+    return 1 / inverse, wa * variance[i, j] + wb * variance[i, j + 1] + wc * variance[i + 1, j] + we * variance[
+        i + 1, j + 1
+    ]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -236,25 +244,6 @@ def _quadratic(row, cov):
         for j in range(6):
             total += row[i] * cov[i, j] * row[j]
     return total
-
-
-@njit(cache=True, nogil=True)
-def _kept(old, rotation, translation, new, taken, focal, focal_baseline, jump):
-    """Pixels of the old map whose information went into the new one: they land on a pixel that took it, at its depth."""
-    height, width = old.shape
-    cx, cy = (width - 1) / 2, (height - 1) / 2
-    kept = np.zeros(old.shape, np.bool_)
-    for v in range(height):
-        for u in range(width):
-            if not old[v, u] > 0:
-                continue
-            x, y, z = _moved(u, v, old[v, u], rotation, translation, focal, cx, cy)
-            if z <= 0:
-                continue
-            j, i = int(np.floor(focal * x / z + cx + 0.5)), int(np.floor(focal * y / z + cy + 0.5))
-            if 0 <= i < height and 0 <= j < width and taken[i, j]:
-                kept[v, u] = focal_baseline * abs(1 / z - 1 / new[i, j]) < jump
-    return kept
 
 
 @njit(cache=True, nogil=True)

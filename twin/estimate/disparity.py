@@ -1,4 +1,4 @@
-"""Dense stereo disparity with its uncertainty (part P12 of the method): semi-global matching, then sub-pixel refinement."""
+"""Dense stereo disparity with its uncertainty (part P12 of the method): a semi-global search, then refinement."""
 
 from __future__ import annotations
 
@@ -14,12 +14,16 @@ from twin.records import StereoRig
 Gray = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
-#: Block of the semi-global search [px]: 5 finds more than 3 in veiled water, and its edges are as sharp after refinement.
+#: Block of the semi-global search [px]: 5 finds more than 3 in veiled water; after refinement edges are as sharp.
 BLOCK_PX = 5
+#: Surfaces of fewer pixels are mismatches.
+SPECKLE_PX = 60
 #: Window of the contrast normalisation before the search [px].
 WINDOW_PX = 25
 #: What refinement cannot know (interpolation, relief inside the window): never claim less than this [px].
 FLOOR_PX = 0.03
+#: Widest search [share of the image's width].
+WIDEST = 0.4
 #: A disparity less certain than this is none [px].
 LIMIT_PX = 0.5
 
@@ -34,9 +38,9 @@ class Disparity(NamedTuple):
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
     """Disparity of every left pixel that both eyes see.
 
-    Semi-global matching (Hirschmueller 2008, three-way)
-    finds it to a pixel, on locally normalised contrast and with the left-right check against half-occlusion; its sub-pixel part locks to whole pixels
-    (biased by 0.02 px, spread 0.17 px on rendered reefs), so `epipolar.refine` replaces it (0.002 px, 0.06 px).
+    Semi-global matching (Hirschmueller 2008, three-way) finds it to a pixel, on locally normalised contrast and with
+    the left-right check against half-occlusion. Its sub-pixel part locks to whole pixels (bias 0.02 px, spread 0.17 px
+    on a rendered reef), so `epipolar.refine` replaces it (bias 0.002 px, spread 0.06 px).
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
@@ -49,9 +53,20 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
     return Disparity(np.where(known, fine.disparity_px, np.nan), np.where(known, sigma, np.nan).astype(np.float32))
 
 
-def max_disparity(rig: StereoRig, nearest_m: float) -> int:
-    """Largest disparity [px] of a scene no nearer than `nearest_m`, as the search wants it: a multiple of 16."""
-    return int(np.ceil(rig.focal_px * rig.baseline_m / nearest_m / 16)) * 16
+class Reach:
+    """How far to search: up to the largest disparity of the last pair and a margin (P12), wide at first or if fixed."""
+
+    def __init__(self, rig: StereoRig, fixed_px: int | None = None):
+        self._fixed = fixed_px is not None
+        self._widest = fixed_px or int(WIDEST * rig.width_px)
+        self.max_disparity_px = self._widest
+
+    def see(self, disparity_px: Map) -> None:
+        """Adapts to the pair just matched; a pair without any disparity widens the search again."""
+        known = disparity_px[np.isfinite(disparity_px)]
+        if not self._fixed:
+            wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest
+            self.max_disparity_px = min(int(wanted), self._widest)
 
 
 def _search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
@@ -65,6 +80,8 @@ def _search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
         P2=32 * BLOCK_PX**2,
         disp12MaxDiff=1,
         preFilterCap=63,
+        speckleWindowSize=SPECKLE_PX,
+        speckleRange=1,
         mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
     )
     padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
@@ -75,7 +92,7 @@ def _search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
 
 def _flattened(image: Gray) -> Gray:
-    """Local contrast normalised, so that lamps and veil do not steer the search; where there is little but noise, less so."""
+    """Local contrast normalised, so that lamps and veil do not steer the search; less so where there is mostly noise."""
     deviation = image.astype(np.float32)
     deviation -= cv2.boxFilter(deviation, -1, (WINDOW_PX, WINDOW_PX))
     variance = cv2.boxFilter(deviation * deviation, -1, (WINDOW_PX, WINDOW_PX))

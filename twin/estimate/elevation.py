@@ -1,9 +1,10 @@
-"""The composite elevation map (parts P18 to P20 of the method): depth maps rasterised as surfaces, fused cell by cell."""
+"""The composite map (parts P18 to P20 of the method): depth maps rasterised as surfaces, fused cell by cell."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ Map = NDArray[np.float32]
 #: well be a web between two surfaces.
 LEAST_COSINE = 0.05
 #: What no filter averages away, as a lateral error of the surface [px on the floor]: the matching window smooths relief
-#: the same way in every view. On a slope s it is an error of s times this in height.
+#: and spills over edges in much the same way in every view. On a slope s it is an error of s times this in height.
 LATERAL_PX = 0.35
 
 
@@ -30,6 +31,7 @@ class Patch(NamedTuple):
         variance_m2: (rows, cols) by the depth's variance alone, independent from one retired map to the next.
         common_m2: (rows, cols) by what views share: the pose's covariance and the smoothing of slopes.
         pixel: (rows, cols, 2) where the cell lies in the image, (u, v).
+        lateral_m: the lateral error at the map's mean depth [m].
     """
 
     row: int
@@ -38,6 +40,7 @@ class Patch(NamedTuple):
     variance_m2: Map
     common_m2: Map
     pixel: Map
+    lateral_m: float
 
 
 def rasterise(
@@ -53,98 +56,131 @@ def rasterise(
     Args:
         pose_cov: (6, 6) covariance of the pose [rotation, translation], in the camera (rad, m).
     """
-    depth = depth_map.depth_m
-    world = _world_points(depth, world_from_camera, rig)
-    window = _window(world, grid)
+    points, bounds = _grid_points(
+        depth_map.depth_m, world_from_camera, rig.focal_px, grid.west_m, grid.north_m, grid.cell_m
+    )
+    window = _window(bounds, grid)
     if window is None:
         return None
     row, col, rows, cols = window
-    patch = Patch(row, col, *(np.full((rows, cols), np.nan, np.float32) for _ in range(3)), np.zeros((rows, cols, 2), np.float32))
-    origin = np.array([grid.west_m + (col + 0.5) * grid.cell_m, grid.north_m - (row + 0.5) * grid.cell_m, grid.cell_m])
-    eye = world_from_camera[:3, 3].copy()
-    rotation = world_from_camera[:3, :3]
-    world_cov = np.block([[rotation, np.zeros((3, 3))], [np.zeros((3, 3)), rotation]])
-    world_cov = world_cov @ pose_cov @ world_cov.T
-    jump = JUMP_PX / (rig.focal_px * rig.baseline_m)
-    _triangles(world, depth, depth_map.variance_m2, eye, rotation[:, 2].copy(), world_cov, jump, rig.focal_px, origin, *patch[2:])
+    lateral = LATERAL_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
+    patch = Patch(row, col, *_blank(rows, cols), lateral)
+    rotation = np.kron(np.eye(2), world_from_camera[:3, :3])
+    view = _View(
+        world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0],
+        world_from_camera[:3, 2].copy(),
+        rotation @ pose_cov @ rotation.T,
+        grid.cell_m,
+        rig.focal_px,
+        JUMP_PX / (rig.focal_px * rig.baseline_m),
+    )
+    _triangles(points, *depth_map, view, *patch[:6])
     return patch
 
 
-def _world_points(depth: Map, world_from_camera: Array, rig: StereoRig) -> Array:
-    """(H, W, 3) points of a depth map in the world [m]."""
-    u = (np.arange(depth.shape[1]) - rig.cx_px) / rig.focal_px
-    v = (np.arange(depth.shape[0]) - rig.cy_px) / rig.focal_px
-    rays = world_from_camera[:3, 0] * u[None, :, None] + world_from_camera[:3, 1] * v[:, None, None] + world_from_camera[:3, 2]
-    return rays * depth[..., None] + world_from_camera[:3, 3]
+class _View(NamedTuple):
+    """Eye relative to the grid's corner [m], optical axis, covariance in world axes, cell, focal length, jump [1/m]."""
+
+    eye: Array
+    axis: Array
+    cov: Array
+    cell_m: float
+    focal_px: float
+    jump: float
 
 
-def _window(world: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """First row and column, number of rows and columns of the cells that a depth map can touch."""
-    known = world[np.isfinite(world[..., 0])]
-    if known.size == 0:
+def _blank(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
+    unknown = np.full((rows, cols), np.nan, np.float32)
+    return unknown, unknown.copy(), unknown.copy(), np.zeros((rows, cols, 2), np.float32)
+
+
+def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
+    """First row and column, number of rows and columns of the cells within bounds (cells); None if there are none."""
+    if not np.isfinite(bounds).all():
         return None
-    west, south = known[:, :2].min(axis=0)
-    east, north = known[:, :2].max(axis=0)
-    col, row = max(0, int((west - grid.west_m) / grid.cell_m)), max(0, int((grid.north_m - north) / grid.cell_m))
-    last_col = min(grid.cols, int((east - grid.west_m) / grid.cell_m) + 1)
-    last_row = min(grid.rows, int((grid.north_m - south) / grid.cell_m) + 1)
-    return (row, col, last_row - row, last_col - col) if last_row > row and last_col > col else None
+    low = np.maximum(np.ceil(bounds[:2]), 0)
+    high = np.minimum(np.floor(bounds[2:]), [grid.rows - 1, grid.cols - 1])
+    rows, cols = (high - low + 1).astype(int)
+    return (int(low[0]), int(low[1]), int(rows), int(cols)) if rows > 0 and cols > 0 else None
 
 
 @njit(cache=True, nogil=True)
-def _triangles(world, depth, variance, eye, axis, cov, jump, focal, origin, height, spread, common, pixel):
+def _grid_points(depth, pose, focal, west, north, cell):
+    """Points of a depth map as (row, column, height), in cells from the centre of cell (0, 0) and metres; bounds."""
+    height, width = depth.shape
+    points = np.empty((height, width, 3))
+    bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    for v in range(height):
+        y = (v - (height - 1) / 2) / focal
+        for u in range(width):
+            x, z = (u - (width - 1) / 2) / focal, depth[v, u]
+            col = (z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3] - west) / cell - 0.5
+            row = (north - z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) - pose[1, 3]) / cell - 0.5
+            points[v, u, 0], points[v, u, 1] = row, col
+            points[v, u, 2] = z * (pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]) + pose[2, 3]
+            if z > 0:
+                bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+                bounds[2], bounds[3] = max(bounds[2], row), max(bounds[3], col)
+    return points, bounds
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _between(a, b, c, e):
+    """True if a whole number lies among four."""
+    return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
+
+
+@njit(cache=True, nogil=True)
+def _triangles(points, depth, variance, view, row, col, height, spread, common, pixel):
+    out = (points, depth, variance, view, row, col, height, spread, common, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
-            for half in range(2):
-                v0, u0 = v + half, u + half
-                args = (world, depth, variance, eye, axis, cov, jump, focal, origin, height, spread, common, pixel)
-                if half == 0:
-                    _triangle(v0, u0, v + 1, u, v, u + 1, *args)
-                else:
-                    _triangle(v0, u0, v, u + 1, v + 1, u, *args)
+            # most squares of pixels have no cell centre below them
+            if not _between(points[v, u, 0], points[v, u + 1, 0], points[v + 1, u, 0], points[v + 1, u + 1, 0]):
+                continue
+            if not _between(points[v, u, 1], points[v, u + 1, 1], points[v + 1, u, 1], points[v + 1, u + 1, 1]):
+                continue
+            _triangle(v, u, v + 1, u, v, u + 1, *out)
+            _triangle(v + 1, u + 1, v, u + 1, v + 1, u, *out)
 
 
 @njit(cache=True, nogil=True)
-def _triangle(va, ua, vb, ub, vc, uc, world, depth, variance, eye, axis, cov, jump, focal, origin, height, spread, common, pixel):
+def _triangle(va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, spread, common, pixel):
     """Writes the cells under one triangle of pixels a, b, c; of two surfaces over one cell the higher is seen."""
+    a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
+    j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
+    i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
+    if not (j0 <= j1 and i0 <= i1):  # no cell centre below it: most triangles end here
+        return
     za, zb, zc = depth[va, ua], depth[vb, ub], depth[vc, uc]
-    if not (za > 0 and zb > 0 and zc > 0):
+    if not (za > 0 and zb > 0 and zc > 0) or 1 / min(za, zb, zc) - 1 / max(za, zb, zc) > view.jump:
         return
-    if 1 / min(za, zb, zc) - 1 / max(za, zb, zc) > jump:
-        return
-    a, b, c = world[va, ua], world[vb, ub], world[vc, uc]
-    bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    cell, eye, axis = view.cell_m, view.eye, view.axis
+    bx, by, bz = (b[1] - a[1]) * cell, (a[0] - b[0]) * cell, b[2] - a[2]
+    cx, cy, cz = (c[1] - a[1]) * cell, (a[0] - c[0]) * cell, c[2] - a[2]
     nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-    rx, ry, rz = a[0] - eye[0], a[1] - eye[1], a[2] - eye[2]
-    if nz <= 0:
+    rx, ry, rz = (a[1] + 0.5) * cell - eye[0], -(a[0] + 0.5) * cell - eye[1], a[2] - eye[2]
+    facing = -(nx * rx + ny * ry + nz * rz)
+    if nz <= 0 or facing < LEAST_COSINE * np.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + rz * rz)):
         return
-    along = nx * rx + ny * ry + nz * rz
-    if -along < LEAST_COSINE * np.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + rz * rz)):
-        return
-    west, north, cell = origin
-    j0 = max(0, int(np.ceil((min(a[0], b[0], c[0]) - west) / cell - 1e-9)))
-    j1 = min(height.shape[1] - 1, int(np.floor((max(a[0], b[0], c[0]) - west) / cell + 1e-9)))
-    i0 = max(0, int(np.ceil((north - max(a[1], b[1], c[1])) / cell - 1e-9)))
-    i1 = min(height.shape[0] - 1, int(np.floor((north - min(a[1], b[1], c[1])) / cell + 1e-9)))
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            x, y = west + j * cell - a[0], north - i * cell - a[1]
+    sx, sy = -nx / nz, -ny / nz  # slope of the surface
+    for i in range(max(int(i0), row), min(int(i1), row + height.shape[0] - 1) + 1):
+        for j in range(max(int(j0), col), min(int(j1), col + height.shape[1] - 1) + 1):
+            x, y = (j - a[1]) * cell, (a[0] - i) * cell
             s, t = (x * cy - y * cx) / nz, (bx * y - by * x) / nz
-            if s < -1e-9 or t < -1e-9 or s + t > 1 + 1e-9:
-                continue
             h = a[2] + s * bz + t * cz
-            if height[i, j] >= h:
+            if s < -1e-9 or t < -1e-9 or s + t > 1 + 1e-9 or height[i - row, j - col] >= h:
                 continue
-            sx, sy = -nx / nz, -ny / nz  # slope of the surface
             px, py, pz = rx + x, ry + y, h - eye[2]
             z = px * axis[0] + py * axis[1] + pz * axis[2]
             lift = (pz - sx * px - sy * py) / z  # change of height per change of depth
-            height[i, j] = h
-            spread[i, j] = lift * lift * ((1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc])
-            common[i, j] = _pose_part(px, py, pz, sx, sy, cov) + (LATERAL_PX * z / focal) ** 2 * (sx * sx + sy * sy)
-            pixel[i, j, 0] = ua + s * (ub - ua) + t * (uc - ua)
-            pixel[i, j, 1] = va + s * (vb - va) + t * (vc - va)
+            p, q = i - row, j - col
+            height[p, q] = h
+            spread[p, q] = lift * lift * ((1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc])
+            common[p, q] = _pose_part(px, py, pz, sx, sy, view.cov)
+            common[p, q] += (LATERAL_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
+            pixel[p, q, 0] = ua + s * (ub - ua) + t * (uc - ua)
+            pixel[p, q, 1] = va + s * (vb - va) + t * (vc - va)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -163,12 +199,13 @@ class ElevationMapper:
     """Fuses patches into the cells of a grid; memory is that of the grid, however long the survey.
 
     A cell keeps up to two hypotheses of its height (a steep cell is seen now at the foot, now at the edge): each patch
-    updates the one whose gate (z - h)^2 < GATE (P + R) it passes and that fits best, or opens the second, or replaces it if it knows
-    more than the weaker. The better known one is the result.
+    updates the one that fits best if it passes its gate (z - h)^2 < GATE (P + R), or opens the second, or replaces the
+    weaker if it knows more. The better known one is the result.
 
     Variance has two parts. That of depth is independent from map to map and shrinks with each fusion. That of the pose
     and of smoothed slopes is shared by all cells of a leg, and largely by all legs: it is carried beside as the
-    weighted mean of what came in, so it never averages away. The sum is told.
+    weighted mean of what came in, so it never averages away. To their sum the result adds the lateral error times the
+    relief around the cell: near an edge the height may be that of the other side, which no single view can tell.
     """
 
     def __init__(self, grid: MapGrid):
@@ -178,10 +215,20 @@ class ElevationMapper:
         self._variance = np.full((2, *shape), np.inf, np.float32)
         self._common = np.zeros((2, *shape), np.float32)
         self._colour = np.zeros((*shape, 4), np.float32)
+        self._lateral_m: list[float] = [0.0, 0.0]  # sum, count
 
-    def add_heights(self, patch: Patch, retired: Mask) -> None:
-        """Fuses the cells of a patch whose nearest pixel is retired."""
-        _fuse_cells(*patch, retired, GATE, self._height, self._variance, self._common)
+    def retire(self, patch: Patch, successor: Patch | None = None, taken: Mask | None = None) -> None:
+        """Fuses the cells of a patch that its successor, the patch of the next key point, does not carry on.
+
+        A cell is carried on where the successor covers it with a pixel that took old information in (`taken`) and
+        whose height agrees: so what is known of a cell enters the map once, and none is lost between two patches.
+        """
+        self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
+        height = patch.height_m
+        if successor is not None and taken is not None:
+            height = height.copy()
+            _strike_carried(*patch[:5], *successor[:6], taken, GATE, height)
+        _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._common)
 
     def add_colours(self, patch: Patch, rgb: Image, gain: Map) -> None:
         """Adds the image to the mosaic: a weighted mean that prefers what lies near the middle of the image."""
@@ -189,22 +236,47 @@ class ElevationMapper:
 
     def result(self) -> ElevationMap:
         """The better known hypothesis of every cell, its standard deviation and the mosaic."""
-        best = self._variance[1] < self._variance[0]
-        pick = lambda layers: np.where(best, layers[1], layers[0])  # noqa: E731
-        height = pick(self._height)
-        sigma = np.sqrt(pick(self._variance) + pick(self._common))
-        sigma[np.isnan(height)] = np.nan
+        best = (self._variance[1] < self._variance[0]).astype(int)[None]
+        height, variance, common = (
+            np.take_along_axis(layers, best, 0)[0] for layers in (self._height, self._variance, self._common)
+        )
+        lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
+        edge = lateral_m / (2 * self.grid.cell_m) * _relief(height)
+        sigma = np.where(np.isnan(height), np.nan, np.sqrt(variance + common + edge**2)).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
-        return ElevationMap(self.grid, height, sigma.astype(np.float32), np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+        return ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+
+
+def _relief(height: Map) -> Map:
+    """Highest minus lowest known height among the 3 x 3 cells around each [m]."""
+    block = np.ones((3, 3), np.uint8)
+    far = np.float32(1e6)
+    high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
+    return np.maximum(high - cv2.erode(np.where(np.isnan(height), far, height), block), 0)
 
 
 @njit(cache=True, nogil=True)
-def _fuse_cells(row, col, height, variance, common, pixel, retired, gate, heights, variances, commons):
+def _strike_carried(
+    row, col, height, variance, common, new_row, new_col, new_height, new_variance, new_common, pixel, taken, gate, left
+):
+    """Sets to NaN what the successor carries on."""
+    for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
+        for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
+            a, b, c, e = i - row, j - col, i - new_row, j - new_col
+            if not taken[int(pixel[c, e, 1] + 0.5), int(pixel[c, e, 0] + 0.5)]:
+                continue
+            spread = variance[a, b] + new_variance[c, e] + common[a, b] + new_common[c, e]
+            if (height[a, b] - new_height[c, e]) ** 2 < gate * spread:
+                left[a, b] = np.nan
+
+
+@njit(cache=True, nogil=True)
+def _fuse_cells(row, col, height, variance, common, gate, heights, variances, commons):
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]
-            if np.isnan(z) or not retired[int(pixel[i, j, 1] + 0.5), int(pixel[i, j, 0] + 0.5)]:
+            if np.isnan(z):
                 continue
             r, q = variance[i, j], common[i, j]
             a, b = row + i, col + j

@@ -43,7 +43,7 @@ class TwoView(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    """Refined disparity (H, W) [px] and its standard deviation (H, W) [px], NaN where it failed; noise [grey levels]."""
+    """Refined disparity (H, W) [px], its standard deviation (H, W) [px], NaN where it failed; noise [grey levels]."""
 
     disparity_px: Map
     sigma_px: Map
@@ -218,7 +218,7 @@ def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support)
 
 @njit(cache=True, nogil=True)
 def _fit_planes(disparity, residual, slope, taper, support, priors):
-    """Disparity of the plane fitted around each pixel, its variance for unit noise, the window's mean square residual."""
+    """Disparity of the plane fitted around each pixel, its variance at unit noise, the window's mean square residual."""
     height, width = disparity.shape
     half = taper.size // 2
     fitted = np.full((height, width), NOTHING, np.float32)

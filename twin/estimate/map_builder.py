@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from twin import geometry
 from twin.estimate import depth_filter, disparity, elevation
 from twin.estimate.depth_filter import DepthMap, Mask
+from twin.estimate.elevation import Patch
 from twin.records import ElevationMap, Image, MapGrid, StereoRig
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
-
-#: Disparities are searched up to that of a surface at this part of the rig's distance to the grid's reference.
-LEAST_SHARE_SEEN = 0.05
 
 
 class KeyPointImages(NamedTuple):
@@ -29,12 +27,12 @@ class KeyPointImages(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The filter at a key point: its map, gray left image and pose."""
+    """The filter at a key point: its map, gray left image and pose, and the map as the grid sees it."""
 
     depth: DepthMap
     gray: Map
     pose: Array
-    cov: Array
+    patch: Patch | None
 
 
 def build_map(
@@ -55,48 +53,50 @@ def build_map(
         node_cov: (n, 6, 6) covariance of each pose [rotation, translation], in the camera (rad, m).
         progress: called with the number of key points done.
         step_cov: (n, 6, 6) covariance of each pose relative to the one before (the first is not used); exact if None.
-        max_disparity_px: largest disparity searched; a quarter of the image's width if None.
+        max_disparity_px: largest disparity searched; found from the images if None.
     """
-    mapper, light = elevation.ElevationMapper(grid), Light()
+    mapper, light, reach = elevation.ElevationMapper(grid), Light(), disparity.Reach(rig, max_disparity_px)
     steps = np.zeros((len(poses), 6, 6)) if step_cov is None else step_cov
-    search = max_disparity_px or rig.width_px // 4
-    state = None
+    old = None
     for k, pair in enumerate(key_points):
-        gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in pair]
-        stereo = depth_filter.stereo_depth(disparity.dense_disparity(gray[0], gray[1], search), rig)
-        new = _State(stereo, gray[0].astype(np.float32), poses[k], node_cov[k])
-        if state is not None:
-            new, kept = _step(state, new, steps[k], rig)
-            _retire(mapper, state, ~kept, rig)
-        light.see(pair.left)
-        patch = elevation.rasterise(new.depth, new.pose, new.cov, rig, grid)
+        gray, stereo = _look(pair, reach, rig)
+        depth, taken = stereo, None
+        if old is not None:
+            depth, taken = _step(old, stereo, gray, poses[k], steps[k], rig)
+        patch = elevation.rasterise(depth, poses[k], node_cov[k], rig, grid)
+        if old is not None and old.patch is not None:
+            mapper.retire(old.patch, patch, taken)
         if patch is not None:
+            light.see(pair.left)
             mapper.add_colours(patch, pair.left, light.gain())
-        state = new
+        old = _State(depth, gray, poses[k], patch)
         if progress is not None:
             progress(k + 1)
-    if state is not None:
-        _retire(mapper, state, np.ones_like(state.depth.depth_m, dtype=bool), rig)
+    if old is not None and old.patch is not None:
+        mapper.retire(old.patch)
     return mapper.result()
 
 
-def _step(old: _State, new: _State, step_cov: Array, rig: StereoRig) -> tuple[_State, Mask]:
+def _look(pair: KeyPointImages, reach: disparity.Reach, rig: StereoRig) -> tuple[Map, DepthMap]:
+    """The left image in grey and the depth map of a stereo pair."""
+    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in pair)
+    stereo = disparity.dense_disparity(left, right, reach.max_disparity_px)
+    reach.see(stereo.disparity_px)
+    return left.astype(np.float32), depth_filter.stereo_depth(stereo, rig)
+
+
+def _step(
+    old: _State, stereo: DepthMap, gray: Map, pose: Array, step_cov: Array, rig: StereoRig
+) -> tuple[DepthMap, Mask]:
     """Carries the filter to the next key point: old map, new stereo, then depth from the motion between them."""
-    old_from_new = geometry.inverse(old.pose) @ new.pose
-    fused, kept = depth_filter.carry(old.depth, new.depth, geometry.inverse(old_from_new), step_cov, rig)
-    motion = depth_filter.motion_depth(new.gray, old.gray, fused, old_from_new, step_cov, rig)
-    return new._replace(depth=depth_filter.fuse(fused, motion)), kept
-
-
-def _retire(mapper: elevation.ElevationMapper, state: _State, retired: Mask, rig: StereoRig) -> None:
-    """Hands the retired pixels of a map to the composite map."""
-    patch = elevation.rasterise(state.depth, state.pose, state.cov, rig, mapper.grid)
-    if patch is not None:
-        mapper.add_heights(patch, retired)
+    old_from_new = geometry.inverse(old.pose) @ pose
+    fused, taken = depth_filter.carry(old.depth, stereo, geometry.inverse(old_from_new), step_cov, rig)
+    motion = depth_filter.motion_depth(gray, old.gray, fused, old_from_new, step_cov, rig)
+    return depth_filter.fuse(fused, motion), taken
 
 
 class Light:
-    """The mean light of the images so far: lamps travel with the camera, the floor does not, so the mean shows the lamps."""
+    """The mean light of the images so far: lamps travel with the camera, the floor does not, so only lamps stay."""
 
     def __init__(self) -> None:
         self._sum: Map | None = None

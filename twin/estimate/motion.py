@@ -82,7 +82,16 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
     return Motion(a_from_b, np.linalg.inv(normal) * sigma**2, n_points, sigma)
 
 
-def pair_motion(a: Array, b: Array, sigma: Array, baseline_m: float, guess: Array, iterations: int = 6) -> Motion | None:
+def pair_motion(
+    a: Array,
+    b: Array,
+    sigma: Array,
+    baseline_m: float,
+    guess: Array,
+    common_sigma: float = 0.0,
+    correlation: float = 1.0,
+    iterations: int = 6,
+) -> Motion | None:
     """Motion between two stereo pairs with the structure estimated along: no errors-in-variables bias.
 
     Both pairs measure each point as (x, y, disparity); the true point in b is unknown. With residual e = z_a - g(z_b),
@@ -94,6 +103,9 @@ def pair_motion(a: Array, b: Array, sigma: Array, baseline_m: float, guess: Arra
         sigma: (3,) standard deviations of the three, normalised.
         baseline_m: of the rig.
         guess: (4, 4) expected pose of b in a.
+        common_sigma: standard deviation of a bias that all points share in each of the three, normalised: it does not
+            average out, however many points there are.
+        correlation: by how much the points are fewer than they seem.
 
     Returns:
         The motion, its residual in units of the expected deviation (1 = as expected), or None when too few agree.
@@ -120,7 +132,9 @@ def pair_motion(a: Array, b: Array, sigma: Array, baseline_m: float, guess: Arra
     n_points = int(np.count_nonzero(weight))
     if n_points < _MIN_POINTS:
         return None
-    return Motion(a_from_b, np.linalg.inv(normal) * max(scale, 0.3) ** 2, n_points, scale)
+    by_bias = np.linalg.solve(normal, np.einsum("n,nij->ij", weight, projected)) * common_sigma
+    cov = np.linalg.inv(normal) * max(scale, 0.3) ** 2 * correlation
+    return Motion(a_from_b, cov + by_bias @ by_bias.T, n_points, scale)
 
 
 def _transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:

@@ -14,7 +14,12 @@ from twin.geometry import Array
 from twin.records import Link, StereoRig
 
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
-_GATE_SIGMAS = 6.0
+_LEAST_SHARE = 0.3  # of matched points that agree on one motion
+_COMMON_PX = 0.013  # bias that all points of a match share: the largest of Lucas-Kanade measured on low contrast
+#: Relief inside the patches makes neighbouring matches err together: over reefs the links' NEES is twice what noise and
+#: shared pixels explain, alike for links along the swath and across, on generated and real reefs.
+_RELIEF = 2.0
+_SMALL_TURN_RAD = 0.06  # patches of 21 px are skewed by less than a pixel
 
 
 def overlap(node: KeyPoint, other: KeyPoint, rig: StereoRig, patch_px: int) -> float:
@@ -109,17 +114,28 @@ class PairMatch:
         measured_other, measured_node, sigma_px = matched
         guess = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         sigma = np.full(3, sigma_px / self.rig.focal_px)
-        result = motion.pair_motion(measured_other, measured_node, sigma, self.rig.baseline_m, guess)
-        if result is None or result.n_points < 0.3 * len(measured_node):
-            return None
-        return result._replace(
-            cov=result.cov * matching.correlation(result.n_points, self.patch_px, (self.rig.height_px, self.rig.width_px))
+        shape = (self.rig.height_px, self.rig.width_px)
+        result = motion.pair_motion(
+            measured_other,
+            measured_node,
+            sigma,
+            self.rig.baseline_m,
+            guess,
+            common_sigma=_COMMON_PX / self.rig.focal_px,
+            correlation=_RELIEF * matching.correlation(len(measured_node), self.patch_px, shape),
         )
+        return None if result is None or result.n_points < _LEAST_SHARE * len(measured_node) else result
 
     def _turned(
         self, image: matching.Image, pixels: matching.Points, other_from_node: Array
     ) -> tuple[matching.Image, matching.Points]:
-        """Image and pixels as a camera in the same place with the other's attitude sees them: exact at any depth."""
+        """Image and pixels as a camera in the same place with the other's attitude sees them: exact at any depth.
+
+        Small turns are left to the matcher: OpenCV rounds the coordinates of a warp to 1/32 pixel, and where the turn
+        is nearly a shift all pixels round alike (0.034 px common to the image, ten times the noise of its mean flow).
+        """
+        if np.linalg.norm(geometry.so3_log(other_from_node[:3, :3])) < _SMALL_TURN_RAD:
+            return image, pixels
         camera = self.rig.matrix
         homography = camera @ other_from_node[:3, :3] @ np.linalg.inv(camera)
         size = (self.rig.width_px, self.rig.height_px)

@@ -68,6 +68,7 @@ class Navigator:
         self.times_s: list[float] = []
         self.f2f_poses: list[Array] = []
         self.online_poses: list[Array] = []
+        self.dropped: list[Link] = []
         self.alignments: list[Alignment] = []
         self.before_ga: list[Array] = []
         self.after_ga: list[Array] = []
@@ -134,8 +135,7 @@ class Navigator:
         if len(points.xyz) < 12:
             return "too few points in stereo"
         self.max_disparity_px = float(np.nanpercentile(dense_px, 99.5))
-        with np.errstate(invalid="ignore"):
-            depth_m = (self.rig.focal_px * self.rig.baseline_m / dense_px).astype(np.float32)
+        depth_m = self._depth(dense_px)
         with self.watch("f2m"):
             self._register_with_mosaic(image, points)
         key = KeyPoint(
@@ -150,6 +150,11 @@ class Navigator:
             self._connect(key)
         self.f2f.restart(image, points)
         return status
+
+    def _depth(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Depth (height, width) [m], NaN where the disparity is unknown or below one pixel."""
+        usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
+        return (self.rig.focal_px * self.rig.baseline_m / usable).astype(np.float32)
 
     def _disparity_limit(self) -> int:
         """Largest disparity to search: that of the last key point with a margin (P12), wide at first."""
@@ -205,6 +210,7 @@ class Navigator:
         aligned = align(nodes, links, anchors, self.rig, self.noise, marginals)
         ms = (time.perf_counter() - begun) * 1e3
         self.alignments.append(Alignment(track, ms, len(nodes), len(links), len(aligned.dropped)))
+        self.dropped += aligned.dropped
         dropped = {(link.i, link.j) for link in aligned.dropped}
         self.links = [link for link in self.links if (link.i, link.j) not in dropped]
         self._move_keys({k.number: pose for k, pose in zip(nodes, aligned.poses, strict=True)})

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from scenes.builder import World
 from scenes.floor import FLOOR_GROUP
-from scenes.gl import GlError, mujoco, offscreen_context
+from scenes.gl import GlMissing, MjModel, MjvScene, mujoco, offscreen_context
 from twin.errors import TwinError
 
 Array = NDArray[np.float64]
@@ -40,6 +42,7 @@ class Renderer:
         self._tan = np.tan(np.deg2rad(vfov_deg) / 2) * np.array([width_px / height_px, 1.0])
         self._rgb = np.empty((height_px, width_px, 3), np.uint8)
         self._z = np.empty((height_px, width_px), np.float32)
+        self._gl: Any
         self._gl, self._context = _open(world.model, width_px, height_px)
         self._scene = _floor_scene(world.model)
         self._set_projection()
@@ -97,11 +100,12 @@ class Renderer:
         self._shown = visible
 
 
-def _open(model: mujoco.MjModel, width_px: int, height_px: int):  # noqa: ANN202 (OpenGL's types vary by platform)
+def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
+    """A current OpenGL context, and MuJoCo's in it with the model uploaded."""
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    except GlError as error:
+    except GlMissing as error:
         raise TwinError(error.field, error.problem, error.allowed) from error
     except mujoco.FatalError as error:
         raise TwinError("rendering", f"OpenGL fails: {error}", "OpenGL 1.5 with frame buffer objects") from error
@@ -110,7 +114,7 @@ def _open(model: mujoco.MjModel, width_px: int, height_px: int):  # noqa: ANN202
     return gl, context
 
 
-def _floor_scene(model: mujoco.MjModel) -> mujoco.MjvScene:
+def _floor_scene(model: MjModel) -> MjvScene:
     """The floor's tiles, and no effect that changes a colour."""
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
     option = mujoco.MjvOption()
@@ -143,10 +147,3 @@ def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.fl
     """Depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far): 1 / depth = z (1/near - 1/far) + 1/far."""
     inverse = z_buffer * np.float32(1 / near_m - 1 / far_m) + np.float32(1 / far_m)
     return np.where(z_buffer > 0, np.reciprocal(inverse), np.float32(np.inf))
-
-
-def pixel_rays(width_px: int, height_px: int, vfov_deg: float) -> Array:
-    """(height, width, 3) directions of the pixel centres in the camera, scaled to z = 1: times depth, points."""
-    focal_px = height_px / 2 / np.tan(np.deg2rad(vfov_deg) / 2)
-    u, v = np.meshgrid(np.arange(width_px) - (width_px - 1) / 2, np.arange(height_px) - (height_px - 1) / 2)
-    return np.stack([u / focal_px, v / focal_px, np.ones_like(u)], axis=-1)

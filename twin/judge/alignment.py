@@ -35,7 +35,7 @@ def _row(alignment: Alignment, before: Array, after: Array, result: SurveyResult
     }
 
 
-def _key_point_rmse(poses: Array | None, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
+def _key_point_rmse(poses: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
     """RMSE of the last key points of `frames` whose poses are given [m]."""
     n = min(len(poses), len(frames))
     if n == 0:

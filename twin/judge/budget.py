@@ -25,7 +25,7 @@ class BudgetRow(NamedTuple):
     """Time of a stage or of all key-point work: mean and p95 of a call [ms], total [s], what it may take [ms]."""
 
     what: str
-    count: int
+    n_calls: int
     mean_ms: float | None
     p95_ms: float | None
     total_s: float | None
@@ -43,7 +43,7 @@ def budget(metrics: Mapping[str, Any], scenario: Mapping[str, Any], n_per_key: i
     rate_hz = scenario.get("rig", {}).get("frame_rate_hz")
     hold_s = scenario.get("control", {}).get("hold_s")
     limits = {"f2f": 1e3 / rate_hz if rate_hz else None, "ga": 1e3 * hold_s if hold_s else None}
-    rows = [_row(STAGE_LABELS.get(name, name), row, limits.get(name)) for name, row in stages.items()]
+    rows = [_row(STAGE_LABELS[name], row, limits.get(name)) for name, row in stages.items()]
     key_ms = 1e3 * n_per_key / rate_hz if n_per_key and rate_hz else None
     return [*rows, _key_point_work(stages, timing.get("keypoints") or 0, key_ms)]
 

@@ -52,4 +52,4 @@ def _positive_definite(cov: Array) -> np.ndarray:
     """(n,) bool."""
     finite = np.isfinite(cov).all(axis=(1, 2))
     smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0]
-    return smallest > 0
+    return np.asarray(smallest > 0)

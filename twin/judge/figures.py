@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LightSource, Normalize
@@ -51,7 +50,7 @@ def draw_all(run: Run) -> dict[str, str]:
 def to_data_uri(figure: Figure) -> str:
     """A figure as an inlined PNG."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.08)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 

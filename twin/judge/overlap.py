@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from twin import geometry
 from twin.judge.numbers import number, percentile
@@ -102,7 +102,7 @@ def _neighbours(prints: Footprints, leg: int) -> NDArray[np.int64]:
     here, there = np.flatnonzero(prints.leg == leg), np.flatnonzero(prints.leg == leg + 1)
     if len(here) == 0 or len(there) == 0:
         return np.zeros((2, 0), dtype=np.int64)
-    _, nearest = cKDTree(prints.centre_m[there]).query(prints.centre_m[here])
+    _, nearest = KDTree(prints.centre_m[there]).query(prints.centre_m[here])
     return np.stack([here, there[nearest]])
 
 

@@ -9,7 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jinja2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from twin.judge import wording
 from twin.judge.budget import budget
 from twin.judge.figures import draw_all
+from twin.judge.pictures import jpeg_bytes, read_rgb
 from twin.judge.run_folder import Run, load_run
 from twin.judge.style import COLOURS, ESTIMATES, LABELS
 
@@ -87,17 +87,13 @@ def sample_photos(run: Run) -> list[tuple[int, str, str | None]]:
 
 
 def _pair(run: Run, frame: int) -> tuple[str, str | None]:
-    left, right = (cv2.imread(str(run.image_file(frame, eye)), cv2.IMREAD_COLOR_RGB) for eye in ("left", "right"))
+    left, right = (read_rgb(run.image_file(frame, eye)) for eye in ("left", "right"))
     return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
 
 
 def jpeg_uri(image: NDArray[np.uint8]) -> str:
-    """An RGB image as an inlined JPEG, no side over `PHOTO_PX`."""
-    scale = PHOTO_PX / max(image.shape[:2])
-    if scale < 1:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 82])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    """An RGB image as an inlined JPEG."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, PHOTO_PX)).decode()
 
 
 def _text(value: Any) -> str:

@@ -11,11 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.errors import RasterioError
 
 from twin.errors import TwinError
 from twin.records import Array, MapGrid, Trajectory
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
+SCENARIO_FILE = "scenario.resolved.toml"
 RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error", "mosaic")
 
 
@@ -34,11 +36,12 @@ class Network(NamedTuple):
 
 
 class KeyPoints(NamedTuple):
-    """Key points as spooled: frame rows, tracks, frames per key point."""
+    """Key points as spooled: frame rows, tracks, frames per key point; durations [ms] of stages, call by call."""
 
     frames: NDArray[np.int64]
     tracks: NDArray[np.int64]
     n_per_key: int | None
+    timing_ms: dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -74,11 +77,11 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         TwinError: it is no run folder, or one of its files is broken.
     """
     folder = Path(folder)
-    if not (folder / "scenario.resolved.toml").is_file():
+    if not (folder / SCENARIO_FILE).is_file():
         raise TwinError(str(folder), "is no run folder", "a folder with scenario.resolved.toml, as `twin run` writes")
     return Run(
         folder,
-        _read(folder / "scenario.resolved.toml", lambda f: tomllib.loads(f.read_text(encoding="utf-8"))),
+        _read(folder / SCENARIO_FILE, lambda f: tomllib.loads(f.read_text(encoding="utf-8"))),
         _read_json(folder / "env.json") or {},
         metrics or _read_json(folder / "metrics.json"),
         _read_present({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
@@ -115,7 +118,8 @@ def _no_network() -> Network:
 def _read_key_points(file: Path) -> KeyPoints:
     index = _read_json(file) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
-    return KeyPoints(frames, tracks, index.get("n_per_key"))
+    timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
+    return KeyPoints(frames, tracks, index.get("n_per_key"), timing_ms)
 
 
 def _read_json(file: Path) -> Any:
@@ -130,5 +134,5 @@ def _read_present(files: dict[str, Path], reader: Any) -> dict[str, Any]:
 def _read(file: Path, reader: Any) -> Any:
     try:
         return reader(file)
-    except (OSError, ValueError, KeyError, IndexError, rasterio.errors.RasterioError) as error:
+    except (OSError, ValueError, KeyError, IndexError, RasterioError) as error:
         raise TwinError(str(file), f"cannot be read: {error}", "a file of this run, unharmed") from None

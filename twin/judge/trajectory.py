@@ -55,7 +55,7 @@ def travelled(positions: Array) -> Array:
 def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:
     """`trajectory.*` of metrics.json; drift is the end error over the true path [%]."""
     distance = errors.distance_m
-    end, path = (distance[-1], errors.travelled_m[-1]) if len(distance) else (None, None)
+    end, path = (float(distance[-1]), float(errors.travelled_m[-1])) if len(distance) else (None, None)
     x, y, z = errors.position_m.T
     heading = rms(np.rad2deg(errors.heading_rad))
     return {
@@ -66,6 +66,6 @@ def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:
         "z_rmse_m": rms(z),
         "heading_rmse_deg": heading,
         "end_error_m": number(end),
-        "drift_percent": number(100 * end / path) if path else None,
+        "drift_percent": 100 * end / path if path and end is not None else None,
         "path_m": number(path),
     }

@@ -36,6 +36,7 @@ class LaggedThrusters:
         self._effects = angular_first(vessel.allocation)
         self._coefficients = vessel.thrust_coefficients
         self._state = np.zeros((len(self._a), self._effects.shape[1]))
+        self._steady_n = np.zeros(self._effects.shape[1])
 
     def thrust_n(self) -> Array:
         """Thrust of each at this instant (n,)."""
@@ -45,10 +46,13 @@ class LaggedThrusters:
         """Their wrench on the body at this instant, [moment, force] in the body (6,) [N m, N]."""
         return self._effects @ self.thrust_n()
 
-    def step(self, command: Array) -> None:
-        """Holds commands (n,), cut to [-1, 1], over one step."""
-        steady_n = steady_thrust_n(np.clip(command, -1, 1), self._coefficients)
-        self._state = self._a @ self._state + self._b * steady_n
+    def command(self, command: Array) -> None:
+        """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
+        self._steady_n = steady_thrust_n(np.clip(command, -1, 1), self._coefficients)
+
+    def step(self) -> None:
+        """One step under the last commands."""
+        self._state = self._a @ self._state + self._b * self._steady_n
 
 
 def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
@@ -60,5 +64,5 @@ def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
     rates = np.zeros((n + 1, n + 1))
     rates[0, :n], rates[0, n] = -denominator[1:], 1.0
     rates[1:n, : n - 1] = np.eye(n - 1)
-    step = expm(rates * timestep_s)
+    step = np.asarray(expm(rates * timestep_s), dtype=np.float64)
     return step[:n, :n], step[:n, n:]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.gl import mujoco
+from scenes.gl import MjModel, mujoco
 from twin import config, geometry
 from twin.errors import SurveyAborted
 from twin.simulate.hydrodynamics import Hull, angular_first, free_joint_acceleration, twist_of_free_joint
@@ -27,7 +27,7 @@ class HasModel(Protocol):
     """A compiled world with one free body named "vehicle"."""
 
     @property
-    def model(self) -> mujoco.MjModel: ...
+    def model(self) -> MjModel: ...
 
 
 def physics_timestep_s(frame_rate_hz: float) -> float:
@@ -109,9 +109,10 @@ class Vehicle:
         n_steps = round(duration_s / self._model.opt.timestep)
         if n_steps < 1 or abs(n_steps * self._model.opt.timestep - duration_s) > 1e-6 * duration_s:
             raise ValueError(f"{duration_s} s is no whole number of steps of {self._model.opt.timestep} s")
+        self._thrusters.command(thruster_u)
         for _ in range(n_steps):
             self._advance(self._thrusters.wrench())
-            self._thrusters.step(thruster_u)
+            self._thrusters.step()
         self._last.append(self._state())
 
     def _advance(self, wrench: Array) -> None:

@@ -1,0 +1,125 @@
+"""Rigid motions: laws, also near identity and near half a turn, and MuJoCo and scipy as oracles."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from scenes.gl import mujoco
+from twin import geometry as g
+
+ANGLES = st.one_of(
+    st.floats(0, 1e-9), st.floats(1e-9, 1e-3), st.floats(1e-3, 3.0), st.floats(np.pi - 1e-3, np.pi - 1e-6)
+)
+
+
+@st.composite
+def motions(draw):
+    """Twists whose angle ranges from nought to just short of half a turn."""
+    direction = np.array([draw(st.floats(-1, 1)) for _ in range(3)]) + [0.0, 0.0, 1.5]
+    rotation = draw(ANGLES) * direction / np.linalg.norm(direction)
+    return np.concatenate([rotation, [draw(st.floats(-10, 10)) for _ in range(3)]])
+
+
+@st.composite
+def poses(draw):
+    return g.exp(draw(motions()))
+
+
+def wedge(motion):
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3], matrix[:3, 3] = g.skew(motion[:3]), motion[3:]
+    return matrix
+
+
+@given(motions())
+def test_exp_is_the_matrix_exponential(motion):
+    np.testing.assert_allclose(g.exp(motion), expm(wedge(motion)), atol=1e-11)
+
+
+@given(motions())
+def test_log_undoes_exp(motion):
+    # Near half a turn the matrix barely holds the sign of the axis: 1e-16 / 1e-6 of the angle, times 10 m.
+    np.testing.assert_allclose(g.log(g.exp(motion)), motion, atol=3e-8)
+
+
+@given(poses())
+def test_exp_undoes_log(pose):
+    np.testing.assert_allclose(g.exp(g.log(pose)), pose, atol=1e-8)
+
+
+def test_half_a_turn_has_a_log():
+    half = g.pose(np.diag([1.0, -1.0, -1.0]), np.array([1.0, 2.0, 3.0]))
+    assert np.linalg.norm(g.log(half)[:3]) == np.pi
+    np.testing.assert_allclose(g.exp(g.log(half)), half, atol=1e-12)
+
+
+@given(poses())
+def test_the_inverse_undoes_a_pose_and_stays_rigid(pose):
+    np.testing.assert_allclose(pose @ g.inverse(pose), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(g.inverse(g.inverse(pose)), pose, atol=1e-12)
+    assert np.linalg.det(g.inverse(pose)[:3, :3]) > 0.999999
+
+
+@given(poses(), motions())
+def test_the_adjoint_carries_a_motion_through_a_pose(pose, motion):
+    np.testing.assert_allclose(pose @ g.exp(motion), g.exp(g.adjoint(pose) @ motion) @ pose, atol=1e-8)
+
+
+@given(poses(), poses())
+def test_adjoints_multiply_as_poses_do(a, b):
+    np.testing.assert_allclose(g.adjoint(a @ b), g.adjoint(a) @ g.adjoint(b), atol=1e-10)
+
+
+@given(poses(), poses())
+def test_transform_is_the_product_with_points(a, b):
+    points = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 0.0]])
+    np.testing.assert_allclose(g.transform(a @ b, points), g.transform(a, g.transform(b, points)), atol=1e-10)
+
+
+@given(motions())
+def test_quaternions_are_mujocos(motion):
+    rotation = g.so3_exp(motion[:3])
+    quaternion, matrix = np.zeros(4), np.zeros(9)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    ours = g.quaternion_wxyz(rotation)
+    np.testing.assert_allclose(ours, quaternion * np.sign(quaternion @ ours), atol=1e-9)
+    mujoco.mju_quat2Mat(matrix, ours)
+    np.testing.assert_allclose(matrix.reshape(3, 3), rotation, atol=1e-9)
+    np.testing.assert_allclose(g.rotation_from_wxyz(ours), rotation, atol=1e-12)
+    np.testing.assert_array_equal(g.quaternion_xyzw(rotation), np.roll(ours, -1))
+    assert ours[0] >= 0
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_roll_pitch_yaw_are_undone(roll, pitch, yaw):
+    np.testing.assert_allclose(
+        g.rpy_from_rotation(g.rotation_from_rpy(roll, pitch, yaw)), [roll, pitch, yaw], atol=1e-9
+    )
+
+
+def test_roll_pitch_yaw_turn_the_way_of_the_body_axes():
+    np.testing.assert_allclose(g.rotation_from_rpy(0, 0, np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)  # bow to north
+    np.testing.assert_allclose(g.rotation_from_rpy(0, np.pi / 2, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # bow down
+    np.testing.assert_allclose(g.rotation_from_rpy(np.pi / 2, 0, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # port up
+
+
+@given(st.floats(-1e3, 1e3))
+def test_a_wrapped_angle_is_the_same_angle(angle):
+    wrapped = g.wrap_angle(angle)
+    assert -np.pi <= wrapped < np.pi
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angle), atol=1e-10)
+
+
+@given(st.floats(-3.1, 3.1))
+def test_a_down_looking_camera_knows_the_heading_of_its_bow(yaw):
+    rotation = g.rotation_from_rpy(0, 0, yaw) @ g.BODY_FROM_DOWN_CAMERA
+    np.testing.assert_allclose(g.heading_of_camera(g.pose(rotation, np.zeros(3))), yaw, atol=1e-12)
+
+
+def test_camera_axes_are_right_down_forward():
+    right, down, forward = g.BODY_FROM_DOWN_CAMERA.T
+    np.testing.assert_array_equal(right, [0, -1, 0])  # starboard
+    np.testing.assert_array_equal(down, [-1, 0, 0])  # the lower edge of the image to the stern
+    np.testing.assert_array_equal(forward, [0, 0, -1])  # the view to the floor
+    np.testing.assert_array_equal(g.CV_FROM_GL @ [0, 0, -1], [0, 0, 1])  # OpenGL looks along -z

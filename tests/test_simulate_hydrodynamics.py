@@ -1,0 +1,183 @@
+"""The hull moves as Fossen's equations say, in closed form and by their conservation laws."""
+
+import numpy as np
+import pytest
+from physics_world import IDLE, bare_world, vehicle
+
+from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
+from twin import geometry
+from twin.config import Vehicle as Section
+from twin.errors import SurveyAborted
+from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
+from twin.simulate.vehicle import Vehicle, hull_of, physics_timestep_s
+
+STEP_S = 1 / 120
+HULL = hull_of(Section(buoyancy_n=0.0))
+
+
+def energy(v, hull=HULL):
+    pose = v.world_from_body
+    return mechanical_energy(hull, pose[:3, :3], pose[:3, 3], v.twist_body)
+
+
+def dense_acceleration(hull, rotation, twist, current, wrench):
+    """Fossen's equation with full matrices, linear velocity first as in the book: the slow way."""
+    mass = np.diag(np.roll(hull.inertia, 3))
+    added = np.diag(np.roll(hull.added, 3))
+    nu, flow = np.roll(twist, 3), np.concatenate([rotation.T @ current, np.zeros(3)])
+    relative = nu - flow
+
+    def coriolis(m, v):
+        s1, s2 = geometry.skew(m[:3, :3] @ v[:3]), geometry.skew(m[3:, 3:] @ v[3:])
+        return np.block([[np.zeros((3, 3)), -s1], [-s1, -s2]])
+
+    drag = np.diag(np.roll(hull.linear_drag, 3) + np.roll(hull.quadratic_drag, 3) * np.abs(relative))
+    up = rotation.T @ [0.0, 0.0, 1.0]
+    lift = (hull.buoyancy_n - hull.weight_n) * up
+    righting = np.cross(hull.centre_of_buoyancy_m, hull.buoyancy_n * up)
+    flow_rate = np.concatenate([-np.cross(nu[3:], flow[:3]), np.zeros(3)])
+    total = np.roll(wrench, 3) + np.concatenate([lift, righting]) + added @ flow_rate
+    total -= coriolis(mass, nu) @ nu + coriolis(added, relative) @ relative + drag @ relative
+    return np.roll(np.linalg.solve(mass + added, total), 3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_acceleration_is_the_solution_of_the_equation_written_with_full_matrices(seed):
+    rng = np.random.default_rng(seed)
+    hull = hull_of(Section(buoyancy_n=3.0, drag_factor=1.7, added_mass_factor=0.6))
+    rotation = geometry.so3_exp(rng.normal(size=3))
+    arguments = rotation, rng.normal(size=6), rng.normal(size=3), rng.normal(size=6)
+    np.testing.assert_allclose(acceleration(hull, *arguments), dense_acceleration(hull, *arguments), rtol=1e-10)
+
+
+def test_energy_never_grows_in_still_water_without_thrust():
+    # Leapfrog may put back (rate * step)^3 / 4 of a swing's energy in a step: (1.7/s / 120)^3 / 4 * 0.6 J < 1e-6 J.
+    v = vehicle(geometry.pose(geometry.rotation_from_rpy(1.0, 0.5, 2.0), np.zeros(3)))
+    v._velocity[:] = [0.8, -0.3, 0.4, 1.0, 0.5, 2.0]
+    v.step(IDLE, STEP_S)
+    energies = []
+    for _ in range(120 * 20):
+        v.step(IDLE, STEP_S)
+        energies.append(energy(v))
+    assert energies[0] - energies[-1] > 1.0
+    assert np.diff(energies).max() < 1e-6
+
+
+def test_without_drag_energy_is_kept():
+    hull = hull_of(Section(buoyancy_n=0.0))._replace(linear_drag=np.zeros(6), quadratic_drag=np.zeros(6))
+    v = vehicle(geometry.pose(geometry.rotation_from_rpy(0.6, -0.3, 0.0), np.zeros(3)))
+    v._hull = hull
+    start = energy(v, hull)
+    energies = [energy(v, hull) for _ in range(120 * 30) if v.step(IDLE, STEP_S) is None]
+    swing = start + hull.buoyancy_n * hull.centre_of_buoyancy_m[2]  # what the pendulum has to give
+    assert np.abs(np.array(energies) - start).max() < 1e-3 * swing  # (1.7/s * step)^2 / 4 = 5e-5, and a margin
+
+
+@pytest.mark.parametrize(("axis", "command"), [("surge", 0.3), ("surge", 0.6), ("heave", 0.3)])
+def test_terminal_speed_balances_thrust_and_drag(axis, command):
+    # The horizontal thrusters sit below the centre of gravity; a huge moment of inertia leaves pure surge.
+    k = {"surge": 0, "heave": 2}[axis]
+    v = vehicle()
+    v._hull = v._hull._replace(inertia=v._hull.inertia * np.array([1e9, 1e9, 1e9, 1, 1, 1]))
+    active = np.array([1, 1, 1, 1, 0, 0, 0, 0] if axis == "surge" else [0, 0, 0, 0, 1, 1, 1, 1])
+    for _ in range(60):
+        v.step(command * active, 0.5)
+    thrust = np.polyval(ROV.thrust_coefficients, command**2) * command * 4 * (np.sqrt(0.5) if axis == "surge" else 1)
+    linear, quadratic = ROV.linear_damping[k], ROV.quadratic_damping[k]
+    expected = (-linear + np.sqrt(linear**2 + 4 * quadratic * thrust)) / (2 * quadratic)
+    assert v.twist_body[3 + k] == pytest.approx(expected, rel=0.01)
+
+
+def test_a_neutral_vehicle_keeps_its_depth_and_a_buoyant_one_rises_at_its_terminal_speed():
+    v = vehicle(buoyancy_n=0.0)
+    v.step(IDLE, 30.0)
+    np.testing.assert_allclose(v.world_from_body, np.eye(4), atol=1e-12)
+    v = vehicle(buoyancy_n=2.0)
+    v.step(IDLE, 30.0)
+    linear, quadratic = ROV.linear_damping[2], ROV.quadratic_damping[2]
+    expected = (-linear + np.sqrt(linear**2 + 8 * quadratic)) / (2 * quadratic)
+    assert v.twist_body[5] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1)])
+def test_free_decay_of_a_small_tilt_has_the_period_and_damping_of_the_linearised_equation(axis, sign):
+    """I a'' + d a' + B h a = 0; roll is given a linear damping as its published one is zero."""
+    damping, stiffness = 0.15, HULL.buoyancy_n * HULL.centre_of_buoyancy_m[2]
+    inertia = (HULL.inertia + HULL.added)[axis]
+    v = vehicle(geometry.pose(geometry.so3_exp(0.02 * sign * np.eye(3)[axis]), np.zeros(3)))
+    v._hull = v._hull._replace(linear_drag=np.array([damping] * 3 + [0.0] * 3), quadratic_drag=np.zeros(6))
+    rate, decay = np.sqrt(stiffness / inertia - (damping / 2 / inertia) ** 2), damping / 2 / inertia
+    times, angles = [], []
+    for _ in range(120 * 12):
+        v.step(IDLE, STEP_S)
+        times.append(v.time_s)
+        angles.append(geometry.so3_log(v.world_from_body[:3, :3])[axis])
+    t = np.array(times)
+    expected = 0.02 * sign * np.exp(-decay * t) * (np.cos(rate * t) + decay / rate * np.sin(rate * t))
+    # sin(a)/a leaves 0.02^2/6 = 7e-5 of the stiffness, leapfrog (rate step)^2 / 24 = 1e-5 of the rate: over 20 rad
+    # of phase an error below 1e-3 of the amplitude, 2e-5 rad; a margin of 2.
+    np.testing.assert_allclose(angles, expected, atol=4e-5)
+
+
+def test_one_step_of_thrust_accelerates_mass_and_added_mass():
+    v = vehicle()
+    force = np.array([0.0, 0.0, 0.0, 10.0, -4.0, 7.0])
+    v._advance(force)
+    np.testing.assert_allclose(v.twist_body[3:], force[3:] / (13.5 + ROV.added_mass[:3]) * STEP_S, rtol=1e-12)
+
+
+def test_physics_is_the_same_in_a_steady_current_as_in_still_water_that_moves_along():
+    """Galilei: start with the current, in a turn, under thrust; subtract the current's path."""
+    current = np.array([0.4, -0.3, 0.1])
+    pose = geometry.pose(geometry.rotation_from_rpy(0.3, -0.2, 0.5), np.zeros(3))
+    drifting, still = vehicle(pose, current), vehicle(pose)
+    drifting._velocity[:3] = current
+    for _ in range(90):
+        for v in (drifting, still):
+            v.step(np.array([0.5, 0.1, 0.3, 0.4, 0.2, 0.1, 0.3, 0.2]), 1 / 30)
+    gone = still.world_from_body
+    gone[:3, 3] += 3.0 * current
+    assert np.linalg.norm(still.twist_body[:3]) > 0.2
+    np.testing.assert_allclose(drifting.world_from_body, gone, atol=1e-9)
+
+
+def test_a_steady_current_carries_a_drifting_neutral_vehicle_with_it():
+    # Along sway drag is purely quadratic, so the last of the difference fades as 1/t: (m + m_A) / (quadratic * t).
+    current = np.array([0.2, 0.1, -0.1])
+    v = vehicle(current_mps=current)
+    v.step(IDLE, 120.0)
+    velocity = v.world_from_body[:3, :3] @ v.twist_body[3:]
+    np.testing.assert_allclose(velocity, current, atol=2 * (13.5 + 7.12) / 217 / 120)
+
+
+def test_added_mass_and_drag_factors_scale_what_they_name():
+    hull = hull_of(Section(drag_factor=2.0, added_mass_factor=3.0))
+    np.testing.assert_allclose(hull.added, 3 * angular_first(ROV.added_mass))
+    np.testing.assert_allclose(hull.linear_drag, 2 * angular_first(ROV.linear_damping))
+    np.testing.assert_allclose(hull.quadratic_drag, 2 * angular_first(ROV.quadratic_damping))
+
+
+def test_a_motion_that_diverges_aborts_the_survey_and_tells_when_and_where():
+    v = vehicle()
+    v.step(IDLE, 0.5)
+    with pytest.raises(SurveyAborted, match=r"diverged at 0\.[56].* s; last states: 0\.500 s: at \[0\.0"):
+        v.step(np.full(8, np.nan), 0.5)
+    fast = vehicle()
+    fast._velocity[0] = 1e3
+    with pytest.raises(SurveyAborted, match="diverged at 0.000 s"):
+        fast.step(IDLE, STEP_S)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 7.5, 24, 25, 29.97, 30, 60, 100, 119, 120])
+def test_a_whole_number_of_physics_steps_makes_a_frame(rate_hz):
+    step = physics_timestep_s(rate_hz)
+    assert step <= STEP_S * (1 + 1e-9)
+    assert 1 / rate_hz / step == pytest.approx(round(1 / rate_hz / step), abs=1e-9)
+    v = Vehicle(bare_world(step), Section(), np.zeros(3), np.eye(4))
+    v.step(IDLE, 1 / rate_hz)
+    assert v.time_s == pytest.approx(1 / rate_hz)
+
+
+def test_a_fraction_of_a_physics_step_is_refused():
+    with pytest.raises(ValueError, match="no whole number of steps"):
+        vehicle().step(IDLE, 0.3 * STEP_S)

@@ -1,0 +1,1 @@
+"""Reading recorded data, writing what other tools open."""
