@@ -10,7 +10,7 @@ import os
 import sys
 from typing import Any, TypeAlias
 
-INSTALL_LINE = "apt-get install -y libegl1 libgl1-mesa-dri"
+INSTALL_LINE = "apt-get install -y libegl1 libgl1 libgl1-mesa-dri"
 
 
 class GlMissing(RuntimeError):  # noqa: N818 (said as it is)

@@ -6,6 +6,7 @@ usage: python tests/readme_commands.py [--done COMMAND]...      COMMAND has run 
 import argparse
 import re
 import subprocess
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -22,7 +23,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--done", action="append", default=[], metavar="COMMAND")
     commands = script((ROOT / "README.md").read_text(encoding="utf-8"), parser.parse_args().done)
-    return subprocess.run(["bash", "-c", commands], cwd=ROOT, check=False).returncode
+    with tempfile.TemporaryDirectory() as checkout:  # the same files, but no runs from before
+        for entry in ROOT.iterdir():
+            if entry.name != "runs":
+                (Path(checkout) / entry.name).symlink_to(entry)
+        return subprocess.run(["bash", "-c", commands], cwd=checkout, check=False).returncode
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 
@@ -91,9 +93,9 @@ def test_a_missed_requirement_is_named(twin_command):
 
 def test_options_reach_the_survey(twin_command):
     words = ("run", "quickstart", "--set", "plan.tracks=1", "--set", "water.jerlov=II", "--seed", "7", "--out", "here")
-    scenario, source, out, _, live = twin_command(*words, outcome=result()).surveys[0]
+    scenario, out, _, live = twin_command(*words, outcome=result()).surveys[0]
     assert (scenario.plan.tracks, scenario.water.jerlov, scenario.seed) == (1, "II", 7)
-    assert (out, live, source.path.name) == (Path("here"), False, "quickstart.toml")
+    assert (out, live, scenario.source.path.name) == (Path("here"), False, "quickstart.toml")
 
 
 @pytest.mark.parametrize(
@@ -189,6 +191,27 @@ def test_a_crash_of_the_driver_is_a_finding(monkeypatch):
     killed = subprocess.CompletedProcess([], -11, "", "")
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: killed)
     assert doctor.graphics().found == "drawing ended with status -11"
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_a_survey_that_can_be_read(tmp_path):
+    out = tmp_path / "run"
+    survey = subprocess.Popen(
+        [sys.executable, "-m", "twin", "run", "quickstart", "--out", str(out), "--json"],
+        stdout=subprocess.PIPE,
+        cwd=ROOT,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also where this one ignores it
+    )
+    deadline = time.monotonic() + 120
+    while len(list(out.glob("keypoints/*"))) < 5 and time.monotonic() < deadline:
+        time.sleep(0.2)
+    survey.send_signal(signal.SIGINT)
+    printed, _ = survey.communicate(timeout=120)
+    assert survey.returncode == 130
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics == json.loads(printed)
+    assert (metrics["status"], metrics["reason"]) == ("aborted", "interrupted")
+    assert metrics["trajectory"]["final"]["path_m"] > 0 and (out / "report.html").is_file()
 
 
 def test_set_up_installs_what_the_doctor_asks_for():

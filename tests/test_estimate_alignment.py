@@ -54,7 +54,10 @@ def mixed_adjustment(start, links, iterations=6):
         a = numeric(lambda x: constraint(x, np.zeros(m)), np.zeros(n))
         b = numeric(lambda v: constraint(np.zeros(n), v), np.zeros(m))
         residual = np.concatenate(
-            [geometry.log(geometry.inverse(link.i_from_j) @ motion) for link, motion in zip(links, motions, strict=True)]
+            [
+                geometry.log(geometry.inverse(link.i_from_j) @ motion)
+                for link, motion in zip(links, motions, strict=True)
+            ]
         )
         w = constraint(np.zeros(n), np.zeros(m))
         system = np.block(
@@ -94,7 +97,9 @@ def test_a_wrong_link_is_dropped_and_told():
     wrong = links[6]._replace(i_from_j=links[6].i_from_j @ geometry.exp(np.array([0, 0, 0.2, 0.5, 0, 0])))
     aligned = align(key_points(poses), links[:6] + [wrong] + links[7:], ANCHOR, RIG, NOISE)
     assert [(link.i, link.j) for link in aligned.dropped] == [(wrong.i, wrong.j)]
-    np.testing.assert_allclose(aligned.poses, align(key_points(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5)
+    np.testing.assert_allclose(
+        aligned.poses, align(key_points(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5
+    )
 
 
 def test_pressure_and_attitude_bound_what_links_alone_cannot():
@@ -113,5 +118,3 @@ def test_pressure_and_attitude_bound_what_links_alone_cannot():
     held = align(key_points(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
     assert abs(free[2, 3] - 2.0) > 0.3
     assert abs(held[2, 3] - 2.0) < 0.01
-
-

@@ -27,7 +27,7 @@ def even(depth, variance):
 
 def test_n_fusions_have_the_mean_and_an_nth_of_the_variance():
     rng = np.random.default_rng(0)
-    seen = 2 + 0.01 * rng.normal(size=(20, 8, 8))
+    seen = 2 + 0.005 * rng.normal(size=(20, 8, 8))  # half the claimed noise: nothing meets the gate
     state = even(seen[0], 1e-4)
     for depth in seen[1:]:
         state = fuse(state, even(depth, 1e-4))
@@ -89,31 +89,29 @@ def test_nothing_is_interpolated_across_a_step():
 
 
 def test_the_relative_pose_adds_its_variance():
-    pose = down_camera(0, 0, 2.0)
     depth = np.full((120, 160), 2.0, np.float32)
     cov = np.zeros((6, 6))
     cov[5, 5] = 0.01**2  # along the axis: straight into depth
     fused = carry(even(depth, 1e-4), even(depth * np.nan, 1e-4), np.eye(4), cov, RIG).fused
     np.testing.assert_allclose(fused.variance_m2[5:-5, 5:-5], 2e-4, rtol=1e-4)
-    assert pose.shape == (4, 4)
 
 
-def test_depth_from_motion_is_the_closed_form_of_the_plane():
+@pytest.mark.parametrize(("guess", "least_z"), [(1.02, 0.3), (1.003, 0.6)])
+def test_depth_from_motion_finds_the_plane(guess, least_z):
+    """From 2 % off (0.4 px of stereo disparity, 0.6 px of flow) and 0.3 %; from afar sigma is on the safe side."""
     rng = np.random.default_rng(5)
     rig = small_rig()
     floor, first, second = plane(0.3, 0.2), down_camera(0, 0, 2.0), down_camera(0.2, 0.01, 2.02, (0.01, 0.02, 0.01))
     old = digitise(look(floor, rig, first)[0], rng, 2.0).astype(np.float32)
     image, truth = look(floor, rig, second)
-    off = even(truth * 1.02, 1e-3)  # 0.4 px of stereo disparity, 0.6 px of flow
-    found = motion_depth(
-        digitise(image, rng, 2.0).astype(np.float32), old, off, geometry.inverse(first) @ second, EXACT, rig
-    )
+    new = digitise(image, rng, 2.0).astype(np.float32)
+    found = motion_depth(new, old, even(truth * guess, 1e-3), geometry.inverse(first) @ second, EXACT, rig)
     inside = np.s_[45:-10, 10:-10]
     assert np.isfinite(found.depth_m[inside]).mean() > 0.95
     error_px = rig.focal_px * rig.baseline_m * (1 / found.depth_m - 1 / truth)[inside]
     z = ((found.depth_m - truth) / np.sqrt(found.variance_m2))[inside]
-    assert abs(np.nanmedian(error_px)) < 0.03  # the prior draws weak pixels back to where they started
-    assert 0.5 < np.nanpercentile(np.abs(z), 68.3) < 1.3
+    assert abs(np.nanmedian(error_px)) < 0.02
+    assert least_z < np.nanpercentile(np.abs(z), 68.3) < 1.3
 
 
 def test_motion_depth_is_as_uncertain_as_the_relative_pose_makes_it():

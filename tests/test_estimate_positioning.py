@@ -61,7 +61,9 @@ def error_of(true, estimated):
 
 
 def test_normalised_images_do_not_depend_on_an_even_lamp_gain():
-    image = colour(scene.digitise(scene.look(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))[0], np.random.default_rng(0), 0))
+    image = colour(
+        scene.digitise(scene.look(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))[0], np.random.default_rng(0), 0)
+    )
     half = (image * 0.5).astype(np.uint8)
     difference = matching.normalise(image).astype(float) - matching.normalise(half)
     assert np.median(np.abs(difference)) < 3  # of 36 grey levels of contrast; the rest is rounding of the darker image
@@ -126,7 +128,9 @@ def test_an_empty_mosaic_gives_no_position(diver):
     assert Mosaic(-6, -6, 0.01, (1200, 1200)).register(image, scene.down_camera(0, 0, ALTITUDE_M), 1.9, RIG) is None
 
 
-@pytest.mark.parametrize("step", [[0, 0, 0, 0, -0.3, 0], [0.01, -0.02, 0.03, 0.3, -0.5, 0.03], [0, 0, 0.2, 0.5, 0.2, 0]])
+@pytest.mark.parametrize(
+    "step", [[0, 0, 0, 0, -0.3, 0], [0.01, -0.02, 0.03, 0.3, -0.5, 0.03], [0, 0, 0.2, 0.5, 0.2, 0]]
+)
 def test_pair_motion_is_right_to_millimetres_though_matching_starts_a_centimetre_off(diver, step):
     pose = scene.down_camera(-1, 0, ALTITUDE_M)
     earlier, _, _ = diver.key_point(pose)
@@ -169,7 +173,9 @@ def test_pressure_corrects_height_alone_and_by_the_weight_of_its_noise():
     believed = PoseFilter(pose, RIG, SensorNoise(0.01, 0.003, 0.01))
     believed.cov = np.diag([1e-8] * 3 + [1e-4] * 3)
     believed.aid(Readings(pressure_z_m=3.02))
-    np.testing.assert_allclose(believed.world_from_camera[:3, 3], [1.0, 2.0, 3.01], atol=1e-6)  # equal variances: half way
+    np.testing.assert_allclose(
+        believed.world_from_camera[:3, 3], [1.0, 2.0, 3.01], atol=1e-6
+    )  # equal variances: half way
 
 
 def test_a_correction_beyond_both_uncertainties_is_refused():

@@ -43,6 +43,8 @@ def test_on_a_level_floor_exactly_the_cells_in_both_images_are_seen(rpy_deg):
     differs = coverage.seen != expected
     assert differs.sum() < 0.4 * 4 * np.sqrt(expected.sum())
     assert not differs[eroded(expected, 1) | ~dilated(expected, 1)].any()
+    centroids = [np.mean(np.nonzero(mask), axis=1) for mask in (coverage.seen, expected)]
+    np.testing.assert_allclose(*centroids, atol=0.1)  # no half-cell shift [cells]
 
 
 def dilated(mask: np.ndarray, n: int) -> np.ndarray:

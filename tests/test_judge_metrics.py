@@ -206,6 +206,18 @@ def broken_off(n_frames: int, n_keys: int):
     return result, None, truth
 
 
+def test_what_comes_in_from_outside_cannot_bring_nan_into_the_json():
+    timing = {
+        "wall_s": np.nan,
+        "simulated_s": np.float32(3),
+        "stages": {"ga": {"mean_ms": np.inf, "count": np.int64(2)}},
+    }
+    figures = evaluate(RESULT, ELEVATION, TRUTH, RIG, {}, timing, {"seed": np.int64(7)})
+    json.dumps(figures, allow_nan=False)
+    assert figures["seed"] == 7 and figures["timing"]["stages"]["ga"] == {"mean_ms": None, "count": 2}
+    assert figures["timing"]["wall_s"] is None and figures["timing"]["simulated_s"] == 3
+
+
 def test_a_map_without_a_single_estimate_is_judged_as_empty_not_as_nan():
     empty = dataclasses.replace(ELEVATION, height_m=np.full_like(ELEVATION.height_m, np.nan))
     figures = evaluate(RESULT, empty, TRUTH, RIG, {}, {}, {})["map"]

@@ -71,7 +71,10 @@ def test_a_constant_height_error_has_its_closed_form():
 
 @pytest.mark.parametrize("yaw_deg", [5.0, 359.0, -359.0, 179.0])
 def test_heading_error_is_wrapped(yaw_deg):
-    errors = path_errors(straight(5, yaw_rad=np.deg2rad(yaw_deg)), straight(5))
+    bow_west = geometry.pose(geometry.rotation_from_rpy(0, 0, np.deg2rad(178)), np.zeros(3))  # at the seam of +-180 deg
+    estimate, truth = straight(5, yaw_rad=np.deg2rad(yaw_deg)), straight(5)
+    turned = (Trajectory(t.times_s, bow_west @ t.world_from_camera) for t in (estimate, truth))
+    errors = path_errors(*turned)
     expected = (yaw_deg + 180) % 360 - 180
     np.testing.assert_allclose(np.rad2deg(errors.heading_rad[1:]), expected, atol=1e-9)
 

@@ -1,1 +1,35 @@
 """A simulation-first digital twin of an underwater stereo survey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from twin.config import Scenario
+    from twin.results import RunResult
+
+__all__ = ["load_scenario", "run"]
+
+
+def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+    """Reads a scenario file, or a name in scenes/, with `key=value` overrides.
+
+    Raises:
+        ScenarioError: every fault of the file, each as `FILE:LINE: key: what is wrong`.
+    """
+    from twin.config import load_scenario
+
+    return load_scenario(path, overrides)
+
+
+def run(scenario: Scenario, out: str | Path) -> RunResult:
+    """Flies a survey and leaves a run folder at `out`.
+
+    Raises:
+        ScenarioError: the survey cannot be flown as asked; nothing was written.
+    """
+    from twin import survey
+
+    return survey.run(scenario, Path(out))

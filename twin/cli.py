@@ -87,7 +87,7 @@ def plan(
     from twin.config import load_scenario
     from twin.mission import prepare
 
-    mission = prepare(*load_scenario(scene, overrides))
+    mission = prepare(load_scenario(scene, overrides))
     console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
     print(f"Picture: {planning.draw(mission, out or Path(f'runs/{mission.scenario.name}-plan.png'))}")
 
@@ -139,7 +139,7 @@ def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> R
     from twin.config import load_scenario
     from twin.doctor import graphics
 
-    scenario, source = load_scenario(scene, overrides)
+    scenario = load_scenario(scene, overrides)
     folder = _new_folder(scenario, out)
     drawing = graphics()
     if not drawing.ok:
@@ -148,7 +148,7 @@ def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> R
     from twin import survey  # only now: it needs OpenGL
 
     with console.progress_bar() as progress:
-        return survey.run(scenario, source, folder, progress, live)
+        return survey.run(scenario, folder, progress, live)
 
 
 def _new_folder(scenario: Scenario, out: Path | None) -> Path:

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from twin import geometry
 from twin.errors import ScenarioError, TwinError
@@ -27,6 +28,15 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _numbers_are_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        """A text or a truth value is no number, even where it could be read as one."""
+        kind = cls.model_fields[info.field_name or ""].annotation
+        if kind in (float, int) and isinstance(value, str | bool):
+            raise PydanticCustomError("float_type" if kind is float else "int_type", "a number")
+        return value
 
 
 class Terrain(Section):
@@ -152,6 +162,23 @@ class Mapping(Section):
     cell_m: float = Field(0.02, gt=0.001, le=1, description="cell of the elevation map [m]")
 
 
+class Source(BaseModel):
+    """Where a scenario came from, so that a fault found later can still be told with file and line."""
+
+    path: Path
+    lines: dict[str, int] = {}
+    overrides: tuple[str, ...] = ()
+
+    def fault(self, error: TwinError) -> str:
+        """`FILE:LINE: key: what is wrong (allowed: ...)`; the line is of the nearest enclosing key that is there."""
+        if any(o.split("=", 1)[0].strip().replace('"', "") == error.field for o in self.overrides):
+            return f"--set: {error}"
+        key = error.field
+        while key not in self.lines and "." in key:
+            key = key.rpartition(".")[0]
+        return f"{self.path}:{self.lines.get(key, 1)}: {error}"
+
+
 class Scenario(Section):
     """One survey, fully described."""
 
@@ -171,6 +198,13 @@ class Scenario(Section):
     estimate: Estimation = Estimation()
     map: Mapping = Mapping()
     require: dict[str, float] = Field({}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
+
+    _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
+
+    @property
+    def source(self) -> Source:
+        """Where the scenario was read, for faults that are found later."""
+        return self._source
 
     def believed_rig(self) -> StereoRig:
         """The rig's calibration as the estimators know it."""
@@ -205,24 +239,7 @@ def _tan_deg(angle_deg: float) -> float:
     return float(np.tan(np.deg2rad(angle_deg)))
 
 
-class Source(BaseModel):
-    """Where a scenario came from, so that a fault found later can still be told with file and line."""
-
-    path: Path
-    lines: dict[str, int] = {}
-    overrides: tuple[str, ...] = ()
-
-    def fault(self, error: TwinError) -> str:
-        """`FILE:LINE: key: what is wrong (allowed: ...)`; the line is of the nearest enclosing key that is there."""
-        if any(o.split("=", 1)[0].strip() == error.field for o in self.overrides):
-            return f"--set: {error}"
-        key = error.field
-        while key not in self.lines and "." in key:
-            key = key.rpartition(".")[0]
-        return f"{self.path}:{self.lines.get(key, 1)}: {error}"
-
-
-def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> tuple[Scenario, Source]:
+def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     """Reads a scenario file (or a name in scenes/), with what it extends and `key=value` overrides.
 
     Raises:
@@ -234,10 +251,12 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> tuple[Scen
     for override in overrides:
         _apply(tree, override)
     try:
-        return Scenario.model_validate(tree), source
+        scenario = Scenario.model_validate(tree)
     except ValidationError as error:
         faults = [_explain(item) for item in error.errors()]
         raise ScenarioError([source.fault(f) for f in faults]) from None
+    scenario._source = source
+    return scenario
 
 
 def find_scene(path: str | Path) -> Path:
@@ -291,7 +310,8 @@ def _read(file: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         line = re.search(r"line (\d+)", str(error))
-        raise ScenarioError([f"{file}:{line[1] if line else 1}: not TOML: {error}"]) from None
+        number = line[1] if line else len(text.splitlines())
+        raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
     lines = _key_lines(text)
@@ -363,10 +383,10 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         value = text
     *parents, leaf = key.strip().split(".")
     if parents[:1] == ["require"]:
-        parents, leaf = ["require"], ".".join([*parents[1:], leaf])
+        parents, leaf = ["require"], ".".join([*parents[1:], leaf]).strip('"')
     node: Any = tree
     for part in parents:
-        node = node[int(part)] if isinstance(node, list) and part.isdigit() else node.setdefault(part, {})
+        node = _enter(node, part, override)
         if not isinstance(node, dict | list):
             raise ScenarioError([f"--set {override}: {part} is a value, not a section"])
     if isinstance(node, list):
@@ -374,6 +394,15 @@ def _apply(tree: dict[str, Any], override: str) -> None:
     node[leaf] = value
     if key.strip() in ("terrain.height_file", "terrain.texture_file"):
         node[leaf] = str(_expand(str(value), Path.cwd()))
+
+
+def _enter(node: Any, part: str, override: str) -> Any:
+    """The section or list item of this name."""
+    if not isinstance(node, list):
+        return node.setdefault(part, {})
+    if not part.isdigit() or int(part) >= len(node):
+        raise ScenarioError([f"--set {override}: no item {part} (allowed: 0 to {len(node) - 1})"])
+    return node[int(part)]
 
 
 def _explain(item: Any) -> TwinError:

@@ -104,7 +104,7 @@ def draw_one_frame() -> str:
         brightness = renderer.render().mean()
         from OpenGL.GL import GL_RENDERER, glGetString
 
-        name = glGetString(GL_RENDERER).decode()
+        name = bytes(glGetString(GL_RENDERER) or b"a nameless renderer").decode()
     if brightness < 1:
         raise RuntimeError(f"{name} draws nothing but black")
     return f"{name} through {os.environ.get('MUJOCO_GL', 'the default')}"
@@ -114,7 +114,7 @@ def _probe() -> int:
     try:
         print(draw_one_frame())
     except Exception as error:  # the parent tells the user, whatever it is
-        print(error, file=sys.stderr)
+        print(getattr(error, "problem", error), file=sys.stderr)
         return 1
     return 0
 

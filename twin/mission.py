@@ -66,13 +66,14 @@ class Mission:
         return range(1, self.plan.n_tracks + 1)
 
 
-def prepare(scenario: Scenario, source: Source) -> Mission:
+def prepare(scenario: Scenario) -> Mission:
     """Loads the floor and plans the survey.
 
     Raises:
         ScenarioError: all that stands in the way, each with file and line.
     """
     faults: list[str] = []
+    source = scenario.source
     terrain = _attempt(lambda: load_terrain(scenario), source, faults)
     plan = _attempt(lambda: make_plan(scenario), source, faults)
     _attempt(lambda: check_require(scenario.require), source, faults)
@@ -123,7 +124,9 @@ def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: lawnmower.S
     size = terrain.size_m
     if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
         shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
-        raise TwinError("plan.area_m", f"{shown} m is larger than the terrain", f"up to {size[0]:.2f} x {size[1]:.2f} m")
+        raise TwinError(
+            "plan.area_m", f"{shown} m is larger than the terrain", f"up to {size[0]:.2f} x {size[1]:.2f} m"
+        )
     clearance = least_clearance(plan, terrain.height_at)
     if not clearance.inside:
         raise TwinError("plan.area_m", "the path leaves the terrain", f"a path inside {size[0]:.2f} x {size[1]:.2f} m")

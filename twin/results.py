@@ -17,6 +17,7 @@ import numpy as np
 from twin import config, view
 from twin.estimate.map_builder import KeyPointImages, build_map
 from twin.estimate.pipeline import Navigator
+from twin.errors import TwinError
 from twin.exchange import geotiff, mesh, posegraph
 from twin.judge.metrics import evaluate
 from twin.judge.report import write_report
@@ -37,10 +38,13 @@ class Logbook:
     """Opens the run folder and notes what happens in it, a JSON object a line (log.jsonl)."""
 
     def __init__(self, folder: Path, mission: Mission):
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = (folder / "log.jsonl").open("w", encoding="utf-8")
-        (folder / "scenario.resolved.toml").write_text(config.dump_toml(mission.scenario), encoding="utf-8")
-        (folder / "env.json").write_text(json.dumps(environment(), indent=1), encoding="utf-8")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = (folder / "log.jsonl").open("w", encoding="utf-8")
+            (folder / "scenario.resolved.toml").write_text(config.dump_toml(mission.scenario), encoding="utf-8")
+            (folder / "env.json").write_text(json.dumps(environment(), indent=1), encoding="utf-8")
+        except OSError as error:
+            raise TwinError("--out", f"{folder} cannot be written: {error}", "a folder with space in it") from None
         self.write("begun", name=mission.scenario.name, seed=mission.scenario.seed, filled=mission.terrain.n_filled)
 
     def __enter__(self) -> Logbook:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.config import Scenario, Source
+from twin.config import Scenario
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
 from twin.mission import Mission, Step, prepare
@@ -32,7 +32,6 @@ class Progress(NamedTuple):
 
 def run(
     scenario: Scenario,
-    source: Source,
     out: Path,
     progress: Callable[[Progress], None] = lambda _: None,
     live: bool = False,
@@ -42,7 +41,7 @@ def run(
     Raises:
         ScenarioError: the survey cannot be flown as asked; nothing was written.
     """
-    mission = prepare(scenario, source)
+    mission = prepare(scenario)
     watch, begun = Stopwatch(), time.perf_counter()
     with Logbook(out, mission) as log, Sea(mission, watch) as sea:
         navigator = make_navigator(mission, out, watch)
@@ -81,7 +80,14 @@ def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigato
     scenario, rig = mission.scenario, mission.rig
     pixel_m = scenario.plan.altitude_m / rig.focal_px
     return Navigator(
-        rig, scenario.believed_noise(), scenario.estimate, mission.start, mission.grid, pixel_m, folder / "keypoints", watch
+        rig,
+        scenario.believed_noise(),
+        scenario.estimate,
+        mission.start,
+        mission.grid,
+        pixel_m,
+        folder / "keypoints",
+        watch,
     )
 
 

@@ -25,8 +25,8 @@ N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
 
 #: The viewer of this Python; without --bind it would listen to everybody.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
-#: The true floor lets the map shine through where the map is too low.
-TRUTH_ALPHA = 110
+#: The true floor lets the map shine through, and is drawn a little lower: a good map would flicker with it.
+TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
 
 
 def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
@@ -102,6 +102,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
     if "dem_truth" in run.rasters:
         floor = view_map.floor_surface(run.rasters["dem_truth"])
+        recording.log("world/true_floor", rr.Transform3D(translation=(0, 0, -TRUTH_BELOW_M)), static=True)
         recording.log("world/true_floor", surface_mesh(floor, alpha=TRUTH_ALPHA), static=True)
     if "reference" in run.trajectories:
         positions = run.trajectories["reference"].positions
@@ -194,6 +195,8 @@ def log_curves(recording: rr.RecordingStream, run: Run) -> None:
                 _log_errors(recording, name, run.trajectories[name], run.trajectories["truth"])
     for stage, (moments, values) in stage_times(run).items():
         log_curve(recording, f"timing/{stage}", moments, values)
+        if len(values) == 1:
+            recording.log(f"timing/{stage}", rr.SeriesPoints(marker_sizes=4), static=True)
 
 
 def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, truth: Trajectory) -> None:
@@ -210,9 +213,8 @@ def log_curve(
 ) -> None:
     """One curve over both timelines, in the colour of its role."""
     if len(values):
-        look: dict[str, Any] = (
-            {"colors": rgb(role), "names": LABELS[role]} if role else {"names": entity.split("/")[-1]}
-        )
+        look: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
+        look |= {"colors": rgb(role)} if role else {}
         recording.log(entity, rr.SeriesLines(**look), static=True)
         recording.send_columns(entity, time_columns(moments), rr.Scalars.columns(scalars=values))
 
@@ -234,10 +236,8 @@ class Live:
         """One frame: the pose always, the images and the path at key points."""
         pose = estimate.world_from_camera
         _set_time(self.recording, frame.index, frame.time_s)
-        self.recording.log(
-            "world/rig",
-            rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
-        )
+        quaternion = rr.Quaternion(xyzw=geometry.quaternion_xyzw(pose[:3, :3]))
+        self.recording.log("world/rig", rr.Transform3D(translation=pose[:3, 3], quaternion=quaternion))
         self.recording.log("error/position/sigma", rr.Scalars(estimate.sigma_m))
         if frame.right is not None:
             self.path.append(pose[:3, 3].copy())

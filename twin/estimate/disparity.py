@@ -85,14 +85,14 @@ def _search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
         mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
     )
     padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / 16
+    disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / np.float32(16)
     column = np.arange(left.shape[1], dtype=np.float32)
     disparity[(disparity < 0) | (disparity > column)] = np.nan
-    return disparity
+    return disparity.astype(np.float32)
 
 
 def _flattened(image: Gray) -> Gray:
-    """Local contrast normalised, so that lamps and veil do not steer the search; less so where there is mostly noise."""
+    """Local contrast normalised, so that lamps and veil do not steer the search; less so where noise prevails."""
     deviation = image.astype(np.float32)
     deviation -= cv2.boxFilter(deviation, -1, (WINDOW_PX, WINDOW_PX))
     variance = cv2.boxFilter(deviation * deviation, -1, (WINDOW_PX, WINDOW_PX))

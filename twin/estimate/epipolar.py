@@ -24,8 +24,8 @@ SUPPORT_PX = 1.2
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
 #: Taper of the window (standard deviation) in calm images and at most [px]; the median sigma that counts as calm [px].
 SPREAD_PX, MAX_SPREAD_PX, CALM_SIGMA_PX = 1.5, 2.5, 0.08
-#: Window in which brightness and contrast of the two images are made equal [px].
-BALANCE_PX = 25
+#: Window in which brightness and contrast of the two images are made equal [px of images at half size].
+BALANCE_PX = 13
 #: Windows that correlate less are mismatches.
 LEAST_CORRELATION = 0.4
 
@@ -68,7 +68,8 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     centre: unbiased on slopes, free of the pixel-locking of the integer search; neighbours on another surface do not
     count. Brightness and contrast of O are first balanced locally: veil and lamps look different from another place.
     The variance is the least-squares one for the noise found in the residuals, raised where a window's own residuals
-    are larger. Where noise is strong, the last window grows.
+    are larger. Where noise is strong, the last window grows. Sigma is the error's within 15 % in clear water; where
+    noise is a fifth and a half of the contrast, errors (mismatches and all) are 1.4 and 1.9 times sigma.
 
     Args:
         reference, other: (H, W) float32 grey images.
@@ -76,11 +77,13 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         view: where the other image sees a disparity.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, NOTHING).astype(np.float32)
-    sigma, noise_variance, spread_px = fitted, 1.0, SPREAD_PX
+    sigma, excess, noise_variance, spread_px = fitted, fitted, 1.0, SPREAD_PX
     for _ in range(iterations):
         residual, slope = _balanced_warp(reference, other, fitted, view)
         noise_variance = _noise_variance(residual, slope)
-        priors = np.array([noise_variance / PRIOR_PX**2, noise_variance / PRIOR_SLOPE**2], np.float32)
+        priors = np.array(
+            [noise_variance / PRIOR_PX**2, noise_variance / PRIOR_SLOPE**2, noise_variance / 8], np.float32
+        )
         fitted, weight, excess = _fit_planes(fitted, residual, slope, _taper(spread_px), np.float32(SUPPORT_PX), priors)
         sigma = np.sqrt(weight * np.maximum(excess, noise_variance))
         spread_px = _spread(sigma, fitted, spread_px)
@@ -111,16 +114,25 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
     warped, slope = np.empty_like(reference), np.empty_like(reference)
     _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
     seen = (slope != 0).astype(np.float32)
+    gain, offset = (
+        cv2.resize(layer, reference.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        for layer in _balance(reference[::2, ::2], warped[::2, ::2], seen[::2, ::2])
+    )
+    return np.asarray((reference - gain * warped - offset) * seen, np.float32), slope
+
+
+def _balance(image: Map, other: Map, seen: Map) -> tuple[Map, Map]:
+    """Gain and offset that give `other` the local mean and deviation of `image`; at half size, they vary slowly."""
     count = _mean(seen) + 1e-3
-    mean_i, mean_o = _mean(reference * seen) / count, _mean(warped * seen) / count
-    power_i, power_o = _mean(reference**2 * seen) / count, _mean(warped**2 * seen) / count
+    mean_i, mean_o = _mean(image * seen) / count, _mean(other * seen) / count
+    power_i, power_o = _mean(image * image * seen) / count, _mean(other * other * seen) / count
     floor = 4.0  # grey levels squared: no texture, no balancing
     gain = np.sqrt((np.maximum(power_i - mean_i**2, 0) + floor) / (np.maximum(power_o - mean_o**2, 0) + floor))
-    return ((reference - mean_i) - gain * (warped - mean_o)) * seen, slope
+    return gain.astype(np.float32), (mean_i - gain * mean_o).astype(np.float32)
 
 
 def _mean(image: Map) -> Map:
-    return cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX))
+    return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 
 def _taper(spread_px: float) -> Map:
@@ -218,7 +230,7 @@ def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support)
 
 @njit(cache=True, nogil=True)
 def _fit_planes(disparity, residual, slope, taper, support, priors):
-    """Disparity of the plane fitted around each pixel, its variance at unit noise, the window's mean square residual."""
+    """Disparity of the plane fitted around each pixel, its variance at unit noise, the mean square residual."""
     height, width = disparity.shape
     half = taper.size // 2
     fitted = np.full((height, width), NOTHING, np.float32)
@@ -252,6 +264,8 @@ def _fit_planes(disparity, residual, slope, taper, support, priors):
             step = (c00 * sums[6, u] + c01 * sums[7, u] + c02 * sums[8, u]) / det
             if abs(step) < 1:
                 fitted[v, u] = disparity[v, u] + step
-                weight[v, u] = c00 / det * (sums[11, u] + priors[0]) / a00  # the taper's own loss: sum w^2 / sum w
+                # the taper's own loss is sum w^2 / sum w; what is noise in the slopes informs of nothing
+                genuine = max(sums[0, u] - priors[2] * sums[10, u], 0.1 * sums[0, u]) / a00
+                weight[v, u] = c00 / det * (sums[11, u] + priors[0]) / a00 / (genuine * genuine)
                 excess[v, u] = sums[9, u] / sums[10, u]
     return fitted, weight, excess

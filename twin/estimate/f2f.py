@@ -51,4 +51,3 @@ class FrameToFrame:
         step = geometry.log(self.last_motion)
         sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(step[3:]))])
         return motion.Motion(self.last_motion, np.diag(sigma**2), 0, np.inf), "too few points matched"
-

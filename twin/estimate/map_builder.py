@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import geometry
-from twin.estimate import depth_filter, disparity, elevation
+from twin.estimate import depth_filter, disparity, elevation, surface
 from twin.estimate.depth_filter import DepthMap, Mask
-from twin.estimate.elevation import Patch
+from twin.estimate.surface import Patch
 from twin.records import ElevationMap, Image, MapGrid, StereoRig
 
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def build_map(
         step_cov: (n, 6, 6) covariance of each pose relative to the one before (the first is not used); exact if None.
         max_disparity_px: largest disparity searched; found from the images if None.
     """
-    mapper, light, reach = elevation.ElevationMapper(grid), Light(), disparity.Reach(rig, max_disparity_px)
+    mapper, light, reach = elevation.ElevationMapper(grid), Light(rig), disparity.Reach(rig, max_disparity_px)
     steps = np.zeros((len(poses), 6, 6)) if step_cov is None else step_cov
     old = None
     for k, pair in enumerate(key_points):
@@ -63,7 +63,7 @@ def build_map(
         depth, taken = stereo, None
         if old is not None:
             depth, taken = _step(old, stereo, gray, poses[k], steps[k], rig)
-        patch = elevation.rasterise(depth, poses[k], node_cov[k], rig, grid)
+        patch = surface.rasterise(depth, poses[k], node_cov[k], rig, grid)
         if old is not None and old.patch is not None:
             mapper.retire(old.patch, patch, taken)
         if patch is not None:
@@ -79,7 +79,7 @@ def build_map(
 
 def _look(pair: KeyPointImages, reach: disparity.Reach, rig: StereoRig) -> tuple[Map, DepthMap]:
     """The left image in grey and the depth map of a stereo pair."""
-    left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in pair)
+    left, right = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in pair)
     stereo = disparity.dense_disparity(left, right, reach.max_disparity_px)
     reach.see(stereo.disparity_px)
     return left.astype(np.float32), depth_filter.stereo_depth(stereo, rig)
@@ -98,18 +98,18 @@ def _step(
 class Light:
     """The mean light of the images so far: lamps travel with the camera, the floor does not, so only lamps stay."""
 
-    def __init__(self) -> None:
-        self._sum: Map | None = None
+    def __init__(self, rig: StereoRig) -> None:
+        self._size = (rig.width_px, rig.height_px)
+        self._sum = np.zeros((-(-rig.height_px // 4), -(-rig.width_px // 4), 3), np.float32)
         self._count = 0
 
     def see(self, rgb: Image) -> None:
         """Takes an image into the mean, at a quarter of its size and blurred: only the lamps are wanted."""
-        small = cv2.resize(rgb, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(np.float32)
-        soft = cv2.blur(small, (9, 9))
-        self._sum = soft if self._sum is None else self._sum + soft
-        self._count, self._shape = self._count + 1, rgb.shape[:2]
+        small = cv2.resize(rgb, self._sum.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+        self._sum += cv2.blur(small, (9, 9))
+        self._count += 1
 
     def gain(self) -> Map:
         """(H, W, 3) factor that evens the light out."""
         mean = self._sum / self._count + 1
-        return cv2.resize(mean.mean(axis=(0, 1)) / mean, self._shape[::-1], interpolation=cv2.INTER_LINEAR)
+        return np.asarray(cv2.resize(mean.mean(axis=(0, 1)) / mean, self._size), np.float32)

@@ -49,7 +49,9 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
     return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
 
-def track(source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1) -> tuple[Points, Mask]:
+def track(
+    source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1
+) -> tuple[Points, Mask]:
     """Where patches of one image are in another, by Lucas-Kanade there and back.
 
     Args:

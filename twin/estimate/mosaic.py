@@ -41,7 +41,9 @@ class Mosaic:
         """Forgets everything: after a global alignment the mosaic is laid anew."""
         self.height_m.fill(np.nan)
 
-    def add(self, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig) -> None:
+    def add(
+        self, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
+    ) -> None:
         """Lays a frame with its depth (height, width), NaN where unknown, into the empty cells."""
         reach_m = float(np.nanmax(depth_m, initial=0.0)) * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
         window, left, top = self._window(world_from_camera[:3, 3], reach_m)
@@ -51,7 +53,9 @@ class Mosaic:
             self.brightness[window], self.height_m[window],
         )  # fmt: skip
 
-    def register(self, image: matching.Image, world_from_camera: Array, footprint_m: float, rig: StereoRig) -> motion.Motion | None:
+    def register(
+        self, image: matching.Image, world_from_camera: Array, footprint_m: float, rig: StereoRig
+    ) -> motion.Motion | None:
         """Pose correction of a frame: predicted_from_true, with its covariance; None where too little agrees.
 
         Args:
@@ -173,14 +177,24 @@ def _normal_equations(points, brightness, frame, camera_from_world, focal, cx, c
         residual = brightness[k] - (top * (1 - a) + bottom * a)
         if abs(residual) > max_residual:
             continue
-        grad_u = focal * (
-            (1 - a) * ((1 - b) * (frame[i, j + 1] - frame[i, j - 1]) + b * (frame[i, j + 2] - frame[i, j]))
-            + a * ((1 - b) * (frame[i + 1, j + 1] - frame[i + 1, j - 1]) + b * (frame[i + 1, j + 2] - frame[i + 1, j]))
-        ) / 2
-        grad_v = focal * (
-            (1 - b) * ((1 - a) * (frame[i + 1, j] - frame[i - 1, j]) + a * (frame[i + 2, j] - frame[i, j]))
-            + b * ((1 - a) * (frame[i + 1, j + 1] - frame[i - 1, j + 1]) + a * (frame[i + 2, j + 1] - frame[i, j + 1]))
-        ) / 2
+        grad_u = (
+            focal
+            * (
+                (1 - a) * ((1 - b) * (frame[i, j + 1] - frame[i, j - 1]) + b * (frame[i, j + 2] - frame[i, j]))
+                + a
+                * ((1 - b) * (frame[i + 1, j + 1] - frame[i + 1, j - 1]) + b * (frame[i + 1, j + 2] - frame[i + 1, j]))
+            )
+            / 2
+        )
+        grad_v = (
+            focal
+            * (
+                (1 - b) * ((1 - a) * (frame[i + 1, j] - frame[i - 1, j]) + a * (frame[i + 2, j] - frame[i, j]))
+                + b
+                * ((1 - a) * (frame[i + 1, j + 1] - frame[i - 1, j + 1]) + a * (frame[i + 2, j + 1] - frame[i, j + 1]))
+            )
+            / 2
+        )
         rows[used, 0] = grad_u * x * y + grad_v * (1 + y * y)
         rows[used, 1] = -grad_u * (1 + x * x) - grad_v * x * y
         rows[used, 2] = grad_u * y - grad_v * x

@@ -131,7 +131,9 @@ class Navigator:
         with self.watch("stereo"):
             right = matching.normalise(frame.right)
             dense_px, _ = dense_disparity(image, right, self._disparity_limit())
-            points = stereo.points_of_pair(image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px)
+            points = stereo.points_of_pair(
+                image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
+            )
         if len(points.xyz) < 12:
             return "too few points in stereo"
         self.max_disparity_px = float(np.nanpercentile(dense_px, 99.5))
@@ -141,8 +143,8 @@ class Navigator:
         key = KeyPoint(
             len(self.keys), len(self.times_s), track, self.filter.world_from_camera.copy(), points, frame.readings
         )
-        self.keys.append(key)
         self.spool.put(key.row, frame.left, frame.right, (image, right))
+        self.keys.append(key)
         self.depth_of_key[key.number] = depth_m.astype(np.float16)
         with self.watch("f2m"):
             self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
@@ -247,6 +249,4 @@ class Navigator:
         self.f2f_poses.append(self.f2f_pose.copy())
         self.online_poses.append(self.filter.world_from_camera.copy())
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
-        return Estimate(
-            frame.time_s, self.online_poses[-1], self.f2f_poses[-1], velocity, sigma_m, status
-        )
+        return Estimate(frame.time_s, self.online_poses[-1], self.f2f_poses[-1], velocity, sigma_m, status)

@@ -45,7 +45,12 @@ def project(xyz: NDArray[np.float64], rig: StereoRig) -> NDArray[np.float32]:
 
 
 def measure(
-    left: matching.Image, right: matching.Image, pixels: matching.Points, disparity_guess_px: NDArray, rig: StereoRig, patch_px: int
+    left: matching.Image,
+    right: matching.Image,
+    pixels: matching.Points,
+    disparity_guess_px: NDArray,
+    rig: StereoRig,
+    patch_px: int,
 ) -> tuple[StereoPoints, matching.Mask]:
     """Disparity of given points of the left image.
 
@@ -70,7 +75,12 @@ def measure(
 
 
 def points_of_pair(
-    left: matching.Image, right: matching.Image, dense_px: NDArray[np.float32], rig: StereoRig, count: int, patch_px: int
+    left: matching.Image,
+    right: matching.Image,
+    dense_px: NDArray[np.float32],
+    rig: StereoRig,
+    count: int,
+    patch_px: int,
 ) -> StereoPoints:
     """Corners of the left image with their disparity, started from a dense disparity map (NaN where unknown)."""
     pixels = matching.corners(left, count, patch_px)

@@ -31,6 +31,8 @@ def interpolate_between_keys(f2f: Array, rows: NDArray[np.int64], key_poses: Arr
         if k + 1 < len(rows):
             arrival = key_poses[k] @ geometry.inverse(f2f[row]) @ f2f[end]
             gap = geometry.log(geometry.inverse(arrival) @ key_poses[k + 1])
-            walked = np.stack([w @ geometry.exp(gap * s) for w, s in zip(walked, np.linspace(0, 1, end - row + 1), strict=False)])
+            walked = np.stack(
+                [w @ geometry.exp(gap * s) for w, s in zip(walked, np.linspace(0, 1, end - row + 1), strict=False)]
+            )
         result[row:end] = walked
     return result

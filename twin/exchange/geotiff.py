@@ -10,7 +10,7 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.errors import RasterioIOError
-from rasterio.transform import Affine, from_origin
+from rasterio.transform import Affine
 
 from twin.errors import TwinError
 from twin.records import ElevationMap, Image, MapGrid
@@ -65,7 +65,7 @@ def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
         "count": bands,
         "dtype": dtype,
         "crs": LOCAL_METRES,
-        "transform": from_origin(grid.west_m, grid.north_m, grid.cell_m, grid.cell_m),
+        "transform": Affine(grid.cell_m, 0, grid.west_m, 0, -grid.cell_m, grid.north_m),
         "compress": "deflate",
     }
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from trimesh.exchange.gltf import export_glb
 
 from twin.records import ElevationMap
 
@@ -20,7 +21,7 @@ def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_V
     """Writes the seen cells as a surface with the mosaic's colours; a map without any as an empty scene."""
     mesh = surface(elevation_map, max_vertices)
     scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
-    path.write_bytes(trimesh.exchange.gltf.export_glb(scene))
+    path.write_bytes(export_glb(scene))
 
 
 def surface(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:

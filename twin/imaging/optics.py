@@ -183,9 +183,11 @@ def _normal(depth, v, u, x, y, focal):
 
     Of the slopes to both neighbours the smaller counts: an edge of the floor does not bend the surface beside it.
     """
-    z = depth[v, u]
-    left, right = z - depth[v, max(u - 1, 0)], depth[v, min(u + 1, depth.shape[1] - 1)] - z
-    up, down = z - depth[max(v - 1, 0), u], depth[min(v + 1, depth.shape[0] - 1), u] - z
+    z, beyond = depth[v, u], np.float32(np.inf)
+    left = z - depth[v, u - 1] if u > 0 else beyond
+    right = depth[v, u + 1] - z if u + 1 < depth.shape[1] else beyond
+    up = z - depth[v - 1, u] if v > 0 else beyond
+    down = depth[v + 1, u] - z if v + 1 < depth.shape[0] else beyond
     nx = focal * (left if abs(left) < abs(right) else right)
     ny = focal * (up if abs(up) < abs(down) else down)
     nz = -(z + x * nx + y * ny)

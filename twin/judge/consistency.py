@@ -50,6 +50,6 @@ def nees(error: Array, cov: Array) -> Array:
 
 def _positive_definite(cov: Array) -> np.ndarray:
     """(n,) bool."""
-    finite = np.isfinite(cov).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0]
     return np.asarray(smallest > 0)

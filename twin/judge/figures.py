@@ -125,7 +125,7 @@ def track_bars(run: Run) -> Figure | None:
     axes.set_xticks(at, [str(row["track"]) for row in tracks])
     axes.set(xlabel="track", ylabel="key-point RMSE [m]")
     axes.grid(visible=False, axis="x")
-    axes.legend(loc="upper left")
+    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return figure
 
 

@@ -23,7 +23,7 @@ LABELS = {
 }
 ESTIMATES = ("f2f", "online", "final")
 #: matplotlib settings of every figure.
-FIGURE_STYLE: dict[str, Any] = {
+FIGURE_STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "savefig.dpi": 110,
     "figure.constrained_layout.use": True,

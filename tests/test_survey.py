@@ -1,0 +1,191 @@
+"""Claims on whole (small) surveys: closed loop, wall between truth and estimate, determinism, partial runs."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin import config, records, sea, survey
+from twin.errors import ScenarioError, SurveyAborted
+from twin.mission import prepare
+from twin.timing import Stopwatch
+
+SMALL = [
+    "terrain.size_m=[5.0, 4.0]",
+    "rig.image_width_px=192",
+    "rig.image_height_px=144",
+    "plan.area_m=[1.2, 0.5]",
+    "plan.altitude_m=1.8",
+    "control.hold_s=0.4",
+]
+TRAJECTORIES = ("truth", "f2f", "online", "final")
+
+
+def fly(out: Path, *overrides: str, progress=lambda _: None) -> survey.RunResult:
+    scenario = config.load_scenario("quickstart", [*SMALL, *overrides])
+    return survey.run(scenario, out, progress)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    return fly(tmp_path_factory.mktemp("flown"))
+
+
+def test_a_survey_steers_by_sight_maps_and_ends_complete(flown):
+    m = flown.metrics
+    assert flown.status == m["status"] == "complete"
+    assert m["trajectory"]["final"]["ate_rmse_m"] < 0.01
+    assert m["control"]["cross_track_rmse_m"] < 0.05
+    assert m["map"]["nmad_m"] < 0.01
+    assert m["map"]["completeness"] > 0.9
+
+
+def test_the_run_folder_holds_all_that_the_design_promises(flown):
+    names = (
+        "scenario.resolved.toml env.json metrics.json report.html run.rrd log.jsonl posegraph.g2o mesh.glb mosaic.tif"
+    )
+    rasters = [f"dem{s}.tif" for s in ("", "_sigma", "_truth", "_error")]
+    for name in [*names.split(), *rasters, *(f"trajectory_{t}.tum" for t in TRAJECTORIES), "keypoints"]:
+        assert (flown.folder / name).exists(), name
+    assert json.loads((flown.folder / "metrics.json").read_text()) == flown.metrics
+
+
+def test_the_resolved_scenario_flies_the_same_survey(flown):
+    again = config.load_scenario(flown.folder / "scenario.resolved.toml")
+    assert again.fingerprint() == flown.metrics["scenario_hash"]
+
+
+def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
+    again = fly(tmp_path / "again")
+    for name in [*(f"trajectory_{t}.tum" for t in TRAJECTORIES), "dem.tif", "dem_sigma.tif"]:
+        assert (again.folder / name).read_bytes() == (flown.folder / name).read_bytes(), name
+
+
+def test_another_seed_gives_another_survey(flown, tmp_path):
+    other = fly(tmp_path / "other", "seed=7", "plan.area_m=[0.6, 0.5]")
+    assert (other.folder / "trajectory_final.tum").read_bytes() != (flown.folder / "trajectory_final.tum").read_bytes()
+
+
+class Recorder:
+    """A navigator that notes what passes through the wall."""
+
+    def __init__(self, navigator):
+        self.navigator, self.frames = navigator, []
+
+    def update(self, frame, track):
+        self.frames.append((frame, track))
+        return self.navigator.update(frame, track)
+
+    def align_track(self, track):
+        self.frames.append((None, track))
+        self.navigator.align_track(track)
+
+
+def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path):
+    """Frames are recorded in one sea and replayed with every truth (floor, poses, map) replaced by another."""
+    scenario = config.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
+    mission, watch = prepare(scenario), Stopwatch()
+    recorder = Recorder(survey.make_navigator(mission, tmp_path / "first", watch))
+    with sea.Sea(mission, watch) as world:
+        survey.fly(mission, world, recorder, lambda *_: None)
+    first = recorder.navigator.finish()
+
+    elsewhere = config.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", "terrain.kind=flat", "seed=9"])
+    other = prepare(elsewhere)
+    assert not np.array_equal(other.terrain.height_m, mission.terrain.height_m)
+    navigator = survey.make_navigator(other, tmp_path / "second", watch)
+    for frame, track in recorder.frames:
+        navigator.align_track(track) if frame is None else navigator.update(frame, track)
+    second = navigator.finish()
+    for name in ("f2f", "online", "final"):
+        assert getattr(first, name).world_from_camera.tobytes() == getattr(second, name).world_from_camera.tobytes()
+
+
+def test_frames_carry_nothing_but_images_time_and_readings():
+    assert set(records.Frame.__dataclass_fields__) == {"index", "time_s", "left", "right", "readings"}
+    assert set(records.Readings.__dataclass_fields__) == {"pressure_z_m", "ahrs_rpy_rad"}
+
+
+def test_sensors_that_do_not_aid_do_not_reach_the_estimators(tmp_path):
+    scenario = config.load_scenario("quickstart", [*SMALL, "navigation.aiding=[]"])
+    mission = prepare(scenario)
+    with sea.Sea(mission, Stopwatch()) as world:
+        readings = world.observe(next(mission.fly(1)), 1).readings
+    assert readings == records.Readings(None, None)
+
+
+@pytest.mark.parametrize("key", ["estimate.use_ga", "estimate.use_f2m"])
+def test_each_stage_can_be_left_out(tmp_path, key):
+    result = fly(tmp_path / "run", f"{key}=false", "plan.area_m=[0.6, 0.5]")
+    assert result.status == "complete"
+    assert result.metrics["trajectory"]["final"]["ate_rmse_m"] < 0.05
+
+
+def stop_at(share, error):
+    def progress(now):
+        if now.stage == "survey" and now.share > share:
+            raise error
+
+    return progress
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (KeyboardInterrupt(), "interrupted"),
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+        (SurveyAborted("the physics diverged at 3.000 s"), "the physics diverged at 3.000 s"),
+    ],
+)
+def test_what_stops_a_survey_is_told_and_what_was_found_is_kept(tmp_path, error, reason):
+    result = fly(tmp_path / "run", progress=stop_at(0.5, error))
+    assert (result.status, result.metrics["reason"]) == ("aborted", reason)
+    path = records.Trajectory.load(result.folder / "trajectory_final.tum")
+    assert 20 < len(path) < 400
+    assert result.metrics["map"]["completeness"] > 0.5
+    assert (result.folder / "report.html").exists()
+
+
+def test_a_nan_in_the_physics_aborts_with_the_reason(tmp_path, monkeypatch):
+    command = survey.make_pilot
+
+    def mad(mission):
+        sane, count = command(mission), 0
+
+        def steer(estimate, reference):
+            nonlocal count
+            count += 1
+            return sane(estimate, reference) * (np.nan if count > 60 else 1.0)
+
+        return steer
+
+    monkeypatch.setattr(survey, "make_pilot", mad)
+    result = fly(tmp_path / "run")
+    assert result.status == "aborted"
+    assert "physics diverged at 2" in result.metrics["reason"]
+
+
+def test_lost_vision_ends_the_survey_with_its_reason(tmp_path):
+    result = fly(tmp_path / "run", "water.jerlov=9C", "water.turbidity=20")
+    assert result.status == "aborted"
+    assert result.metrics["reason"].startswith("vision lost at ")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "plan.area_m=[30.0, 0.5]",
+            "plan.area_m: 30 x 0.5 m is larger than the terrain (allowed: up to 5.00 x 4.00 m)",
+        ),
+        ("plan.altitude_m=0.7", "plan.altitude_m: 0.7: the cameras come within "),
+        ('require."map.le91_m"=0.1', "map.le91_m: no such metric, did you mean"),
+        ("terrain.texture_file=x.png", "terrain.texture_file: is not read by a generated floor (reef)"),
+    ],
+)
+def test_a_survey_that_cannot_be_flown_is_refused_before_anything_is_written(tmp_path, override, message):
+    with pytest.raises(ScenarioError) as refused:
+        fly(tmp_path / "run", override)
+    assert message in str(refused.value)
+    assert not (tmp_path / "run").exists()
