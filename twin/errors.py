@@ -25,5 +25,5 @@ class ScenarioError(TwinError):
         Exception.__init__(self, "\n".join(lines))
 
 
-class SurveyAborted(Exception):
+class SurveyAborted(Exception):  # noqa: N818 (an outcome, not a mistake)
     """The survey cannot go on (physics diverged, disk full, vision lost); partial results are kept."""

@@ -1,4 +1,4 @@
-"""From an estimate of the camera to thruster commands: the vehicle is steered by what it believes, never by the truth."""
+"""From an estimate of the camera to thruster commands: the vehicle is steered by what it believes."""
 
 from __future__ import annotations
 

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twin import config, view
+from twin.errors import TwinError
 from twin.estimate.map_builder import KeyPointImages, build_map
 from twin.estimate.pipeline import Navigator
-from twin.errors import TwinError
 from twin.exchange import geotiff, mesh, posegraph
 from twin.judge.metrics import evaluate
 from twin.judge.report import write_report
@@ -100,7 +100,7 @@ def conclude(
     metrics = _judge(mission, result, elevation, truth, watch, wall_s, status, reason)
     say("report", 0.0)
     try:
-        _write_files(mission, folder, result, elevation, truth)
+        _write_files(mission, folder, result, elevation, truth, watch)
         _finish_folder(folder, metrics)
     except OSError as error:
         status, reason = "aborted", reason or str(error)
@@ -140,7 +140,12 @@ def _judge(mission, result, elevation, truth, watch, wall_s, status, reason) -> 
 
 
 def _write_files(
-    mission: Mission, folder: Path, result: SurveyResult, elevation: ElevationMap | None, truth: Truth
+    mission: Mission,
+    folder: Path,
+    result: SurveyResult,
+    elevation: ElevationMap | None,
+    truth: Truth,
+    watch: Stopwatch,
 ) -> None:
     reference = np.tile(mission.start, (len(truth.reference), 1, 1))
     reference[:, :3, 3] = truth.reference
@@ -152,6 +157,7 @@ def _write_files(
         "frames": result.key_frames.tolist(),
         "tracks": result.track_of_key.tolist(),
         "n_per_key": mission.plan.n_frames_per_key,
+        "timing_ms": {stage: watch.durations_ms(stage) for stage in ("f2f", "stereo")},
     }
     (folder / "keypoints" / "index.json").write_text(json.dumps(index))
     grid = mission.grid
@@ -164,7 +170,7 @@ def _write_files(
 
 
 def _finish_folder(folder: Path, metrics: dict[str, Any]) -> None:
-    """The metrics go beside first: report and recording are drawn from the folder; the real file comes last, at once."""
+    """The metrics go beside first: report and recording are drawn from the folder; the real file comes last."""
     waiting = folder / ".metrics.json.part"
     waiting.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     write_report(folder, metrics)

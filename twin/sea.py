@@ -1,4 +1,4 @@
-"""The left of the wall: vehicle, floor, light and sensors; frames come out, thruster commands go in, truth is kept beside."""
+"""Left of the wall: vehicle, floor, light, sensors; frames come out, thruster commands go in, truth is kept beside."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ _PATIENCE_S = 2.0  # without vision for longer, the vehicle is lost
 
 
 class Progress(NamedTuple):
-    """How far the survey is: simulated and wall time [s], share of the frames, believed position error (1 sigma) [m]."""
+    """How far the survey is: simulated and wall time [s], share of the stage, believed position error (1 sigma) [m]."""
 
     simulated_s: float
     wall_s: float

@@ -27,6 +27,10 @@ class Stopwatch:
         finally:
             self._durations_s[stage].append(time.perf_counter() - start)
 
+    def durations_ms(self, stage: str) -> list[float]:
+        """Every duration of a stage, in order [ms]."""
+        return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
+
     def summary(self) -> dict[str, dict[str, float | int | None]]:
         """Per stage: count, mean and 95th percentile [ms], total [s]."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}

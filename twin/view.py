@@ -37,7 +37,7 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
-    rig = config.load_scenario(run.folder / SCENARIO_FILE)[0].believed_rig()
+    rig = config.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_view_point(run)))
     log_scene(recording, run)

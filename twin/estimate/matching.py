@@ -1,4 +1,4 @@
-"""Finding the same patch again: local normalisation, corners, and Lucas-Kanade with one window for stereo and flow alike.
+"""Finding a patch again: local normalisation, corners, and Lucas-Kanade with one window for stereo and flow alike.
 
 Stereo and flow must average the relief over the same support: with different windows the flow sees less parallax than
 the depth promises, and the least squares trades translation for pitch until the path bends. So every match of the

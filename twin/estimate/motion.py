@@ -1,6 +1,6 @@
 """Camera motion from image motion: eqs. (1) and (2), and structure and motion together from two stereo pairs.
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity likewise, so that depth = baseline / disparity.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity likewise: depth = baseline / disparity.
 A motion is the pose of the later camera in the earlier one, or its twist [w, t] (rad, m).
 """
 
@@ -24,7 +24,7 @@ class Motion(NamedTuple):
         a_from_b: (4, 4) pose of the later camera b in the earlier a.
         cov: (6, 6) of [rotation, translation] in b (rad, m).
         n_points: inliers.
-        residual_px: robust deviation of the residuals, in units of the expected deviation for `pair_motion`, else [1].
+        residual: robust deviation of the residuals, in the units of what was measured.
     """
 
     a_from_b: Array
@@ -44,7 +44,7 @@ def image_motion(x: Array, y: Array, depth: Array) -> Array:
 
 
 def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> tuple[Array, Array]:
-    """Least squares for [w, t] from flow (n, 2) and depth (n,), eq. (2), each point weighted. -> twist (6,), normal matrix."""
+    """Weighted least squares for [w, t] from flow (n, 2) and depth (n,), eq. (2). -> twist (6,), normal (6, 6)."""
     rows = image_motion(x, y, depth)
     weighted = rows * weight[:, None, None]
     normal = np.einsum("nki,nkj->ij", weighted, rows)
@@ -138,7 +138,7 @@ def pair_motion(
 
 
 def _transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:
-    """(x, y, disparity) in a of points measured in b, with its derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
+    """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
     rotation, translation = a_from_b[:3, :3], a_from_b[:3, 3]
     disparity = z_b[:, 2]
     ray = np.column_stack([z_b[:, :2], np.ones(len(z_b))])

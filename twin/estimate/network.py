@@ -37,7 +37,7 @@ def overlap(node: KeyPoint, other: KeyPoint, rig: StereoRig, patch_px: int) -> f
 def choose_links(
     node: KeyPoint, earlier: Sequence[KeyPoint], rig: StereoRig, min_overlap: float, max_links: int, patch_px: int
 ) -> list[tuple[KeyPoint, float]]:
-    """Earlier nodes to link with: the two previous ones, the farthest back on the same swath, and the best of other swaths.
+    """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
 
     The last links of a run of overlapping nodes carry the longest base; links to other swaths tie the legs together.
     """
@@ -87,7 +87,7 @@ class PairMatch:
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
 
     def flow(self, node: KeyPoint, other: KeyPoint) -> tuple[Array, Array, float] | None:
-        """Measurements of the same points in the other pair and in the node's: (n, 3), (n, 3), sigma [px]; None if none.
+        """The same points as measured in the other pair and in the node's: (n, 3), (n, 3), sigma [px]; None if none.
 
         Matching starts from the flow that positions and depth predict (P11). The node's image is first turned into the
         other's attitude, so that patches differ by parallax alone.

@@ -1,4 +1,4 @@
-"""The method in the paper's order: F2F at every frame; at key points stereo, F2M, mosaic and network; GA at the end of a track."""
+"""The method in the paper's order: F2F at every frame; stereo, F2M and network at key points; GA at a track's end."""
 
 from __future__ import annotations
 
@@ -102,6 +102,7 @@ class Navigator:
 
     def finish(self) -> SurveyResult:
         """The truly global alignment over all tracks, and the trajectories."""
+        self._forget_unfinished()
         cov = np.tile(self.filter.cov, (len(self.keys), 1, 1))
         if self.settings.use_ga and len(self.nodes) >= 2:
             with self.watch("ga"):
@@ -124,6 +125,13 @@ class Navigator:
             before_ga=self.before_ga,
             after_ga=self.after_ga,
         )
+
+    def _forget_unfinished(self) -> None:
+        """Drops a key point whose frame was interrupted before it was recorded."""
+        n_frames = len(self.times_s)
+        self.keys = [k for k in self.keys if k.row < n_frames]
+        self.nodes = [k for k in self.nodes if k.row < n_frames]
+        self.links = [link for link in self.links if link.j < len(self.keys)]
 
     def _visit_key_point(self, frame: Frame, image: matching.Image, track: int, status: str) -> str:
         """Stereo, F2M, mosaic and network at a key point; fresh points for F2F."""
