@@ -53,7 +53,7 @@ def demo(out: OutOption = None) -> None:
     """Fly a small complete survey (under 2 minutes) and show its errors."""
     result = _survey("quickstart", [], out, live=False)
     console.errors(result.metrics)
-    print(f"Report: {result.folder / 'report.html'}\nOpen the recording: twin view {result.folder}")
+    console.pictures(result.folder)
     raise typer.Exit(exit_status(result))
 
 
@@ -72,7 +72,7 @@ def run(
         print(json.dumps(result.metrics, indent=1))
     else:
         console.errors(result.metrics)
-        print(f"Report: {result.folder / 'report.html'}")
+        console.pictures(result.folder)
     raise typer.Exit(exit_status(result))
 
 

@@ -42,124 +42,154 @@ class Section(BaseModel):
 class Terrain(Section):
     """The sea floor."""
 
-    kind: Literal["flat", "ripples", "fractal", "reef", "file"] = Field("reef", description="generator, or a real DEM")
-    size_m: tuple[Metres, Metres] = Field((10.0, 10.0), description="extent along x and y [m], centred at the origin")
-    relief_m: float = Field(0.6, ge=0, le=20, description="highest minus lowest point of a generated floor [m]")
-    base_m: float = Field(0.0, ge=-50, le=50, description="height of the lowest point above the reference plane [m]")
-    grid_m: float = Field(0.05, gt=0.001, le=1, description="spacing of a generated height grid [m]")
-    height_file: str | None = Field(None, description="DEM: GeoTIFF, 16-bit PNG or .npy [m]; ${TWIN_DATA} is expanded")
-    height_spacing_m: float = Field(0.01, gt=0, le=10, description="grid spacing of a PNG or .npy height file [m]")
-    height_range_m: float = Field(1.0, gt=0, le=1000, description="height of a PNG's full white over full black [m]")
-    texture_file: str | None = Field(None, description="any image, tiled over the floor; generated where missing")
-    texture_px_m: float = Field(0.005, gt=0.0005, le=1, description="size of a texture pixel on the floor [m]")
+    kind: Literal["flat", "ripples", "fractal", "reef", "file"] = Field(
+        default="reef", description="generator, or a real DEM"
+    )
+    size_m: tuple[Metres, Metres] = Field(
+        default=(10.0, 10.0), description="extent along x and y [m], centred at the origin"
+    )
+    relief_m: float = Field(default=0.6, ge=0, le=20, description="highest minus lowest point of a generated floor [m]")
+    base_m: float = Field(
+        default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane [m]"
+    )
+    grid_m: float = Field(default=0.05, gt=0.001, le=1, description="spacing of a generated height grid [m]")
+    height_file: str | None = Field(
+        default=None, description="DEM: GeoTIFF, 16-bit PNG or .npy [m]; ${TWIN_DATA} is expanded"
+    )
+    height_spacing_m: float = Field(
+        default=0.01, gt=0, le=10, description="grid spacing of a PNG or .npy height file [m]"
+    )
+    height_range_m: float = Field(
+        default=1.0, gt=0, le=1000, description="height of a PNG's full white over full black [m]"
+    )
+    texture_file: str | None = Field(
+        default=None, description="any image, tiled over the floor; generated where missing"
+    )
+    texture_px_m: float = Field(default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the floor [m]")
 
 
 class Vehicle(Section):
     """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); drag factors let a study vary it."""
 
-    buoyancy_n: float = Field(1.0, ge=-20, le=20, description="net buoyancy after trimming, positive floats [N]")
-    drag_factor: float = Field(1.0, ge=0.05, le=20, description="scales linear and quadratic drag")
-    added_mass_factor: float = Field(1.0, ge=0, le=5, description="scales the added mass")
+    buoyancy_n: float = Field(
+        default=1.0, ge=-20, le=20, description="net buoyancy after trimming, positive floats [N]"
+    )
+    drag_factor: float = Field(default=1.0, ge=0.05, le=20, description="scales linear and quadratic drag")
+    added_mass_factor: float = Field(default=1.0, ge=0, le=5, description="scales the added mass")
 
 
 class Rig(Section):
     """The calibrated stereo pair, looking down, the top of the image towards the bow."""
 
-    image_width_px: int = Field(320, ge=64, le=2048)
-    image_height_px: int = Field(240, ge=48, le=2048)
-    hfov_deg: float = Field(60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
-    baseline_m: float = Field(0.15, gt=0.005, le=3, description="distance between the cameras [m]")
-    frame_rate_hz: float = Field(30.0, ge=1, le=120)
-    mount_m: Vector3 = Field((0.0, 0.0, -0.15), description="middle of the pair in the body: forward, left, up [m]")
+    image_width_px: int = Field(default=320, ge=64, le=2048)
+    image_height_px: int = Field(default=240, ge=48, le=2048)
+    hfov_deg: float = Field(default=60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
+    baseline_m: float = Field(default=0.15, gt=0.005, le=3, description="distance between the cameras [m]")
+    frame_rate_hz: float = Field(default=30.0, ge=1, le=120)
+    mount_m: Vector3 = Field(
+        default=(0.0, 0.0, -0.15), description="middle of the pair in the body: forward, left, up [m]"
+    )
 
 
 class Imaging(Section):
     """How light becomes numbers."""
 
-    fidelity: Literal["rendered"] = Field("rendered", description="images are rendered")
-    gray_level: float = Field(0.45, gt=0.01, lt=1, description="mean image level that auto-exposure aims at (0 to 1)")
-    noise_sd: float = Field(0.008, ge=0, le=0.5, description="read noise, as a share of full scale")
+    fidelity: Literal["rendered"] = Field(default="rendered", description="images are rendered")
+    gray_level: float = Field(
+        default=0.45, gt=0.01, lt=1, description="mean image level that auto-exposure aims at (0 to 1)"
+    )
+    noise_sd: float = Field(default=0.008, ge=0, le=0.5, description="read noise, as a share of full scale")
     shot_noise: float = Field(
-        0.006, ge=0, le=0.5, description="shot noise at full scale, grows with the root of signal"
+        default=0.006, ge=0, le=0.5, description="shot noise at full scale, grows with the root of signal"
     )
 
 
 class Water(Section):
     """Inherent optical properties of the water."""
 
-    jerlov: JERLOV = Field("IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
-    turbidity: float = Field(1.0, ge=0, le=100, description="multiplies scattering")
+    jerlov: JERLOV = Field(default="IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
+    turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies scattering")
 
 
 class Lamp(Section):
     """A lamp on the vehicle."""
 
     position_m: Vector3 = Field(description="in the body: forward, left, up [m]")
-    tilt_deg: float = Field(0.0, ge=-90, le=90, description="beam axis from straight down towards the bow [deg]")
-    pan_deg: float = Field(0.0, ge=-90, le=90, description="beam axis from straight down towards port [deg]")
-    intensity_cd: float = Field(1000.0, ge=0, le=1e6, description="luminous intensity on the axis [cd]")
+    tilt_deg: float = Field(
+        default=0.0, ge=-90, le=90, description="beam axis from straight down towards the bow [deg]"
+    )
+    pan_deg: float = Field(default=0.0, ge=-90, le=90, description="beam axis from straight down towards port [deg]")
+    intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the axis [cd]")
 
 
 class Sun(Section):
     """Even daylight on the floor."""
 
-    illuminance_lx: float = Field(0.0, ge=0, le=2e5, description="white daylight on the floor [lx]")
+    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="white daylight on the floor [lx]")
 
 
 class Current(Section):
     """Steady, irrotational current."""
 
-    velocity_mps: Vector3 = Field((0.0, 0.0, 0.0), description="east, north, up [m/s]")
+    velocity_mps: Vector3 = Field(default=(0.0, 0.0, 0.0), description="east, north, up [m/s]")
 
 
 class Navigation(Section):
     """Navigation sensors: all are simulated; only those in `aiding` reach the estimators."""
 
-    aiding: tuple[AIDING, ...] = Field((), description="sensors that aid vision; empty = vision only")
-    pressure_sigma_m: float = Field(0.01, gt=0, le=10, description="noise of height by pressure [m]")
-    attitude_sigma_deg: float = Field(0.2, gt=0, le=30, description="noise of roll and pitch [deg]")
-    heading_sigma_deg: float = Field(0.5, gt=0, le=90, description="noise of heading [deg]")
+    aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty = vision only")
+    pressure_sigma_m: float = Field(default=0.01, gt=0, le=10, description="noise of height by pressure [m]")
+    attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30, description="noise of roll and pitch [deg]")
+    heading_sigma_deg: float = Field(default=0.5, gt=0, le=90, description="noise of heading [deg]")
 
 
 class Plan(Section):
     """The lawnmower survey (Negahdaripour & Madjidi 2003, section III-A)."""
 
     pattern: Literal["lawnmower"] = "lawnmower"
-    area_m: tuple[Metres, Metres] = Field((4.0, 2.0), description="extent along x (the legs) and y, centred [m]")
-    altitude_m: float = Field(
-        2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
+    area_m: tuple[Metres, Metres] = Field(
+        default=(4.0, 2.0), description="extent along x (the legs) and y, centred [m]"
     )
-    speed_mps: float = Field(0.25, gt=0.01, le=2, description="speed along the legs [m/s]")
-    overlap_along: float = Field(0.9, gt=0, lt=1, description="overlap of consecutive key points")
-    overlap_across: float = Field(0.8, gt=0, lt=1, description="overlap of neighbouring swaths")
-    tracks: int = Field(0, ge=0, le=1000, description="tracks to fly (two legs each); 0 fills the area")
-    clearance_m: float = Field(0.3, ge=0, le=10, description="least distance of the cameras to the floor [m]")
+    altitude_m: float = Field(
+        default=2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
+    )
+    speed_mps: float = Field(default=0.25, gt=0.01, le=2, description="speed along the legs [m/s]")
+    overlap_along: float = Field(default=0.9, gt=0, lt=1, description="overlap of consecutive key points")
+    overlap_across: float = Field(default=0.8, gt=0, lt=1, description="overlap of neighbouring swaths")
+    tracks: int = Field(default=0, ge=0, le=1000, description="tracks to fly (two legs each); 0 fills the area")
+    clearance_m: float = Field(default=0.3, ge=0, le=10, description="least distance of the cameras to the floor [m]")
 
 
 class Control(Section):
     """Trajectory following and station keeping."""
 
-    hold_s: float = Field(2.0, ge=0.1, le=600, description="station keeping at the end of a track, while GA runs [s]")
-    natural_frequency_radps: float = Field(1.2, gt=0.05, le=10, description="closed-loop bandwidth [rad/s]")
+    hold_s: float = Field(
+        default=2.0, ge=0.1, le=600, description="station keeping at the end of a track, while GA runs [s]"
+    )
+    natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10, description="closed-loop bandwidth [rad/s]")
 
 
 class Estimation(Section):
     """F2F, F2M, the key-point network and global alignment."""
 
-    window_tracks: int = Field(4, ge=0, le=1000, description="previous tracks in the window of global alignment")
-    node_stride: int = Field(1, ge=1, le=20, description="every n-th key point is a node of the network")
-    min_overlap: float = Field(0.45, gt=0, lt=1, description="least true overlap of linked nodes")
-    max_links: int = Field(7, ge=1, le=50, description="most links of a node to earlier ones")
-    use_f2m: bool = Field(True, description="correct the position at key points by registration with the mosaic")
-    use_ga: bool = Field(True, description="global alignment at the end of each track and of the survey")
-    points: int = Field(300, ge=30, le=5000, description="matched points per frame")
-    patch_px: int = Field(21, ge=7, le=61, description="window of matching, one for stereo and flow alike [px]")
+    window_tracks: int = Field(
+        default=4, ge=0, le=1000, description="previous tracks in the window of global alignment"
+    )
+    node_stride: int = Field(default=1, ge=1, le=20, description="every n-th key point is a node of the network")
+    min_overlap: float = Field(default=0.45, gt=0, lt=1, description="least true overlap of linked nodes")
+    max_links: int = Field(default=7, ge=1, le=50, description="most links of a node to earlier ones")
+    use_f2m: bool = Field(
+        default=True, description="correct the position at key points by registration with the mosaic"
+    )
+    use_ga: bool = Field(default=True, description="global alignment at the end of each track and of the survey")
+    points: int = Field(default=300, ge=30, le=5000, description="matched points per frame")
+    patch_px: int = Field(default=21, ge=7, le=61, description="window of matching, one for stereo and flow alike [px]")
 
 
 class Mapping(Section):
     """The Kalman depth map and its composition."""
 
-    cell_m: float = Field(0.02, gt=0.001, le=1, description="cell of the elevation map [m]")
+    cell_m: float = Field(default=0.02, gt=0.001, le=1, description="cell of the elevation map [m]")
 
 
 class Source(BaseModel):
@@ -182,8 +212,8 @@ class Source(BaseModel):
 class Scenario(Section):
     """One survey, fully described."""
 
-    name: str = Field("survey", min_length=1, max_length=80)
-    seed: int = Field(0, ge=0, lt=2**32)
+    name: str = Field(default="survey", min_length=1, max_length=80)
+    seed: int = Field(default=0, ge=0, lt=2**32)
     terrain: Terrain = Terrain()
     vehicle: Vehicle = Vehicle()
     rig: Rig = Rig()
@@ -197,7 +227,7 @@ class Scenario(Section):
     control: Control = Control()
     estimate: Estimation = Estimation()
     map: Mapping = Mapping()
-    require: dict[str, float] = Field({}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
+    require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
 
@@ -307,13 +337,14 @@ def _read(file: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
     try:
         text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
+    try:
         tree = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         line = re.search(r"line (\d+)", str(error))
         number = line[1] if line else len(text.splitlines())
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
     lines = _key_lines(text)
     _resolve_paths(tree, file.parent)
     base = tree.pop("extends", None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -62,3 +63,11 @@ def errors(metrics: dict[str, Any]) -> None:
             for name, r in metrics["require"].items()
         ]
         table("Required", rows)
+
+
+def pictures(folder: Path) -> None:
+    """Where the pictures of a run are, as far as they could be written."""
+    if (folder / "report.html").is_file():
+        print(f"Report: {folder / 'report.html'}")
+    if (folder / "run.rrd").is_file():
+        print(f"Open the recording: twin view {folder}")

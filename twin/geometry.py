@@ -54,7 +54,14 @@ def so3_exp(w: Array) -> Array:
 
 def so3_log(rotation: Array) -> Array:
     """Rotation vector [rad] of a rotation matrix, angle in [0, pi]. (3, 3) -> (3,)."""
-    return Rotation.from_matrix(rotation).as_rotvec()
+    twice = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine, cosine = 0.5 * np.sqrt(twice @ twice), 0.5 * (rotation[0, 0] + rotation[1, 1] + rotation[2, 2] - 1.0)
+    if cosine < -0.9:  # near half a turn the difference above says nothing
+        return Rotation.from_matrix(rotation).as_rotvec()
+    scale = 0.5 if sine < 1e-8 else 0.5 * np.arctan2(sine, cosine) / sine
+    return scale * twice
 
 
 def _left_jacobian(w: Array) -> Array:
@@ -76,7 +83,7 @@ def exp(motion: Array) -> Array:
 def log(a_from_b: Array) -> Array:
     """Twist [rotation, translation] of a pose: the inverse of `exp`. (4, 4) -> (6,)."""
     w = so3_log(a_from_b[:3, :3])
-    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), a_from_b[:3, 3])])
+    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), a_from_b[:3, 3])], dtype=np.float64)
 
 
 def adjoint(a_from_b: Array) -> Array:

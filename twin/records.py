@@ -202,8 +202,8 @@ class MapGrid:
     def centres(self) -> tuple[Array, Array]:
         """x (cols,) and y (rows,) of the cell centres [m]."""
         return (
-            self.west_m + (np.arange(self.cols) + 0.5) * self.cell_m,
-            self.north_m - (np.arange(self.rows) + 0.5) * self.cell_m,
+            self.west_m + (np.arange(self.cols, dtype=np.float64) + 0.5) * self.cell_m,
+            self.north_m - (np.arange(self.rows, dtype=np.float64) + 0.5) * self.cell_m,
         )
 
 

@@ -13,7 +13,8 @@ from twin.estimate.pipeline import Navigator
 from twin.mission import Mission, Step, prepare
 from twin.pilot import make_pilot
 from twin.records import Estimate
-from twin.results import Logbook, RunResult, conclude
+from twin.results import RunResult, conclude
+from twin.run_writer import RunFolder
 from twin.sea import Sea
 from twin.timing import Stopwatch
 
@@ -42,17 +43,18 @@ def run(
         ScenarioError: the survey cannot be flown as asked; nothing was written.
     """
     mission = prepare(scenario)
-    watch, begun = Stopwatch(), time.perf_counter()
-    with Logbook(out, mission) as log, Sea(mission, watch) as sea:
+    watch, begun, reason = Stopwatch(), time.perf_counter(), ""
+
+    def say(stage: str, share: float) -> None:
+        progress(Progress(0.0, time.perf_counter() - begun, share, 0.0, stage))
+
+    with Sea(mission, watch) as sea, RunFolder(out, mission) as folder:
         navigator = make_navigator(mission, out, watch)
-        reason = ""
         try:
-            fly(mission, sea, navigator, _Watcher(mission, log, progress, begun, live))
+            fly(mission, sea, navigator, _Watcher(mission, folder, progress, begun, live))
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
-            log.write("aborted", reason=reason)
-        say = lambda stage, share: progress(Progress(0.0, time.perf_counter() - begun, share, 0.0, stage))  # noqa: E731
-        return conclude(mission, out, navigator, sea.truth(), watch, begun, reason, log, say)
+        return conclude(mission, folder, navigator, sea.truth(), watch, begun, reason, say)
 
 
 def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Step, Estimate, Any], None]) -> None:
@@ -94,9 +96,9 @@ def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigato
 class _Watcher:
     """Looks on: progress, log, live view, and the end of patience when vision is lost."""
 
-    def __init__(self, mission: Mission, log: Logbook, progress, begun: float, live: bool):
+    def __init__(self, mission: Mission, folder: RunFolder, progress, begun: float, live: bool):
         self.n_frames, self.rate_hz = mission.n_frames, mission.rig.frame_rate_hz
-        self.log, self.progress, self.begun = log, progress, begun
+        self.folder, self.progress, self.begun = folder, progress, begun
         self.live = None
         if live:
             from twin.view import Live
@@ -108,7 +110,7 @@ class _Watcher:
         self.count += 1
         self.blind = 0 if estimate.status == "ok" else self.blind + 1
         if estimate.status != self.status:
-            self.log.write("vision", time_s=estimate.time_s, status=estimate.status)
+            self.folder.log("vision", time_s=estimate.time_s, status=estimate.status)
             self.status = estimate.status
         if self.live is not None:
             self.live.log_frame(frame, estimate)

@@ -46,7 +46,7 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
         left, right: (H, W) uint8 rectified grey images.
         max_disparity_px: largest disparity searched.
     """
-    coarse = _search(_flattened(left), _flattened(right), max_disparity_px)
+    coarse = search(_flattened(left), _flattened(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
     sigma = np.hypot(fine.sigma_px, np.float32(FLOOR_PX))
     known = sigma < LIMIT_PX
@@ -69,8 +69,11 @@ class Reach:
             self.max_disparity_px = min(int(wanted), self._widest)
 
 
-def _search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Semi-global disparity; padded on the left, so that the margin is only as wide as each pixel's own disparity."""
+def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
+    """Semi-global disparity (H, W) [px] of images of even contrast, NaN where none is: good to a fifth of a pixel.
+
+    Padded on the left, so that the margin is only as wide as each pixel's own disparity.
+    """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,

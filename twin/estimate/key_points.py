@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,23 +49,29 @@ class ImageSpool:
     def __init__(self, folder: Path):
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
+        self._writer = ThreadPoolExecutor(1)  # compression takes the second core
+        self._writing: Future[None] | None = None
         self._normalised: OrderedDict[int, tuple[matching.Image, matching.Image]] = OrderedDict()
 
     def put(self, row: int, left: Image, right: Image, normalised: tuple[matching.Image, matching.Image]) -> None:
         """Stores the pair (height, width, 3) of the key point at this frame.
 
         Raises:
-            OSError: the disk is full.
+            OSError: the disk was full for this pair or the one before.
         """
-        for side, image in (("left", left), ("right", right)):
-            ok, data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-            if not ok:
-                raise OSError(f"frame {row} cannot be encoded")
-            self._path(row, side).write_bytes(data.tobytes())
+        self.settle()
+        self._writing = self._writer.submit(self._write, row, left, right)
         self._remember(row, normalised)
+
+    def settle(self) -> None:
+        """Waits for what is being written. Raises OSError where that failed."""
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
 
     def pair(self, row: int) -> tuple[Image, Image]:
         """Left and right image as recorded."""
+        self.settle()
         return self._read(row, "left"), self._read(row, "right")
 
     def normalised(self, row: int) -> tuple[matching.Image, matching.Image]:
@@ -79,6 +86,11 @@ class ImageSpool:
         self._normalised[row] = pair
         while len(self._normalised) * 2 * pair[0].nbytes > _CACHE_BYTES:
             self._normalised.popitem(last=False)
+
+    def _write(self, row: int, left: Image, right: Image) -> None:
+        for side, image in (("left", left), ("right", right)):
+            data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+            self._path(row, side).write_bytes(data.tobytes())
 
     def _path(self, row: int, side: str) -> Path:
         return self.folder / f"{row:06d}_{side}.png"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -24,6 +25,14 @@ class KeyPointImages(NamedTuple):
 
     left: Image
     right: Image
+
+
+class _Seen(NamedTuple):
+    """A stereo pair, its left image in grey and its depth by stereo alone."""
+
+    pair: KeyPointImages
+    gray: Map
+    stereo: DepthMap
 
 
 class _State(NamedTuple):
@@ -58,8 +67,7 @@ def build_map(
     mapper, light, reach = elevation.ElevationMapper(grid), Light(rig), disparity.Reach(rig, max_disparity_px)
     steps = np.zeros((len(poses), 6, 6)) if step_cov is None else step_cov
     old = None
-    for k, pair in enumerate(key_points):
-        gray, stereo = _look(pair, reach, rig)
+    for k, (pair, gray, stereo) in enumerate(_ahead(_look(pair, reach, rig) for pair in key_points)):
         depth, taken = stereo, None
         if old is not None:
             depth, taken = _step(old, stereo, gray, poses[k], steps[k], rig)
@@ -77,12 +85,21 @@ def build_map(
     return mapper.result()
 
 
-def _look(pair: KeyPointImages, reach: disparity.Reach, rig: StereoRig) -> tuple[Map, DepthMap]:
-    """The left image in grey and the depth map of a stereo pair."""
+def _ahead(items: Iterator[_Seen]) -> Iterator[_Seen]:
+    """The same items, the next one made on the second core while the last one is used."""
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = pool.submit(next, items, None)
+            yield item
+
+
+def _look(pair: KeyPointImages, reach: disparity.Reach, rig: StereoRig) -> _Seen:
+    """A stereo pair with its left image in grey and its depth map."""
     left, right = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in pair)
     stereo = disparity.dense_disparity(left, right, reach.max_disparity_px)
     reach.see(stereo.disparity_px)
-    return left.astype(np.float32), depth_filter.stereo_depth(stereo, rig)
+    return _Seen(pair, left.astype(np.float32), depth_filter.stereo_depth(stereo, rig))
 
 
 def _step(

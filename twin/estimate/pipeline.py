@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from twin import geometry
 from twin.config import Estimation
-from twin.estimate import matching, network, stereo
+from twin.estimate import disparity, matching, network, stereo
 from twin.estimate.alignment import Aligned, align
-from twin.estimate.disparity import dense_disparity
 from twin.estimate.f2f import FrameToFrame
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.mosaic import Mosaic
@@ -60,7 +59,7 @@ class Navigator:
         self.matcher = network.PairMatch(rig, self.spool, settings.patch_px)
         self.f2f_pose = start.copy()
         self.since_node = (np.eye(4), np.zeros((6, 6)))
-        self.max_disparity_px: float | None = None
+        self.reach = disparity.Reach(rig)
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
         self.links: list[Link] = []
@@ -138,13 +137,13 @@ class Navigator:
         assert frame.right is not None
         with self.watch("stereo"):
             right = matching.normalise(frame.right)
-            dense_px, _ = dense_disparity(image, right, self._disparity_limit())
+            dense_px = disparity.search(image, right, self.reach.max_disparity_px)
+            self.reach.see(dense_px)
             points = stereo.points_of_pair(
                 image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
         if len(points.xyz) < 12:
             return "too few points in stereo"
-        self.max_disparity_px = float(np.nanpercentile(dense_px, 99.5))
         depth_m = self._depth(dense_px)
         with self.watch("f2m"):
             self._register_with_mosaic(image, points)
@@ -165,11 +164,6 @@ class Navigator:
         """Depth (height, width) [m], NaN where the disparity is unknown or below one pixel."""
         usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
         return (self.rig.focal_px * self.rig.baseline_m / usable).astype(np.float32)
-
-    def _disparity_limit(self) -> int:
-        """Largest disparity to search: that of the last key point with a margin (P12), wide at first."""
-        limit_px = 0.4 * self.rig.width_px
-        return int(limit_px if self.max_disparity_px is None else min(limit_px, self.max_disparity_px * 1.3 + 16))
 
     def _register_with_mosaic(self, image: matching.Image, points: stereo.StereoPoints) -> None:
         """Corrects the position by the mosaic (F2M)."""

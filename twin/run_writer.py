@@ -1,0 +1,128 @@
+"""The run folder on disk: opened before the flight, a log through it, everything else after it, metrics.json last."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin import config, view
+from twin.errors import TwinError
+from twin.exchange import geotiff, mesh, posegraph
+from twin.judge.report import write_report
+from twin.mission import Mission
+from twin.records import ElevationMap, SurveyResult, Trajectory, Truth
+from twin.timing import Stopwatch
+
+_RESERVE_BYTES = 4 * 2**20  # set aside so that a full disk leaves room for trajectories and metrics
+
+
+class RunFolder:
+    """A run's folder and its log (log.jsonl, a JSON object a line). Use as a context manager.
+
+    Raises:
+        TwinError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, mission: Mission):
+        self.path, self._reserve = folder, folder / ".reserve"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
+            self._write("scenario.resolved.toml", config.dump_toml(mission.scenario))
+            self._write("env.json", json.dumps(environment(), indent=1))
+            self._reserve.write_bytes(bytes(_RESERVE_BYTES))
+        except OSError as error:
+            raise TwinError("--out", f"{folder} cannot be written: {error}", "a folder with space in it") from None
+        self.log("begun", name=mission.scenario.name, seed=mission.scenario.seed)
+        if mission.terrain.n_filled:
+            self.log("terrain holes filled", cells=mission.terrain.n_filled)
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._reserve.unlink(missing_ok=True)
+        self._log.close()
+
+    def log(self, event: str, **what: Any) -> None:
+        """Adds a line; a full disk does not stop the survey here."""
+        try:
+            self._log.write(json.dumps({"event": event, **what}) + "\n")
+            self._log.flush()
+        except OSError:
+            pass
+
+    def finish(
+        self,
+        mission: Mission,
+        result: SurveyResult,
+        elevation: ElevationMap | None,
+        truth: Truth,
+        watch: Stopwatch,
+        metrics: dict[str, Any],
+    ) -> dict[str, Any]:
+        """Writes all that is left, and returns the metrics as they stand on disk.
+
+        The metrics take their place first and their name last: report and recording are drawn from the folder, and a
+        folder without metrics.json is an unfinished run. A full disk makes the survey "aborted".
+        """
+        self._reserve.unlink(missing_ok=True)
+        waiting = ".metrics.json.part"
+        self._write(waiting, json.dumps(metrics, indent=1))
+        try:
+            self._write_paths(mission, result, truth, watch)
+            self._write_maps(elevation, truth, mission)
+            write_report(self.path, metrics)
+            view.write_recording(self.path, metrics)
+        except OSError as error:
+            metrics = metrics | {"status": "aborted", "reason": metrics["reason"] or str(error)}
+            self._write(waiting, json.dumps(metrics, indent=1))
+        (self.path / waiting).replace(self.path / "metrics.json")
+        self.log(metrics["status"], reason=metrics["reason"])
+        return metrics
+
+    def _write(self, name: str, text: str) -> None:
+        (self.path / name).write_text(text, encoding="utf-8")
+
+    def _write_paths(self, mission: Mission, result: SurveyResult, truth: Truth, watch: Stopwatch) -> None:
+        """Trajectories, network and the index of the key points."""
+        planned = np.tile(mission.start, (len(truth.reference), 1, 1))
+        planned[:, :3, 3] = truth.reference
+        paths = {"truth": truth.trajectory, "f2f": result.f2f, "online": result.online, "final": result.final}
+        for name, path in (paths | {"reference": Trajectory(truth.trajectory.times_s, planned)}).items():
+            path.save(self.path / f"trajectory_{name}.tum")
+        posegraph.write(self.path / "posegraph.g2o", result)
+        index = {
+            "frames": result.key_frames.tolist(),
+            "tracks": result.track_of_key.tolist(),
+            "n_per_key": mission.plan.n_frames_per_key,
+            "timing_ms": {stage: watch.durations_ms(stage) for stage in ("f2f", "stereo")},
+        }
+        self._write("keypoints/index.json", json.dumps(index))
+
+    def _write_maps(self, elevation: ElevationMap | None, truth: Truth, mission: Mission) -> None:
+        geotiff.write_layer(self.path / "dem_truth.tif", truth.height_m, mission.grid, "true elevation [m]")
+        if elevation is None:
+            return
+        geotiff.write_map(self.path, elevation)
+        error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
+        geotiff.write_layer(self.path / "dem_error.tif", error_m, mission.grid, "estimated minus true elevation [m]")
+        mesh.write_glb(self.path / "mesh.glb", elevation)
+
+
+def environment() -> dict[str, str]:
+    """What the survey ran on."""
+    names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "gtsam", "rerun-sdk")
+    return {
+        "twin": version("seabed-twin"),
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "system": platform.platform(),
+        "cpus": str(os.cpu_count()),
+    } | {name: version(name) for name in names}
