@@ -80,7 +80,11 @@ def test_json_is_all_that_stands_on_stdout(twin_command):
     assert json.loads(done.out) == METRICS
 
 
-def test_the_error_table_and_the_report_stand_on_stdout(twin_command):
+def test_the_error_table_and_the_report_stand_on_stdout(twin_command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("runs/quickstart-1").mkdir(parents=True)
+    for name in ("report.html", "run.rrd"):
+        Path("runs/quickstart-1", name).touch()
     done = twin_command("demo", outcome=result())
     assert done.status == 0 and "1.2 cm" in done.out and "98.0 %" in done.out
     assert done.out.endswith("Open the recording: twin view runs/quickstart-1\n")

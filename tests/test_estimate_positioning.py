@@ -37,8 +37,10 @@ class Diver:
         self.count = 0
 
     def frame(self, pose):
-        left, right, depth = scene.stereo_pair(self.floor, RIG, pose, self.rng)
-        return colour(left), colour(right), depth
+        (left, depth), (right, _) = (
+            scene.look(self.floor, RIG, p, samples=1) for p in (pose, pose @ RIG.left_from_right)
+        )
+        return *(colour(scene.digitise(image, self.rng, 2.0)) for image in (left, right)), depth
 
     def key_point(self, pose, believed=None):
         left, right, depth = self.frame(pose)

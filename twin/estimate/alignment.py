@@ -51,6 +51,7 @@ def align(
         marginals_of: numbers of the nodes whose covariance is wanted; all if None, zeros for the others.
     """
     kept, dropped = list(links), []
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for _ in range(_ROUNDS):
         graph, start = _graph(nodes, kept, anchors, rig, noise)
         values = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters()).optimize()

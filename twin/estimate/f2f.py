@@ -50,4 +50,6 @@ class FrameToFrame:
         self.pixels, self.xyz = self.pixels[:0], self.xyz[:0]
         step = geometry.log(self.last_motion)
         sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(step[3:]))])
-        return motion.Motion(self.last_motion, np.diag(sigma**2), 0, np.inf), "too few points matched"
+        return motion.Motion(
+            self.last_motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf
+        ), "too few points matched"

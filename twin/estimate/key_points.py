@@ -96,4 +96,5 @@ class ImageSpool:
         return self.folder / f"{row:06d}_{side}.png"
 
     def _read(self, row: int, side: str) -> NDArray[np.uint8]:
-        return cv2.imdecode(np.fromfile(self._path(row, side), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        data = np.fromfile(self._path(row, side), np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)

@@ -35,7 +35,7 @@ def normalise(rgb: Image) -> Image:
     mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
     variance = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT) - mean * mean
     deviation = np.sqrt(np.maximum(variance, 0.0)) + _FLAT_GRAY
-    return cv2.convertScaleAbs(np.maximum((gray - mean) / deviation * _GRAY_PER_SIGMA + 128.0, 0.0))
+    return np.asarray(np.clip((gray - mean) / deviation * _GRAY_PER_SIGMA + 128.5, 0, 255), np.uint8)
 
 
 def corners(image: Image, count: int, patch_px: int) -> Points:
@@ -46,7 +46,7 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
     inside[margin : height - margin, margin : width - margin] = 255
     spacing_px = 0.7 * np.sqrt(height * width / count)
     found = cv2.goodFeaturesToTrack(image, count, 0.01, spacing_px, mask=inside, blockSize=7)
-    return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
+    return np.zeros((0, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
 
 def track(
@@ -66,13 +66,27 @@ def track(
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
-    options = dict(winSize=(patch_px, patch_px), criteria=_CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    points, guess = points.astype(np.float32), guess.astype(np.float32)
-    found, there, _ = cv2.calcOpticalFlowPyrLK(source, target, points, guess.copy(), maxLevel=levels, **options)
-    returned, back, _ = cv2.calcOpticalFlowPyrLK(target, source, found, points.copy(), maxLevel=0, **options)
+    points = points.astype(np.float32)
+    found, there = _lucas_kanade(source, target, points, guess.astype(np.float32), patch_px, levels)
+    returned, back = _lucas_kanade(target, source, found, points, patch_px, 0)
     round_trip_px = np.linalg.norm(returned - points, axis=1)
-    ok = (there.ravel() > 0) & (back.ravel() > 0) & (round_trip_px < _ROUND_TRIP_PX)
-    return found, ok & inside(found, source.shape, patch_px // 2)
+    return found, there & back & (round_trip_px < _ROUND_TRIP_PX) & inside(found, source.shape, patch_px // 2)
+
+
+def _lucas_kanade(
+    source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
+) -> tuple[Points, Mask]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        points,
+        guess.copy(),
+        winSize=(patch_px, patch_px),
+        maxLevel=levels,
+        criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(found, np.float32), np.asarray(status).ravel() > 0
 
 
 def inside(points: Points, shape: tuple[int, ...], margin_px: float) -> Mask:

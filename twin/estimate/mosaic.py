@@ -68,7 +68,7 @@ class Mosaic:
             return None
         points, brightness = cells
         frame = image.astype(np.float32)
-        current = world_from_camera
+        current, normal, sigma, n_used = world_from_camera, np.eye(6), 0.0, 0
         for _ in range(_ITERATIONS):
             camera_from_world = geometry.inverse(current)
             normal, right, sigma, n_used = _normal_equations(
@@ -76,12 +76,12 @@ class Mosaic:
             )
             if n_used < _MIN_CELLS:
                 return None
-            step = np.linalg.solve(normal, right)
+            step = np.asarray(np.linalg.solve(normal, right), np.float64)
             current = current @ geometry.exp(step)
             if np.abs(step).max() < 1e-6:
                 break
         correction = geometry.inverse(world_from_camera) @ current
-        return motion.Motion(correction, np.linalg.inv(normal) * sigma**2, n_used, sigma)
+        return motion.Motion(correction, np.asarray(np.linalg.inv(normal) * sigma**2, np.float64), n_used, sigma)
 
     def _window(self, centre: Array, half_m: float) -> tuple[tuple[slice, slice], int, int]:
         """The cells within a square, with the column and row of their first."""
@@ -104,7 +104,8 @@ class Mosaic:
         rows, cols = rows[keep], cols[keep]
         x = self.west_m + (left + cols + 0.5) * self.cell_m
         y = self.south_m + (top + rows + 0.5) * self.cell_m
-        return np.column_stack([x, y, height[rows, cols].astype(np.float64)]), bright[rows, cols]
+        points = np.column_stack([x, y, height[rows, cols]])
+        return np.asarray(points, np.float64), bright[rows, cols]
 
 
 def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -64,7 +64,7 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
     """
     if len(points) < _MIN_POINTS:
         return None
-    a_from_b = guess
+    a_from_b, normal, weight, sigma = guess, np.eye(6), np.zeros(len(points)), 0.0
     for _ in range(iterations):
         xyz = geometry.transform(geometry.inverse(a_from_b), points)
         if np.any(xyz[:, 2] <= 0):
@@ -73,13 +73,17 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
         residual = observed - np.stack([x, y], axis=1)
         size = np.linalg.norm(residual, axis=1)
         sigma = max(float(np.median(size)) / 1.1774, 1e-7)  # median of a Rayleigh distribution
-        weight = np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-12)) * (size < 5 * sigma)
+        weight = _huber(size, sigma, cut=5.0)
         twist, normal = closed_form_motion(x, y, xyz[:, 2], residual, weight)
         a_from_b = a_from_b @ geometry.exp(twist)
     n_points = int(np.count_nonzero(weight))
-    if n_points < _MIN_POINTS:
-        return None
-    return Motion(a_from_b, np.linalg.inv(normal) * sigma**2, n_points, sigma)
+    cov = np.asarray(np.linalg.inv(normal) * sigma**2, np.float64)
+    return None if n_points < _MIN_POINTS else Motion(a_from_b, cov, n_points, sigma)
+
+
+def _huber(size: Array, sigma: float, cut: float) -> Array:
+    """Huber's weights (n,) of residuals of this size, zero beyond `cut` deviations."""
+    return np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-12)) * (size < cut * sigma)
 
 
 def pair_motion(
@@ -114,27 +118,25 @@ def pair_motion(
         return None
     cov_point = np.diag(sigma**2)
     a_from_b, structure = guess, b.copy()
-    weight = np.ones(len(a))
+    weight, normal, by_bias, scale = np.zeros(len(a)), np.eye(6), np.zeros((6, 3)), 1.0
     for _ in range(iterations):
         predicted, by_point, by_motion = _transfer(structure, a_from_b, baseline_m)
         error = a - predicted - np.einsum("nij,nj->ni", by_point, b - structure)
         information = np.linalg.inv(cov_point + by_point @ cov_point @ by_point.transpose(0, 2, 1))
         size = np.sqrt(np.einsum("ni,nij,nj->n", error, information, error) / 3)
         scale = max(float(np.median(size)) / 0.888, 1e-3)  # root of the median of chi2 with 3 degrees, over 3
-        weight = np.minimum(1.0, _HUBER * scale / np.maximum(size, 1e-12)) * (size < 4 * scale)
+        weight = _huber(size, scale, cut=4.0)
         projected = by_motion.transpose(0, 2, 1) @ information
         normal = np.einsum("n,nij,njk->ik", weight, projected, by_motion)
         twist = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weight, projected, error))
+        by_bias = np.linalg.solve(normal, np.einsum("n,nij->ij", weight, projected)) * common_sigma
         left = np.einsum("nij,nj->ni", information, error - by_motion @ twist)
         structure = b + np.einsum("ij,nkj,nk->ni", cov_point, by_point, left)
         structure[:, 2] = np.maximum(structure[:, 2], 1e-4)
         a_from_b = a_from_b @ geometry.exp(twist)
     n_points = int(np.count_nonzero(weight))
-    if n_points < _MIN_POINTS:
-        return None
-    by_bias = np.linalg.solve(normal, np.einsum("n,nij->ij", weight, projected)) * common_sigma
-    cov = np.linalg.inv(normal) * max(scale, 0.3) ** 2 * correlation
-    return Motion(a_from_b, cov + by_bias @ by_bias.T, n_points, scale)
+    cov = np.asarray(np.linalg.inv(normal) * max(scale, 0.3) ** 2 * correlation + by_bias @ by_bias.T, np.float64)
+    return None if n_points < _MIN_POINTS else Motion(a_from_b, cov, n_points, scale)
 
 
 def _transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:

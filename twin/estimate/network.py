@@ -142,7 +142,8 @@ class PairMatch:
         turned = cv2.warpPerspective(
             image, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=128
         )
-        return turned, cv2.perspectiveTransform(pixels[:, None].astype(np.float32), homography)[:, 0]
+        moved = cv2.perspectiveTransform(pixels[:, None].astype(np.float32), homography)[:, 0]
+        return np.asarray(turned, np.uint8), np.asarray(moved, np.float32)
 
 
 def to_link(node: KeyPoint, other: KeyPoint, share: float, result: motion.Motion) -> Link:

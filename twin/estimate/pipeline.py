@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -93,9 +94,9 @@ class Navigator:
             return
         self.before_ga.append(self._key_poses())
         first = track - self.settings.window_tracks
-        with self.watch("ga") as _:
-            started = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
-        self._rebase(started)
+        with self.watch("ga"):
+            aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
+        self._rebase(aligned)
         self._relay_mosaic(track)
         self.after_ga.append(self._key_poses())
 
@@ -205,19 +206,14 @@ class Navigator:
         held = {link.i for link in links} - inside
         everyone = [k for k in self.nodes if k.number in held] + nodes
         anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
-        return self._timed_align(everyone, links, anchors, track, marginals)
-
-    def _timed_align(self, nodes, links, anchors, track, marginals) -> Aligned:
-        import time
-
         begun = time.perf_counter()
-        aligned = align(nodes, links, anchors, self.rig, self.noise, marginals)
+        aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
         ms = (time.perf_counter() - begun) * 1e3
-        self.alignments.append(Alignment(track, ms, len(nodes), len(links), len(aligned.dropped)))
+        self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
         self.dropped += aligned.dropped
         dropped = {(link.i, link.j) for link in aligned.dropped}
         self.links = [link for link in self.links if (link.i, link.j) not in dropped]
-        self._move_keys({k.number: pose for k, pose in zip(nodes, aligned.poses, strict=True)})
+        self._move_keys({k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)})
         return aligned
 
     def _move_keys(self, poses: dict[int, Array]) -> None:
