@@ -11,7 +11,7 @@ from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.mosaic import Mosaic
 from twin.estimate.pose_filter import PoseFilter
 from twin.estimate.trajectory import interpolate_between_keys
-from twin.records import Readings, SensorNoise
+from twin.records import Link, Readings, SensorNoise
 
 PATCH_PX = 21
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)
@@ -168,6 +168,13 @@ def test_links_join_neighbours_on_the_swath_and_on_the_next_one(diver):
     assert {second[-2].number, second[-3].number} <= chosen
     assert chosen & {k.number for k in first}
     assert len(chosen) <= 7
+
+
+def test_links_of_one_node_together_know_no_more_than_its_own_stereo_noise_lets_them():
+    link = Link(0, 3, np.eye(4), np.eye(6) * 1e-6, 0.8, 200)
+    links = network.share_noise([link, link._replace(i=1), link._replace(i=2)])
+    together = np.linalg.inv(sum(np.linalg.inv(shared.cov) for shared in links))
+    np.testing.assert_allclose(together, link.cov)
 
 
 def test_pressure_corrects_height_alone_and_by_the_weight_of_its_noise():

@@ -179,6 +179,7 @@ def test_lost_vision_ends_the_survey_with_its_reason(tmp_path):
             "plan.area_m=[30.0, 0.5]",
             "plan.area_m: 30 x 0.5 m is larger than the terrain (allowed: up to 5.00 x 4.00 m)",
         ),
+        ("plan.speed_mps=2.0", "plan.speed_mps: 2: too fast for the thrusters (allowed: up to 0.7"),
         ("plan.altitude_m=0.7", "plan.altitude_m: 0.7: the cameras come within "),
         ('require."map.le91_m"=0.1', "map.le91_m: no such metric, did you mean"),
         ("terrain.texture_file=x.png", "terrain.texture_file: is not read by a generated floor (reef)"),

@@ -17,6 +17,7 @@ from twin.errors import ScenarioError, TwinError
 from twin.geometry import Array
 from twin.judge.metrics import check_require
 from twin.records import MapGrid, StereoRig
+from twin.simulate.autopilot import top_speed_mps
 
 
 class Step(NamedTuple):
@@ -76,6 +77,7 @@ def prepare(scenario: Scenario) -> Mission:
     source = scenario.source
     terrain = _attempt(lambda: load_terrain(scenario), source, faults)
     plan = _attempt(lambda: make_plan(scenario), source, faults)
+    _attempt(lambda: _check_speed(scenario), source, faults)
     _attempt(lambda: check_require(scenario.require), source, faults)
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
@@ -117,6 +119,15 @@ def make_plan(scenario: Scenario) -> lawnmower.SurveyPlan:
         p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
         rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz,
     )  # fmt: skip
+
+
+def _check_speed(scenario: Scenario) -> None:
+    """The vehicle can fly as fast as planned."""
+    reach = top_speed_mps(scenario.vehicle)
+    if scenario.plan.speed_mps > reach:
+        raise TwinError(
+            "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
+        )
 
 
 def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: lawnmower.SurveyPlan) -> None:

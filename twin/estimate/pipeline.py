@@ -183,6 +183,7 @@ class Navigator:
             window = [k for k in self.nodes if k.track >= node.track - s.window_tracks]
             chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
         measured = [link for other, share in chosen if (link := self._measure(node, other, share)) is not None]
+        measured = network.share_noise(measured)
         if self.nodes and not any(link.i == self.nodes[-1].number for link in measured):
             relative, cov = self.since_node
             measured.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))

@@ -50,20 +50,17 @@ class StereoCamera:
 
     def shoot(self, world_from_left: Array, stereo: bool) -> Shot:
         """Images of the left eye and, where `stereo`, of the right one at the same instant."""
-        light, depth_left = self._see(world_from_left, 0)
-        gain = self._exposure.gain(light)
-        left = self._expose(light, gain, 0)
+        left, depth_left, gain = self._see(world_from_left, 0, None)
         if not stereo:
             return Shot(left, None, depth_left, None)
-        light, depth_right = self._see(world_from_left @ self._left_from_right, 1)
-        return Shot(left, self._expose(light, gain, 1), depth_left, depth_right)
+        right, depth_right, _ = self._see(world_from_left @ self._left_from_right, 1, gain)
+        return Shot(left, right, depth_left, depth_right)
 
-    def _see(self, world_from_eye: Array, eye: int) -> tuple[NDArray[np.float32], Depth]:
+    def _see(self, world_from_eye: Array, eye: int, gain: float | None) -> tuple[Image, Depth, float]:
+        """Image and true depth of an eye, and the gain it was exposed with: metered here, or that of the other eye."""
         with self._watch("render"):
             albedo, depth = self._renderer.render(world_from_eye)
         with self._watch("optics"):
-            return self._optics.radiance(albedo, depth, eye), depth
-
-    def _expose(self, light: NDArray[np.float32], gain: float, eye: int) -> Image:
-        with self._watch("optics"):
-            return expose(light, gain, self._imaging, self._rngs[eye])
+            light = self._optics.radiance(albedo, depth, eye)
+            gain = self._exposure.gain(light) if gain is None else gain
+            return expose(light, gain, self._imaging, self._rngs[eye]), depth, gain

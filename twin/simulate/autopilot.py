@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from controllers.allocation import allocation
 from controllers.tracking import HullModel, Pilot
 from scenes.bluerov2 import BLUEROV2_HEAVY
@@ -18,3 +20,11 @@ def nominal_pilot(natural_frequency_radps: float, frame_rate_hz: float) -> Pilot
     effects = angular_first(BLUEROV2_HEAVY.allocation)
     shares = allocation(effects, lambda u: steady_thrust_n(u, BLUEROV2_HEAVY.thrust_coefficients))
     return Pilot(believed, shares, natural_frequency_radps, 1 / frame_rate_hz)
+
+
+def top_speed_mps(vehicle: config.Vehicle) -> float:
+    """Speed along the bow at which drag takes all that the thrusters give, straight ahead in still water [m/s]."""
+    hull, share = hull_of(vehicle), angular_first(BLUEROV2_HEAVY.allocation)[3]
+    thrust_n = float(abs(share).sum() * steady_thrust_n(1.0, BLUEROV2_HEAVY.thrust_coefficients))
+    linear, quadratic = float(hull.linear_drag[3]), float(hull.quadratic_drag[3])
+    return (math.sqrt(linear**2 + 4 * quadratic * thrust_n) - linear) / (2 * quadratic)
