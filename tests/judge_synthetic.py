@@ -10,7 +10,7 @@ import numpy as np
 import rasterio
 
 from twin import geometry
-from twin.config import Scenario, dump_toml
+from twin.config import Scenario
 from twin.judge import metrics as judge
 from twin.judge.map_error import height_error
 from twin.records import (
@@ -23,6 +23,7 @@ from twin.records import (
     Trajectory,
     Truth,
 )
+from twin.scenario_file import dump_toml
 from twin.timing import Stopwatch
 
 SCENARIO = Scenario.model_validate(

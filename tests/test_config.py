@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin.config import Scenario, dump_toml, load_scenario
+from twin.config import Scenario
 from twin.errors import ScenarioError, TwinError
+from twin.scenario_file import dump_toml, load_scenario
 
 PLAN_KEYS = "pattern, area_m, altitude_m, speed_mps, overlap_along, overlap_across, tracks, clearance_m"
 TOP_KEYS = (
@@ -37,6 +38,7 @@ BAD_FILES = [
     ("seed = -1", ["1: seed: -1: not allowed (allowed: greater than or equal to 0)"]),
     ('name = ""', ["1: name: '': not allowed (allowed: a text that is not empty)"]),
     ("[rig]\nimage_width_px = 320.5", ["2: rig.image_width_px: 320.5: not allowed (allowed: a whole number)"]),
+    ("[rig]\nframe_rate_hz = 3", ["2: rig.frame_rate_hz: 3: not allowed (allowed: greater than or equal to 5)"]),
     ('[rig]\nbaseline_m = "wide"', ["2: rig.baseline_m: 'wide': not allowed (allowed: a number)"]),
     ("[estimate]\nuse_f2m = 2", ["2: estimate.use_f2m: 2: not allowed (allowed: true or false)"]),
     ("[plan]\nspeed_mps = nan", ["2: plan.speed_mps: nan: not allowed (allowed: a finite number)"]),

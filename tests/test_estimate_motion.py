@@ -56,7 +56,7 @@ def test_too_few_points_are_a_status_not_a_motion():
     points = floor_points(np.random.default_rng(3), 8)
     assert motion.frame_motion(points, points[:, :2] / points[:, 2:], np.eye(4)) is None
     a, b = seen(points, np.eye(4))
-    assert motion.pair_motion(a, b, np.full(3, 1e-3), BASELINE_M, np.eye(4)) is None
+    assert motion.pair_motion(a, b, np.eye(3) * 1e-6, BASELINE_M, np.eye(4)) is None
 
 
 def test_transfer_derivatives_agree_with_finite_differences():
@@ -83,7 +83,7 @@ def test_pair_motion_has_a_true_covariance_and_no_bias():
     nees, errors = [], []
     for _ in range(150):
         a, b = (z + rng.normal(size=z.shape) * sigma for z in seen(floor_points(rng, 120), true))
-        found = motion.pair_motion(a, b, sigma, BASELINE_M, true @ geometry.exp(rng.normal(size=6) * 0.01))
+        found = motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true @ geometry.exp(rng.normal(size=6) * 0.01))
         assert found is not None
         error = geometry.log(geometry.inverse(true) @ found.a_from_b)
         errors.append(error)
@@ -102,7 +102,7 @@ def test_depth_taken_as_exact_is_biased_where_structure_and_motion_together_are_
     for _ in range(40):
         a, b = (z + rng.normal(size=z.shape) * sigma for z in seen(floor_points(rng, 200), true))
         points = np.column_stack([a[:, :2], np.ones(len(a))]) * BASELINE_M / a[:, 2:]
-        first, second = motion.frame_motion(points, b[:, :2], true), motion.pair_motion(a, b, sigma, BASELINE_M, true)
+        first, second = motion.frame_motion(points, b[:, :2], true), motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true)
         assert first is not None and second is not None
         naive.append(first.a_from_b[0, 3] - 0.4)
         joint.append(second.a_from_b[0, 3] - 0.4)

@@ -10,7 +10,7 @@ import pytest
 from judge_synthetic import SCENARIO, write_folder
 
 from twin.errors import TwinError
-from twin.judge import wording
+from twin.judge import figures, wording
 from twin.judge.budget import budget
 from twin.judge.report import sample_photos, write_report
 from twin.judge.run_folder import load_run
@@ -141,3 +141,15 @@ def test_pictures_keep_their_colours(folder):
     data = base64.b64decode(sample_photos(run)[0][1].split(",")[1])
     shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     np.testing.assert_allclose(shown.mean(axis=(0, 1)), image.mean(axis=(0, 1)), atol=2)
+
+
+def test_a_wild_height_leaves_the_rest_its_relief():
+    x, y = np.meshgrid(np.linspace(0, 20, 120), np.linspace(0, 15, 90))
+    tame = np.sin(x) * np.cos(y)
+    wild = tame.copy()
+    wild[40, 60] = -50.0
+    drawn, expected = figures._relief(wild, "gray"), figures._relief(tame, "gray")
+    away = np.hypot(*np.ogrid[-40:50, -60:60]) > 2
+    # not equal: the hill shade is stretched to the darkest slope, which is the pit's
+    assert drawn[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
+    assert np.abs(drawn[away] - expected[away]).max() < 0.2

@@ -56,9 +56,10 @@ def test_the_stereo_pair_is_mounted_as_calibrated(world: World) -> None:
     data = settled(world, np.array([0.3, -0.4, 2.0]), rotation)
     world_from_left = geometry.pose(rotation, np.array([0.3, -0.4, 2.0])) @ BODY_FROM_LEFT
     right_from = geometry.pose(np.eye(3), np.array([0.2, 0, 0]))
+    cv_from_gl = np.diag([1.0, -1.0, -1.0])  # MuJoCo's cameras have y up and look along -z
     for camera, expected in zip(world.camera_ids, (world_from_left, world_from_left @ right_from), strict=True):
         assert data.cam_xpos[camera] == pytest.approx(expected[:3, 3], abs=1e-9)
-        assert data.cam_xmat[camera].reshape(3, 3) @ geometry.CV_FROM_GL == pytest.approx(expected[:3, :3], abs=1e-9)
+        assert data.cam_xmat[camera].reshape(3, 3) @ cv_from_gl == pytest.approx(expected[:3, :3], abs=1e-9)
     assert np.all(world.model.cam_fovy == 45.0)
 
 

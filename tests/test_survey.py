@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin import config, records, sea, survey
+from twin import records, scenario_file, sea, survey
 from twin.errors import ScenarioError, SurveyAborted
 from twin.mission import prepare
 from twin.timing import Stopwatch
@@ -23,7 +23,7 @@ TRAJECTORIES = ("truth", "f2f", "online", "final")
 
 
 def fly(out: Path, *overrides: str, progress=lambda _: None) -> survey.RunResult:
-    scenario = config.load_scenario("quickstart", [*SMALL, *overrides])
+    scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
     return survey.run(scenario, out, progress)
 
 
@@ -52,7 +52,7 @@ def test_the_run_folder_holds_all_that_the_design_promises(flown):
 
 
 def test_the_resolved_scenario_flies_the_same_survey(flown):
-    again = config.load_scenario(flown.folder / "scenario.resolved.toml")
+    again = scenario_file.load_scenario(flown.folder / "scenario.resolved.toml")
     assert again.fingerprint() == flown.metrics["scenario_hash"]
 
 
@@ -84,14 +84,16 @@ class Recorder:
 
 def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path):
     """Frames are recorded in one sea and replayed with every truth (floor, poses, map) replaced by another."""
-    scenario = config.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
+    scenario = scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
     mission, watch = prepare(scenario), Stopwatch()
     recorder = Recorder(survey.make_navigator(mission, tmp_path / "first", watch))
     with sea.Sea(mission, watch) as world:
         survey.fly(mission, world, recorder, lambda *_: None)
     first = recorder.navigator.finish()
 
-    elsewhere = config.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", "terrain.kind=flat", "seed=9"])
+    elsewhere = scenario_file.load_scenario(
+        "quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", "terrain.kind=flat", "seed=9"]
+    )
     other = prepare(elsewhere)
     assert not np.array_equal(other.terrain.height_m, mission.terrain.height_m)
     navigator = survey.make_navigator(other, tmp_path / "second", watch)
@@ -108,7 +110,7 @@ def test_frames_carry_nothing_but_images_time_and_readings():
 
 
 def test_sensors_that_do_not_aid_do_not_reach_the_estimators(tmp_path):
-    scenario = config.load_scenario("quickstart", [*SMALL, "navigation.aiding=[]"])
+    scenario = scenario_file.load_scenario("quickstart", [*SMALL, "navigation.aiding=[]"])
     mission = prepare(scenario)
     with sea.Sea(mission, Stopwatch()) as world:
         readings = world.observe(next(mission.fly(1)), 1).readings

@@ -19,7 +19,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     Raises:
         ScenarioError: every fault of the file, each as `FILE:LINE: key: what is wrong`.
     """
-    from twin.config import load_scenario
+    from twin.scenario_file import load_scenario
 
     return load_scenario(path, overrides)
 

@@ -84,8 +84,8 @@ def plan(
 ) -> None:
     """Show the numbers and a picture of a survey; nothing is simulated."""
     from twin import plan as planning
-    from twin.config import load_scenario
     from twin.mission import prepare
+    from twin.scenario_file import load_scenario
 
     mission = prepare(load_scenario(scene, overrides))
     console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
@@ -136,8 +136,8 @@ def exit_status(result: RunResult) -> int:
 
 
 def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
-    from twin.config import load_scenario
     from twin.doctor import graphics
+    from twin.scenario_file import load_scenario
 
     scenario = load_scenario(scene, overrides)
     folder = _new_folder(scenario, out)

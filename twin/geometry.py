@@ -17,8 +17,6 @@ Array = NDArray[np.float64]
 
 #: A camera that looks straight down with the top of its image towards the bow: columns are its axes in the body.
 BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-#: The same camera in MuJoCo's and OpenGL's axes (x right, y up, looks along -z).
-CV_FROM_GL: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def skew(v: Array) -> Array:
@@ -38,6 +36,12 @@ def inverse(a_from_b: Array) -> Array:
     """b_from_a, exactly rigid. (4, 4) -> (4, 4)."""
     rotation = a_from_b[:3, :3].T
     return pose(rotation, -rotation @ a_from_b[:3, 3])
+
+
+def rigid(almost: Array) -> Array:
+    """The rigid motion nearest to a product of many: `inverse` doubles what a rotation lacks of orthogonality."""
+    u, _, vt = np.linalg.svd(almost[:3, :3])
+    return pose(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, almost[:3, 3])
 
 
 def so3_exp(w: Array) -> Array:

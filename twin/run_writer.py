@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from twin import config, view
+from twin import scenario_file, view
 from twin.errors import TwinError
 from twin.exchange import geotiff, mesh, posegraph
 from twin.judge.report import write_report
@@ -34,7 +34,7 @@ class RunFolder:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
-            self._write("scenario.resolved.toml", config.dump_toml(mission.scenario))
+            self._write("scenario.resolved.toml", scenario_file.dump_toml(mission.scenario))
             self._write("env.json", json.dumps(environment(), indent=1))
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:

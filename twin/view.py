@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from twin import config, geometry, view_map
+from twin import geometry, scenario_file, view_map
 from twin.judge import wording
 from twin.judge.pictures import jpeg_bytes, read_rgb
 from twin.judge.run_folder import SCENARIO_FILE, Run, load_run
@@ -37,7 +37,7 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
-    rig = config.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
+    rig = scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_view_point(run)))
     log_scene(recording, run)

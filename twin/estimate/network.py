@@ -16,9 +16,9 @@ from twin.records import Link, StereoRig
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
 _LEAST_SHARE = 0.3  # of matched points that agree on one motion
 _COMMON_PX = 0.013  # bias that all points of a match share: the largest of Lucas-Kanade measured on low contrast
-#: Relief inside the patches makes neighbouring matches err together: over reefs the links' NEES is twice what noise and
-#: shared pixels explain, alike for links along the swath and across, on generated and real reefs.
-_RELIEF = 2.0
+#: Relief inside the patches makes neighbouring matches err together: over reefs the links' NEES is half more than noise
+#: and shared pixels explain, alike for links along the swath and across, on generated and real reefs.
+_RELIEF = 1.5
 _SMALL_TURN_RAD = 0.06  # patches of 21 px are skewed by less than a pixel
 
 
@@ -122,12 +122,11 @@ class PairMatch:
         """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted."""
         measured_other, measured_node, sigma_px = matched
         guess = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        sigma = np.full(3, sigma_px / self.rig.focal_px)
         shape = (self.rig.height_px, self.rig.width_px)
         result = motion.pair_motion(
             measured_other,
             measured_node,
-            sigma,
+            stereo.point_cov(sigma_px / self.rig.focal_px),
             self.rig.baseline_m,
             guess,
             common_sigma=_COMMON_PX / self.rig.focal_px,

@@ -60,6 +60,7 @@ class Navigator:
         self.matcher = network.PairMatch(rig, self.spool, settings.patch_px)
         self.f2f_pose = start.copy()
         self.since_node = (np.eye(4), np.zeros((6, 6)))
+        self.cov_at_node = np.zeros((6, 6))
         self.reach = disparity.Reach(rig)
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
@@ -146,18 +147,18 @@ class Navigator:
         if len(points.xyz) < 12:
             return "too few points in stereo"
         depth_m = self._depth(dense_px)
-        with self.watch("f2m"):
-            self._register_with_mosaic(image, points)
-        key = KeyPoint(
-            len(self.keys), len(self.times_s), track, self.filter.world_from_camera.copy(), points, frame.readings
-        )
+        key = KeyPoint(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
         self.spool.put(key.row, frame.left, frame.right, (image, right))
         self.keys.append(key)
-        self.depth_of_key[key.number] = depth_m.astype(np.float16)
+        is_node = key.number % self.settings.node_stride == 0
+        chain = self._follow_chain(key) if is_node else None
         with self.watch("f2m"):
+            self._register_with_mosaic(image, points)
+            key.world_from_camera = self.filter.world_from_camera
             self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
-        if key.number % self.settings.node_stride == 0:
-            self._connect(key)
+        self.depth_of_key[key.number] = depth_m.astype(np.float16)
+        if is_node:
+            self._connect(key, chain)
         self.f2f.restart(image, points)
         return status
 
@@ -176,19 +177,38 @@ class Navigator:
             cov = correction.cov + np.diag(_F2M_SIGMA**2)
             self.filter.correct_pose(self.filter.world_from_camera @ correction.a_from_b, cov)
 
-    def _connect(self, node: KeyPoint) -> None:
-        """Links a new node to earlier ones by measured motions; to the last one by F2F where that fails."""
+    def _follow_chain(self, node: KeyPoint) -> Link | None:
+        """Measures the motion since the last node, and lets it take the place of the F2F motion in the online position.
+
+        Two stereo pairs tell the motion ten times better than the frames between them (the paper's better start values
+        for GA, section IV-5); what the navigation sensors corrected meanwhile is kept.
+        """
+        if not self.nodes:
+            return None
+        last, (walked, _) = self.nodes[-1], self.since_node
+        link = self._measure(node, last, network.overlap(node, last, self.rig, self.settings.patch_px))
+        if link is None:
+            return None
+        aided = geometry.inverse(last.world_from_camera @ walked) @ self.filter.world_from_camera
+        carry = geometry.adjoint(geometry.inverse(link.i_from_j))
+        self.filter.reset(last.world_from_camera @ link.i_from_j @ aided, carry @ self.cov_at_node @ carry.T + link.cov)
+        node.world_from_camera = self.filter.world_from_camera
+        return link
+
+    def _connect(self, node: KeyPoint, chain: Link | None) -> None:
+        """Links a new node to earlier ones by measured motions; to the last one by F2F where that failed."""
         s = self.settings
         with self.watch("network"):
             window = [k for k in self.nodes if k.track >= node.track - s.window_tracks]
             chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
-        measured = [link for other, share in chosen if (link := self._measure(node, other, share)) is not None]
-        measured = network.share_noise(measured)
-        if self.nodes and not any(link.i == self.nodes[-1].number for link in measured):
+        others = [(k, share) for k, share in chosen if k is not self.nodes[-1]]
+        measured = [link for other, share in others if (link := self._measure(node, other, share)) is not None]
+        self.links += network.share_noise(measured + ([chain] if chain else []))
+        if self.nodes and chain is None:
             relative, cov = self.since_node
-            measured.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))
-        self.links += measured
+            self.links.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))
         self.nodes.append(node)
+        self.cov_at_node = self.filter.cov
         self.since_node = (np.eye(4), np.zeros((6, 6)))
 
     def _measure(self, node: KeyPoint, other: KeyPoint, share: float) -> Link | None:
@@ -231,6 +251,7 @@ class Navigator:
         last_from_now = geometry.inverse(self.online_poses[last.row]) @ self.filter.world_from_camera
         carry = geometry.adjoint(geometry.inverse(last_from_now))
         self.filter.reset(last.world_from_camera @ last_from_now, carry @ aligned.covs[-1] @ carry.T)
+        self.cov_at_node = aligned.covs[-1]
 
     def _relay_mosaic(self, track: int) -> None:
         """Lays the mosaic anew with the aligned key points of the last track; older ones are forgotten."""

@@ -46,8 +46,8 @@ class PoseFilter:
             self._update(residual, np.eye(3, 6), cov)
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
-        """Takes the pose and covariance of a global alignment."""
-        self.world_from_camera, self.cov = world_from_camera, cov
+        """Takes a pose and covariance from elsewhere: a measured motion, a global alignment."""
+        self.world_from_camera, self.cov = geometry.rigid(world_from_camera), cov
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
         gain = np.linalg.solve(jacobian @ self.cov @ jacobian.T + cov, jacobian @ self.cov).T

@@ -21,7 +21,8 @@ class StereoPoints(NamedTuple):
         pixels: (n, 2) in the left image [px].
         measured: (n, 3) normalised (x, y, disparity).
         xyz: (n, 3) in the left camera [m].
-        sigma_px: standard deviation of one matched coordinate, from what should be zero: the vertical disparity.
+        sigma_px: standard deviation of localising a patch in one image, from what should be zero: the vertical
+            disparity, which errs by two of them.
     """
 
     pixels: NDArray[np.float32]
@@ -42,6 +43,14 @@ def project(xyz: NDArray[np.float64], rig: StereoRig) -> NDArray[np.float32]:
     """Pixels of points (n, 3) in front of the left camera; behind it NaN. -> (n, 2)"""
     depth = np.where(xyz[:, 2:] > 1e-3, xyz[:, 2:], np.nan)
     return (xyz[:, :2] / depth * rig.focal_px + [rig.cx_px, rig.cy_px]).astype(np.float32)
+
+
+def point_cov(sigma: float) -> NDArray[np.float64]:
+    """Covariance (3, 3) of (x, y, disparity) where each image localises a patch to `sigma`.
+
+    The disparity is the difference of two places, and x is one of them: they err together.
+    """
+    return sigma**2 * np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 2.0]])
 
 
 def measure(
@@ -67,7 +76,7 @@ def measure(
     vertical_px = found[:, 1] - pixels[:, 1]
     disparity_px = (pixels[:, 0] - found[:, 0]).astype(np.float64)
     ok &= (np.abs(vertical_px) < _EPIPOLAR_PX) & (disparity_px > 0.5)
-    sigma_px = max(matching.robust_sigma(vertical_px[ok]), _FLOOR_PX)
+    sigma_px = max(matching.robust_sigma(vertical_px[ok]) / np.sqrt(2), _FLOOR_PX)
     measured = np.column_stack([normalised(pixels[ok], rig), disparity_px[ok] / rig.focal_px])
     depth = rig.baseline_m / measured[:, 2:]
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * depth

@@ -9,10 +9,8 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
-from rasterio.errors import RasterioIOError
 from rasterio.transform import Affine
 
-from twin.errors import TwinError
 from twin.records import ElevationMap, Image, MapGrid
 
 Map = NDArray[np.float32]
@@ -43,20 +41,6 @@ def write_mosaic(path: Path, mosaic: Image, grid: MapGrid) -> None:
         file.write(np.moveaxis(mosaic, 2, 0))
 
 
-def read_layer(path: Path) -> tuple[Map, MapGrid]:
-    """The first band of a north-up GeoTIFF with square cells as float32, NaN for no data, and its grid.
-
-    Raises:
-        TwinError: the file cannot be read, or is not such a grid.
-    """
-    try:
-        with rasterio.open(path) as file:
-            values, transform = file.read(1, masked=True), file.transform
-    except RasterioIOError as error:
-        raise TwinError(str(path), f"cannot be read: {error}", "a GeoTIFF") from None
-    return np.ma.filled(values.astype(np.float32), np.nan), _grid(path, transform, values.shape)
-
-
 def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
     return {
         "driver": "GTiff",
@@ -68,9 +52,3 @@ def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
         "transform": Affine(grid.cell_m, 0, grid.west_m, 0, -grid.cell_m, grid.north_m),
         "compress": "deflate",
     }
-
-
-def _grid(path: Path, transform: Affine, shape: tuple[int, int]) -> MapGrid:
-    if transform.b or transform.d or transform.a <= 0 or not np.isclose(transform.a, -transform.e, rtol=1e-6):
-        raise TwinError(str(path), "is rotated or has oblong cells", "a north-up grid of square cells")
-    return MapGrid(transform.c, transform.f, transform.a, *shape)

@@ -104,11 +104,20 @@ def path_error_curves(run: Run) -> Figure | None:
         position.plot(errors.travelled_m, errors.distance_m, **style)
         height.plot(errors.travelled_m, errors.position_m[:, 2], **style)
         heading.plot(errors.travelled_m, np.rad2deg(errors.heading_rad), **style)
-    position.set(ylabel="position error [m]", ylim=(0, None))
+    _log_scale(position)
+    position.set(ylabel="position error [m]")
     height.set(ylabel="height error [m]")
     heading.set(ylabel="heading error [deg]", xlabel="true path travelled [m]")
     position.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))
     return figure
+
+
+def _log_scale(axes: Axes) -> None:
+    """Decades from a little below the usual smallest of the curves: millimetres stay visible beside decimetres."""
+    sizes = np.concatenate([np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines])
+    sizes = sizes[sizes > 0]
+    if len(sizes):
+        axes.set(yscale="log", ylim=(0.7 * float(np.percentile(sizes, 1)), None))
 
 
 def track_bars(run: Run) -> Figure | None:
@@ -136,14 +145,13 @@ def elevation_maps(run: Run) -> Figure | None:
     ]
     if not rasters:
         return None
-    finite = np.concatenate([r.values[np.isfinite(r.values)] for r, _ in rasters])
-    norm = Normalize(*np.percentile(finite, [0.5, 99.5])) if len(finite) else Normalize(0, 1)
+    scale = _height_scale(np.concatenate([raster.values.ravel() for raster, _ in rasters]))
     figure = Figure(figsize=(WIDTH_IN, 4.0))
     panels = figure.subplots(1, len(rasters), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (raster, title) in zip(panels, rasters, strict=True):
-        _map_axes(axes).imshow(_relief(thinned(raster), "viridis", norm), extent=_extent(raster))
+        _map_axes(axes).imshow(_relief(thinned(raster), "viridis", scale), extent=_extent(raster))
         axes.set_title(title)
-    figure.colorbar(ScalarMappable(norm, "viridis"), ax=panels, label="height [m]", shrink=0.8)
+    figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=panels, label="height [m]", shrink=0.8)
     return figure
 
 
@@ -166,7 +174,7 @@ def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normali
     axes.set_facecolor("#dfe6ea")
     figure = axes.get_figure()
     assert figure is not None
-    figure.colorbar(image, ax=axes, label="[m]", shrink=0.8, extend="both")
+    figure.colorbar(image, ax=axes, label="[m]", shrink=0.8, extend="both" if norm.vmin else "max")
 
 
 def error_histogram(run: Run) -> Figure | None:
@@ -234,13 +242,27 @@ def thinned(raster: Raster) -> np.ndarray:
     return raster.values[::step, ::step]
 
 
-def _relief(heights: np.ndarray, cmap: str, norm: Normalize | None = None) -> np.ndarray:
-    """Hill-shaded colours (rows, cols, 4) lit from the north-west; holes are transparent."""
+def _height_scale(heights: np.ndarray) -> tuple[float, float]:
+    """Nearly the lowest and nearly the highest of the finite heights."""
+    finite = heights[np.isfinite(heights)]
+    low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
+    return float(low), float(high)
+
+
+def _relief(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
+    """Hill-shaded colours (rows, cols, 4) lit from the north-west; holes are transparent.
+
+    Heights are clipped to the colour scale: a single wild one would leave no shade for all others.
+    """
     holes = ~np.isfinite(heights)
-    filled = np.where(holes, np.nanmean(heights) if not holes.all() else 0.0, heights)
-    span = float(np.ptp(filled)) or 1.0
+    low, high = scale or _height_scale(heights)
+    filled = np.clip(np.where(holes, (low + high) / 2, heights), low, high)
     shaded = LightSource(315, 45).shade(
-        filled, matplotlib.colormaps[cmap], norm or Normalize(), "soft", vert_exag=0.12 * max(heights.shape) / span
+        filled,
+        matplotlib.colormaps[cmap],
+        Normalize(low, high),
+        "soft",
+        vert_exag=0.12 * max(heights.shape) / ((high - low) or 1.0),
     )
     shaded[..., 3] = ~holes
     return shaded

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from twin.judge import wording
 from twin.judge.budget import budget
 from twin.judge.figures import draw_all
+from twin.judge.mesh_picture import surface_picture
 from twin.judge.pictures import jpeg_bytes, read_rgb
 from twin.judge.run_folder import Run, load_run
 from twin.judge.style import COLOURS, ESTIMATES, LABELS
@@ -67,6 +68,7 @@ def context(run: Run) -> dict[str, Any]:
         "budget": budget(metrics, run.scenario, run.key_points.n_per_key) if metrics else [],
         "figures": draw_all(run),
         "mosaic": mosaic_photo(run),
+        "surface": surface_photo(run),
         "samples": sample_photos(run),
         "scenario": (run.folder / "scenario.resolved.toml").read_text(encoding="utf-8"),
         "environment": {key: _text(value) for key, value in run.environment.items()},
@@ -75,8 +77,17 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def mosaic_photo(run: Run) -> str | None:
-    """The photo mosaic as an inlined JPEG."""
-    return jpeg_uri(run.rasters["mosaic"].values) if "mosaic" in run.rasters else None
+    """The photo mosaic as an inlined JPEG, white where the map has a hole."""
+    if "mosaic" not in run.rasters:
+        return None
+    mosaic = run.rasters["mosaic"].values
+    return jpeg_uri(np.where(mosaic.any(axis=2, keepdims=True), mosaic, np.uint8(255)))
+
+
+def surface_photo(run: Run) -> str | None:
+    """The mesh of the map as an inlined JPEG."""
+    picture = surface_picture(run.folder / "mesh.glb")
+    return None if picture is None else jpeg_uri(picture)
 
 
 def sample_photos(run: Run) -> list[tuple[int, str, str | None]]:

@@ -92,9 +92,15 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
 
 def read_raster(file: Path) -> Raster:
-    """A GeoTIFF, row 0 = north; nodata becomes NaN."""
+    """A GeoTIFF, row 0 = north; nodata becomes NaN.
+
+    Raises:
+        ValueError: its cells are no squares along east and north.
+    """
     with rasterio.open(file) as source:
         transform, bands = source.transform, source.read(masked=source.count == 1)
+        if transform.b or transform.d or transform.a <= 0 or not np.isclose(transform.a, -transform.e, rtol=1e-6):
+            raise ValueError("it is rotated or has oblong cells")
         grid = MapGrid(transform.c, transform.f, transform.a, source.height, source.width)
     if len(bands) == 1:
         return Raster(grid, bands[0].astype(float).filled(np.nan))
