@@ -102,7 +102,10 @@ def test_depth_taken_as_exact_is_biased_where_structure_and_motion_together_are_
     for _ in range(40):
         a, b = (z + rng.normal(size=z.shape) * sigma for z in seen(floor_points(rng, 200), true))
         points = np.column_stack([a[:, :2], np.ones(len(a))]) * BASELINE_M / a[:, 2:]
-        first, second = motion.frame_motion(points, b[:, :2], true), motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true)
+        first, second = (
+            motion.frame_motion(points, b[:, :2], true),
+            motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true),
+        )
         assert first is not None and second is not None
         naive.append(first.a_from_b[0, 3] - 0.4)
         joint.append(second.a_from_b[0, 3] - 0.4)

@@ -125,9 +125,9 @@ def test_camera_axes_are_right_down_forward():
 
 
 def test_the_nearest_rigid_motion_mends_what_products_lose():
-    true = geometry.exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
+    true = g.exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
     bent = true + np.pad(np.full((3, 3), 1e-6), ((0, 1), (0, 1)))
-    mended = geometry.rigid(bent)
+    mended = g.rigid(bent)
     np.testing.assert_allclose(mended[:3, :3].T @ mended[:3, :3], np.eye(3), atol=1e-14)
     np.testing.assert_allclose(mended, true, atol=5e-6)
-    np.testing.assert_allclose(geometry.rigid(true), true, atol=1e-14)
+    np.testing.assert_allclose(g.rigid(true), true, atol=1e-14)

@@ -192,3 +192,16 @@ def test_a_survey_that_cannot_be_flown_is_refused_before_anything_is_written(tmp
         fly(tmp_path / "run", override)
     assert message in str(refused.value)
     assert not (tmp_path / "run").exists()
+
+
+def test_an_alignment_that_fails_is_told_and_the_rest_is_kept(tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("\nIndeterminate linear system\nmore")
+
+    monkeypatch.setattr("twin.estimate.pipeline.align", fail)
+    result = fly(tmp_path / "run", "plan.area_m=[0.6, 0.5]")
+    assert (result.status, result.metrics["reason"]) == (
+        "aborted",
+        "global alignment failed: Indeterminate linear system",
+    )
+    assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from twin.errors import SurveyAborted
 from twin.estimate.map_builder import KeyPointImages, build_map
 from twin.estimate.pipeline import Navigator
 from twin.geometry import Array
@@ -40,7 +41,10 @@ def conclude(
     say: Callable[[str, float], None],
 ) -> RunResult:
     """Aligns, maps, judges and writes what was flown; `reason` tells why it ended early ("" if it did not)."""
-    result = navigator.finish()
+    try:
+        result = navigator.finish()
+    except SurveyAborted as error:
+        result, reason = navigator.finish(), reason or str(error)
     for link in navigator.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
     for alignment in result.alignments:

@@ -114,7 +114,7 @@ class PairMatch:
         predicted = geometry.transform(other_from_node, node_points.xyz)
         disparity_px = self.rig.focal_px * self.rig.baseline_m / predicted[:, 2]
         points, both = stereo.measure(left, right, found[ok], disparity_px, self.rig, self.patch_px)
-        if len(points.xyz) == 0:
+        if not np.isfinite(points.sigma_px):  # too few to tell their noise
             return None
         return points.measured, node_points.measured[both], max(points.sigma_px, node_points.sigma_px)
 

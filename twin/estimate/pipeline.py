@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from twin import geometry
 from twin.config import Estimation
+from twin.errors import SurveyAborted
 from twin.estimate import disparity, matching, network, stereo
 from twin.estimate.alignment import Aligned, align
 from twin.estimate.f2f import FrameToFrame
@@ -61,6 +62,7 @@ class Navigator:
         self.f2f_pose = start.copy()
         self.since_node = (np.eye(4), np.zeros((6, 6)))
         self.cov_at_node = np.zeros((6, 6))
+        self.alignable = True
         self.reach = disparity.Reach(rig)
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
@@ -102,10 +104,14 @@ class Navigator:
         self.after_ga.append(self._key_poses())
 
     def finish(self) -> SurveyResult:
-        """The truly global alignment over all tracks, and the trajectories."""
+        """The truly global alignment over all tracks, and the trajectories.
+
+        Raises:
+            SurveyAborted: the alignment failed; called again, it goes without.
+        """
         self._forget_unfinished()
         cov = np.tile(self.filter.cov, (len(self.keys), 1, 1))
-        if self.settings.use_ga and len(self.nodes) >= 2:
+        if self.settings.use_ga and self.alignable and len(self.nodes) >= 2:
             with self.watch("ga"):
                 aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
             owner = np.searchsorted([n.number for n in self.nodes], [k.number for k in self.keys], side="right") - 1
@@ -228,7 +234,11 @@ class Navigator:
         everyone = [k for k in self.nodes if k.number in held] + nodes
         anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
         begun = time.perf_counter()
-        aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+        try:
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+        except RuntimeError as error:  # gtsam: the links do not hold every node
+            self.alignable = False
+            raise SurveyAborted(f"global alignment failed: {str(error).strip().splitlines()[0]}") from None
         ms = (time.perf_counter() - begun) * 1e3
         self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
         self.dropped += aligned.dropped

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from controllers.allocation import allocation
 from controllers.tracking import HullModel, Pilot
 from scenes.bluerov2 import BLUEROV2_HEAVY
@@ -25,6 +27,7 @@ def nominal_pilot(natural_frequency_radps: float, frame_rate_hz: float) -> Pilot
 def top_speed_mps(vehicle: config.Vehicle) -> float:
     """Speed along the bow at which drag takes all that the thrusters give, straight ahead in still water [m/s]."""
     hull, share = hull_of(vehicle), angular_first(BLUEROV2_HEAVY.allocation)[3]
-    thrust_n = float(abs(share).sum() * steady_thrust_n(1.0, BLUEROV2_HEAVY.thrust_coefficients))
+    full_n = steady_thrust_n(np.ones(1), BLUEROV2_HEAVY.thrust_coefficients)[0]
+    thrust_n = float(abs(share).sum() * full_n)
     linear, quadratic = float(hull.linear_drag[3]), float(hull.quadratic_drag[3])
     return (math.sqrt(linear**2 + 4 * quadratic * thrust_n) - linear) / (2 * quadratic)
