@@ -19,6 +19,8 @@ W, H, VFOV = 160, 120, 45.0
 #: In a process of its own: pyrender closes MuJoCo's display with its own. Without samples: their mean shifts the depth.
 PYRENDER = """
 import sys
+import pyglet
+pyglet.options["headless"] = True
 import numpy as np, pyrender, pyrender.renderer as inner, trimesh
 several = inner.glRenderbufferStorageMultisample
 inner.glRenderbufferStorageMultisample = lambda target, samples, *rest: several(target, 0, *rest)

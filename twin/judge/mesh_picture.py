@@ -48,6 +48,9 @@ def surface_picture(mesh_file: Path) -> Image | None:
 
 def draw(mesh: Any) -> Image:
     """A coloured trimesh in GLB's axes (y up) on white, lit from the north-west, cropped to what is drawn."""
+    import pyglet
+
+    pyglet.options["headless"] = True  # pyrender opens pyglet's windows at import: a bare machine has no X libraries
     import pyrender
 
     scene = pyrender.Scene(bg_color=WHITE)
