@@ -186,7 +186,7 @@ class Navigator:
     def _follow_chain(self, node: KeyPoint) -> Link | None:
         """Measures the motion since the last node, and lets it take the place of the F2F motion in the online position.
 
-        Two stereo pairs tell the motion ten times better than the frames between them (the paper's better start values
+        Two stereo pairs tell the motion better than the frames between them do (the paper's better start values
         for GA, section IV-5); what the navigation sensors corrected meanwhile is kept.
         """
         if not self.nodes:
