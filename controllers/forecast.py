@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.lawnmower import SurveyPlan
+from controllers.survey_plan import SurveyPlan
 
 Array = NDArray[np.float64]
 
@@ -18,27 +18,29 @@ class Forecast(NamedTuple):
 
     Args:
         n_frames_per_key: N.
-        keys_per_leg: M.
+        keys_per_swath: M, of a leg or a loop.
         n_tracks: L.
         n_keys, n_frames: in all, without station keeping.
         duration_s, path_m: of the whole flight, without station keeping.
-        footprint_m: width (across track) and height (along track) of the image.
-        key_spacing_m, leg_spacing_m: distance of neighbouring key points and legs.
-        overlap_along, overlap_across: true shares, along the image height and width.
+        speed_mps: along the swaths.
+        footprint_m: width (across the bow) and height (along it) of the image.
+        key_spacing_m, swath_spacing_m: distance of neighbouring key points; greatest one of neighbouring swaths.
+        overlap_along, overlap_across: true shares, along the sides of the image on which the pattern counts them.
         disparity_px: expected disparity.
         depth_sigma_m: expected depth noise of one stereo pair.
     """
 
     n_frames_per_key: int
-    keys_per_leg: int
+    keys_per_swath: int
     n_tracks: int
     n_keys: int
     n_frames: int
     duration_s: float
     path_m: float
+    speed_mps: float
     footprint_m: tuple[float, float]
     key_spacing_m: float
-    leg_spacing_m: float
+    swath_spacing_m: float
     overlap_along: float
     overlap_across: float
     disparity_px: float
@@ -51,23 +53,22 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     With d = f b / Z the depth noise is sigma_Z = Z^2 / (f b) sigma_d.
     """
     tracks = range(1, plan.n_tracks + 1)
-    duration_s = sum(plan.track_duration_s(t) for t in tracks)
-    n_frames = round(duration_s * plan.frame_rate_hz) + 1
+    key_points = [is_key for track in tracks for _, is_key in plan.frames_of_track(track)]
     key_spacing_m = plan.n_frames_per_key * plan.speed_mps / plan.frame_rate_hz
-    width_m, height_m = plan.footprint_m
     return Forecast(
         n_frames_per_key=plan.n_frames_per_key,
-        keys_per_leg=max(1, round(plan.area_m[0] / key_spacing_m)),
+        keys_per_swath=max(1, round(plan.swath_length_m / key_spacing_m)),
         n_tracks=plan.n_tracks,
-        n_keys=(n_frames - 1) // plan.n_frames_per_key + 1,
-        n_frames=n_frames,
-        duration_s=duration_s,
+        n_keys=sum(key_points),
+        n_frames=len(key_points),
+        duration_s=sum(plan.track_duration_s(t) for t in tracks),
         path_m=sum(plan.track_length_m(t) for t in tracks),
+        speed_mps=plan.speed_mps,
         footprint_m=plan.footprint_m,
         key_spacing_m=key_spacing_m,
-        leg_spacing_m=plan.leg_spacing_m,
-        overlap_along=max(0.0, 1 - key_spacing_m / height_m),
-        overlap_across=max(0.0, 1 - plan.leg_spacing_m / width_m),
+        swath_spacing_m=plan.swath_spacing_m,
+        overlap_along=max(0.0, 1 - key_spacing_m / plan.side_along_m),
+        overlap_across=max(0.0, 1 - plan.swath_spacing_m / plan.side_across_m),
         disparity_px=plan.focal_px * baseline_m / plan.altitude_m,
         depth_sigma_m=plan.altitude_m**2 / (plan.focal_px * baseline_m) * disparity_sigma_px,
     )
@@ -89,20 +90,23 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """How close the planned path comes to the floor under the camera's footprint.
+    """How close the planned path comes to the floor under the camera's footprint, and between swaths.
 
     Args:
         height_at: height of the floor [m] at arrays of x and y [m]; NaN where there is no floor. Floors are rectangles,
-            so that the corners of the path tell whether all of it lies inside.
+            so that the waypoints tell whether all of the path lies inside.
         sample_m: spacing of the heights looked at.
     """
-    corners = np.concatenate([plan.waypoints(t) for t in range(1, plan.n_tracks + 1)])[:, :2]
-    reach = np.array(plan.footprint_m[::-1]) / 2  # the image height lies along x
-    low, high = corners.min(axis=0) - reach, corners.max(axis=0) + reach
-    x, y = (np.linspace(a, b, round((b - a) / sample_m) + 2) for a, b in zip(low, high, strict=True))
+    path = plan.outline()[:, :2]
+    along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along x
+    south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
     # row by row: a large floor at fine spacing would fill the memory
-    rows = (np.nan_to_num(height_at(x, np.full_like(x, row_y)), nan=-np.inf) for row_y in y)
-    tops = [(float(row.max()), float(x[row.argmax()])) for row in rows]
-    k = max(range(len(tops)), key=lambda i: tops[i][0])
-    inside = bool(np.isfinite(height_at(*corners.T)).all())
-    return Clearance(plan.altitude_m - tops[k][0], tops[k][1], float(y[k]), inside)
+    tops = []
+    for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
+        near = path[np.abs(path[:, 1] - y) <= across_m + 1e-9, 0]
+        west, east = near.min() - along_m, near.max() + along_m
+        x = np.linspace(west, east, round((east - west) / sample_m) + 2)
+        row = np.nan_to_num(height_at(x, np.full_like(x, y)), nan=-np.inf)
+        tops.append((float(row.max()), float(x[row.argmax()]), float(y)))
+    height, x, y = max(tops)
+    return Clearance(plan.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*path.T)).all()))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.allocation import Allocation
-from controllers.lawnmower import Reference
+from controllers.segments import Reference
 
 Array = NDArray[np.float64]
 
@@ -63,6 +63,11 @@ def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
     forward, left, up = lever_arm_m
     offset = np.array([c * forward - s * left, s * forward + c * left, up])
     return camera._replace(position=camera.position - offset)
+
+
+def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
+    """Velocity (3,) [m/s] that takes a point to its reference: along with it, and back to it in a time 1 / w."""
+    return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
 class Pilot:

@@ -13,7 +13,7 @@ from twin.scenario_file import dump_toml, load_scenario
 PLAN_KEYS = "pattern, area_m, altitude_m, speed_mps, overlap_along, overlap_across, tracks, clearance_m"
 TOP_KEYS = (
     "name, seed, terrain, vehicle, rig, imaging, water, lamps, sun, current, navigation, plan, control, estimate, "
-    "map, require"
+    "map, beacons, require"
 )
 
 BAD_FILES = [
@@ -42,6 +42,10 @@ BAD_FILES = [
     ('[rig]\nbaseline_m = "wide"', ["2: rig.baseline_m: 'wide': not allowed (allowed: a number)"]),
     ("[estimate]\nuse_f2m = 2", ["2: estimate.use_f2m: 2: not allowed (allowed: true or false)"]),
     ("[plan]\nspeed_mps = nan", ["2: plan.speed_mps: nan: not allowed (allowed: a finite number)"]),
+    (
+        '[plan]\npattern = "spiral"',
+        ["2: plan.pattern: 'spiral': not allowed (allowed: 'lawnmower' or 'loops')"],
+    ),
     ("[plan]\narea_m = [0.0, 2.0]", ["2: plan.area_m.0: 0.0: not allowed (allowed: greater than 0)"]),
     ("plan = 3", ["1: plan: 3: not allowed (allowed: a section)"]),
     ("lamps = 3", ["1: lamps: 3: not allowed (allowed: a list)"]),
@@ -52,7 +56,23 @@ BAD_FILES = [
     ),
     (
         '[navigation]\naiding = ["pressure", "sonar"]',
-        ["2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure' or 'ahrs')"],
+        ["2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure', 'ahrs', 'dvl', 'usbl' or 'beacons')"],
+    ),
+    ("[navigation]\nusbl_interval_s = 0", ["2: navigation.usbl_interval_s: 0: not allowed (allowed: greater than 0)"]),
+    (
+        "[navigation]\ndvl_sigma_mps = 0.0\ndvl_scale_sigma = 0.2",
+        [
+            "2: navigation.dvl_sigma_mps: 0.0: not allowed (allowed: greater than 0)",
+            "3: navigation.dvl_scale_sigma: 0.2: not allowed (allowed: less than or equal to 0.1)",
+        ],
+    ),
+    (
+        "[[beacons]]\nposition_m = [0, 0, 1]\n[[beacons]]\nposition_m = [0, nan, 1]\n[[beacons]]\ncolour = 3",
+        [
+            "4: beacons.1.position_m.1: nan: not allowed (allowed: a finite number)",
+            "5: beacons.2.position_m: missing (allowed: a value must be given)",
+            "6: beacons.2.colour: unknown key (allowed: position_m)",
+        ],
     ),
     (
         '[water]\njerlov = "X"',
@@ -70,6 +90,8 @@ BAD_FILES = [
     ('extends = "bad.toml"', ["1: extends: the file extends itself (allowed: another file)"]),
     ('name = "a"\nseed = = 1', ["2: not TOML: Invalid value (at line 2, column 8)"]),
 ]
+
+SCENES = sorted(file.stem for file in (Path(__file__).parent.parent / "scenes").glob("*.toml"))
 
 BAD_OVERRIDES = [
     ("plan.tracks", "--set plan.tracks: not of the form key=value (for instance plan.tracks=2)"),
@@ -108,8 +130,7 @@ def test_a_missing_scenario_is_told_with_the_names_there_are():
     with pytest.raises(ScenarioError) as told:
         load_scenario("quikstart")
     assert told.value.lines == [
-        "quikstart: no such scenario (did you mean quickstart?)"
-        " (allowed: a file, or one of horseshoe, paper, quickstart)"
+        f"quikstart: no such scenario (did you mean quickstart?) (allowed: a file, or one of {', '.join(SCENES)})"
     ]
 
 
@@ -129,7 +150,7 @@ def test_faults_found_later_are_told_by_the_line_of_their_key_or_of_its_section(
     assert source.fault(TwinError("plan.tracks", "no")) == "--set: plan.tracks: no"
 
 
-@pytest.mark.parametrize("name", ["quickstart", "paper", "horseshoe"])
+@pytest.mark.parametrize("name", SCENES)
 def test_the_scenes_survive_a_round_trip_through_toml(tmp_path, name):
     scenario = load_scenario(name)
     again = load_scenario(written(tmp_path, dump_toml(scenario)))
@@ -142,10 +163,13 @@ def test_the_scenes_survive_a_round_trip_through_toml(tmp_path, name):
     seed=st.integers(0, 2**32 - 1),
     tilt=st.floats(-90, 90),
     drag=st.floats(0.05, 20),
-    aiding=st.lists(st.sampled_from(["pressure", "ahrs"]), max_size=2),
+    aiding=st.lists(st.sampled_from(["pressure", "ahrs", "dvl", "usbl", "beacons"]), max_size=5),
+    beacons=st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), max_size=3),
     limit=st.floats(1e-9, 1e9),
 )
-def test_any_scenario_survives_a_round_trip_through_toml(tmp_path_factory, name, seed, tilt, drag, aiding, limit):
+def test_any_scenario_survives_a_round_trip_through_toml(
+    tmp_path_factory, name, seed, tilt, drag, aiding, beacons, limit
+):
     scenario = Scenario.model_validate(
         {
             "name": name,
@@ -153,6 +177,7 @@ def test_any_scenario_survives_a_round_trip_through_toml(tmp_path_factory, name,
             "vehicle": {"drag_factor": drag},
             "lamps": [{"position_m": (0.1, -0.2, 0.0), "tilt_deg": tilt}, {"position_m": (1, 2, 3)}],
             "navigation": {"aiding": aiding},
+            "beacons": [{"position_m": position} for position in beacons],
             "require": {"map.le90_m": limit},
         }
     )

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 
+from controllers import lawnmower
 from controllers.forecast import forecast, least_clearance
-from controllers.lawnmower import PlanFault, plan
+from controllers.survey_plan import PlanFault, SurveyRequest
 
 PAPER = {
     "area_m": (30.48, 30.48),
@@ -22,13 +23,17 @@ PAPER = {
 SMALL = PAPER | {"area_m": (4.0, 3.0), "altitude_m": 2.0, "speed_mps": 0.3, "tracks": 0}
 
 
+def plan(**request):
+    return lawnmower.plan(SurveyRequest(**request))
+
+
 def test_the_paper_mission_has_the_papers_numbers():
     numbers = forecast(plan(**PAPER), baseline_m=0.3048, disparity_sigma_px=0.2)
     assert numbers.n_frames_per_key == 15
     assert numbers.n_tracks == 25
-    assert 0.60 < numbers.leg_spacing_m < 0.63  # 2 ft
-    assert numbers.keys_per_leg == 100
-    assert numbers.n_tracks == pytest.approx(numbers.keys_per_leg / 4, abs=1)  # L = M/4
+    assert 0.60 < numbers.swath_spacing_m < 0.63  # 2 ft
+    assert numbers.keys_per_swath == 100
+    assert numbers.n_tracks == pytest.approx(numbers.keys_per_swath / 4, abs=1)  # L = M/4
     assert 25 * 204 == pytest.approx(numbers.n_keys, rel=0.12)  # ours also stops at every corner
     assert numbers.disparity_px == pytest.approx(686.24 * 0.3048 / 3.353, rel=1e-4)
     assert numbers.depth_sigma_m == pytest.approx(3.353 / numbers.disparity_px * 0.2)
@@ -57,7 +62,7 @@ def test_fewer_tracks_are_the_first_ones_of_the_whole_survey():
 
 def test_the_survey_starts_in_the_south_west_and_its_tracks_join():
     p = plan(**SMALL)
-    np.testing.assert_allclose(p.waypoints(1)[0], [-2, -1.5 + p.leg_spacing_m / 2, 2.0])
+    np.testing.assert_allclose(p.waypoints(1)[0], [-2, -1.5 + p.swath_spacing_m / 2, 2.0])
     assert p.reference(1, 1.0).velocity[0] > 0
     for track in range(1, p.n_tracks):
         end = p.reference(track, p.track_duration_s(track))

@@ -7,14 +7,16 @@ import pytest
 from physics_world import bare_world
 
 from controllers.allocation import allocation
-from controllers.lawnmower import Reference, plan
-from controllers.tracking import body_reference
+from controllers.lawnmower import plan
+from controllers.segments import Reference
+from controllers.survey_plan import SurveyRequest
+from controllers.tracking import body_reference, commanded_velocity
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin import config, geometry
-from twin.simulate.autopilot import nominal_pilot
+from twin.simulate.autopilot import nominal_pilot, top_speed_mps
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
-from twin.simulate.vehicle import Vehicle
+from twin.simulate.vehicle import Vehicle, hull_of
 
 RATE_HZ = 30.0
 LEVER_M = np.array([0.0, 0.075, -0.15])
@@ -31,7 +33,7 @@ SHARES = allocation(EFFECTS, thrust_of)
 def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors):
     """Flies a small survey on the true state plus noise; errors of position (n, 3) [m] and attitude (n, 3) [deg]."""
     rng = np.random.default_rng(seed)
-    p = plan((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ)
+    p = plan(SurveyRequest((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ))
     start = body_reference(p.reference(1, 0.0), LEVER_M).position
     section = config.Vehicle(**factors)
     rov = Vehicle(bare_world(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
@@ -132,6 +134,22 @@ def test_body_and_camera_references_differ_by_the_lever_arm_turned_to_the_headin
     body = body_reference(camera, LEVER_M)
     pose = geometry.pose(geometry.rotation_from_rpy(0, 0, 0.7), body.position)
     np.testing.assert_allclose(geometry.transform(pose, LEVER_M[None])[0], camera.position, atol=1e-12)
+
+
+@pytest.mark.parametrize("bearing_deg", [0.0, 30.0, 45.0, 90.0, 200.0])
+def test_at_top_speed_in_any_direction_drag_takes_all_that_one_thruster_gives(bearing_deg):
+    bearing = np.deg2rad(bearing_deg)
+    direction = np.array([np.cos(bearing), np.sin(bearing), 0.0])
+    hull = hull_of(config.Vehicle())
+    velocity = top_speed_mps(config.Vehicle(), direction) * direction
+    drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
+    thrusts = np.linalg.pinv(EFFECTS) @ [0, 0, 0, *drag]
+    assert np.abs(thrusts).max() == pytest.approx(thrust_of(np.ones(1))[0])
+
+
+def test_a_commanded_velocity_follows_the_reference_and_closes_the_gap():
+    reference = Reference(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.0, 0.0]), 0.0, np.zeros(3))
+    np.testing.assert_allclose(commanded_velocity(np.array([1.0, 1.5, 3.0]), reference, 1.2), [0.3, 0.6, 0.0])
 
 
 def test_while_thrusters_saturate_the_integral_does_not_wind_up():

@@ -52,26 +52,29 @@ def test_frame_motion_is_exact_for_finite_motion_and_ignores_outliers():
     np.testing.assert_allclose(found.a_from_b, true, atol=1e-6)
 
 
+def pair_motion(a, b, sigma, guess):
+    cov = np.tile(np.diag(sigma**2), (len(a), 1, 1))
+    return motion.pair_motion(a, b, cov, cov, BASELINE_M, guess)
+
+
 def test_too_few_points_are_a_status_not_a_motion():
     points = floor_points(np.random.default_rng(3), 8)
     assert motion.frame_motion(points, points[:, :2] / points[:, 2:], np.eye(4)) is None
     a, b = seen(points, np.eye(4))
-    assert motion.pair_motion(a, b, np.eye(3) * 1e-6, BASELINE_M, np.eye(4)) is None
+    assert pair_motion(a, b, np.full(3, 1e-3), np.eye(4)) is None
 
 
 def test_transfer_derivatives_agree_with_finite_differences():
     rng = np.random.default_rng(4)
     a_from_b = geometry.exp(rng.normal(size=6) * 0.1)
     b = seen(floor_points(rng, 5), a_from_b)[1]
-    _, by_point, by_motion = motion._transfer(b, a_from_b, BASELINE_M)
+    _, by_point, by_motion = motion.transfer(b, a_from_b, BASELINE_M)
     step = 1e-6
     for k in range(3):
-        up, down = (motion._transfer(b + s * np.eye(3)[k], a_from_b, BASELINE_M)[0] for s in (step, -step))
+        up, down = (motion.transfer(b + s * np.eye(3)[k], a_from_b, BASELINE_M)[0] for s in (step, -step))
         np.testing.assert_allclose(by_point[:, :, k], (up - down) / (2 * step), atol=1e-7)
     for k in range(6):
-        up, down = (
-            motion._transfer(b, a_from_b @ geometry.exp(s * np.eye(6)[k]), BASELINE_M)[0] for s in (step, -step)
-        )
+        up, down = (motion.transfer(b, a_from_b @ geometry.exp(s * np.eye(6)[k]), BASELINE_M)[0] for s in (step, -step))
         np.testing.assert_allclose(by_motion[:, :, k], (up - down) / (2 * step), atol=1e-7)
 
 
@@ -83,7 +86,7 @@ def test_pair_motion_has_a_true_covariance_and_no_bias():
     nees, errors = [], []
     for _ in range(150):
         a, b = (z + rng.normal(size=z.shape) * sigma for z in seen(floor_points(rng, 120), true))
-        found = motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true @ geometry.exp(rng.normal(size=6) * 0.01))
+        found = pair_motion(a, b, sigma, true @ geometry.exp(rng.normal(size=6) * 0.01))
         assert found is not None
         error = geometry.log(geometry.inverse(true) @ found.a_from_b)
         errors.append(error)
@@ -104,7 +107,7 @@ def test_depth_taken_as_exact_is_biased_where_structure_and_motion_together_are_
         points = np.column_stack([a[:, :2], np.ones(len(a))]) * BASELINE_M / a[:, 2:]
         first, second = (
             motion.frame_motion(points, b[:, :2], true),
-            motion.pair_motion(a, b, np.diag(sigma**2), BASELINE_M, true),
+            pair_motion(a, b, sigma, true),
         )
         assert first is not None and second is not None
         naive.append(first.a_from_b[0, 3] - 0.4)

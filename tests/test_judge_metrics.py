@@ -154,6 +154,46 @@ def test_overlap_is_lost_where_the_floor_rises():
     assert raised["along_median"] < low["along_median"] - 0.05
 
 
+def diagonal_swaths(apart_m):
+    """A survey of two straight swaths to the north-east over a flat floor, beside each other; its truth and result."""
+    n, ahead, abeam = 21, np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([-1.0, 1.0, 0.0]) / np.sqrt(2)
+    first = np.outer(np.arange(n) * 0.1, ahead) + [0, 0, 2.2]
+    reference = np.concatenate([first, first + apart_m * abeam])
+    poses = np.tile(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), (2 * n, 1, 1))
+    poses[:, :3, 3] = reference
+    truth = dataclasses.replace(
+        TRUTH, trajectory=Trajectory(np.arange(2 * n) * 1.0, poses), reference=reference,
+        track=np.repeat([1, 2], n), height_m=np.full_like(TRUTH.height_m, 0.2),
+    )  # fmt: skip
+    return truth, dataclasses.replace(RESULT, key_frames=np.arange(2 * n), track_of_key=truth.track)
+
+
+def test_overlap_of_loops_is_counted_square_to_their_travel_in_any_direction():
+    truth, result = diagonal_swaths(0.3)
+    figures = overlap_metrics(result, truth, RIG, None, {"pattern": "loops"})
+    length, width = RIG.height_px * 2.0 / RIG.focal_px, RIG.width_px * 2.0 / RIG.focal_px
+
+    def shared(step):
+        return (1 - step / np.sqrt(2) / length) * (1 - step / np.sqrt(2) / width)
+
+    assert figures["across_median"] == pytest.approx(shared(0.3), abs=1e-6)
+    assert figures["along_median"] == pytest.approx(shared(0.1), abs=1e-6)
+
+
+def test_the_far_end_of_a_track_is_where_it_is_planned_farthest_from_the_start():
+    poses = TRUTH.trajectory.world_from_camera.copy()
+    away = np.linalg.norm(TRUTH.reference - TRUTH.reference[0], axis=1)
+    for track, error in ((1, 0.03), (2, 0.07)):
+        here = TRUTH.track == track
+        far = here & (away >= 0.9 * away[here].max())
+        poses[far, 1, 3] += error
+        poses[here & ~far, 1, 3] += 1.0
+    poses[0] = TRUTH.trajectory.world_from_camera[0]  # the anchor
+    result = dataclasses.replace(RESULT, final=Trajectory(TRUTH.trajectory.times_s, poses))
+    rows = evaluated(result, ELEVATION, TRUTH, RIG)["tracks"]
+    assert [row["farthest_error_m"] for row in rows] == pytest.approx([0.03, 0.07])
+
+
 def test_requirements_bound_errors_from_above_and_quality_from_below():
     metrics = evaluate(
         RESULT, ELEVATION, TRUTH, RIG, {}, {}, {}, {"map.le90_m": 0.05, "map.completeness": 1.0, "map.max_m": 1e-9}

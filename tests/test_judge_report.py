@@ -53,6 +53,8 @@ def test_the_report_tells_the_figures_of_metrics_json(folder):
     assert "The survey is complete" in page and "Jerlov type IB" in page
     for value in (metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"], metrics["map"]["nmad_m"]):
         assert wording.length(value) in page
+    for row in metrics["tracks"]:
+        assert f"<td>{wording.length(row['farthest_error_m'])}</td>" in page
     assert '<td class="good">passed</td>' in page.replace("\n", "")
     for section in "plan_view path_errors tracks elevation error histogram mosaic samples network timing".split():
         assert f'<section id="{section}">' in page, section

@@ -1,13 +1,17 @@
 """Thrusters lag as their transfer function says; sensors err as their data sheet says."""
 
+import pickle
+
+import cv2
 import numpy as np
 import pytest
 from scipy import signal
 
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin import geometry
-from twin.records import SensorNoise
-from twin.simulate.sensors import read_sensors
+from twin.config import Navigation
+from twin.records import SensorNoise, StereoRig
+from twin.simulate.sensors import AcousticFix, DopplerLog, NavigationSensors, read_sensors, sight_beacons
 from twin.simulate.thrusters import LaggedThrusters, steady_thrust_n
 
 NOISE = SensorNoise(pressure_m=0.02, attitude_rad=0.003, heading_rad=0.01)
@@ -63,3 +67,93 @@ def test_a_draw_does_not_depend_on_what_is_listed():
     np.testing.assert_array_equal(both.ahrs_rpy_rad, ahrs.ahrs_rpy_rad)
     assert pressure.ahrs_rpy_rad is None and ahrs.pressure_z_m is None
     assert none.pressure_z_m is None and none.ahrs_rpy_rad is None
+
+
+RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, CAMERA)
+LEVEL = geometry.pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
+POSE_ABOVE = LEVEL @ CAMERA
+SURVEYED = ((1.2, 2.3, 0.5), (0.7, 1.6, 0.4), (9.0, 2.0, 0.4))  # the last one lies beside the image
+BEACONS = SensorNoise(0.02, 0.003, 0.01, beacon_px=0.3, beacons_m=SURVEYED)
+CLEAR = np.full((240, 320), 10.0, np.float32)
+
+
+def test_the_doppler_log_scatters_about_the_velocity_times_one_scale_for_the_survey():
+    noise, velocity, n = SensorNoise(0.02, 0.003, 0.01, dvl_mps=0.01, dvl_scale=0.05), np.array([0.4, -0.2, 0.1]), 2000
+    log = DopplerLog(noise, np.random.default_rng(0))
+    early, late = (np.array([log.read(velocity) for _ in range(n)]) for _ in range(2))
+    # 4 standard errors of a standard deviation, and of the difference of two means
+    assert np.all(np.abs(early.std(axis=0) / 0.01 - 1) < 4 / np.sqrt(2 * n))
+    assert np.abs(np.corrcoef(early.T) - np.eye(3)).max() < 4 / np.sqrt(n)
+    assert np.all(np.abs(early.mean(axis=0) - late.mean(axis=0)) < 4 * 0.01 * np.sqrt(2 / n))
+    silent = SensorNoise(0.02, 0.003, 0.01, dvl_mps=1e-12, dvl_scale=0.05)
+    ratios = np.array([DopplerLog(silent, np.random.default_rng(k)).read(velocity) / velocity for k in range(n)])
+    assert np.ptp(ratios, axis=1).max() < 1e-9  # all axes alike
+    assert abs(ratios.mean() - 1) < 4 * 0.05 / np.sqrt(n)
+    assert abs(ratios[:, 0].std() / 0.05 - 1) < 4 / np.sqrt(2 * n)
+
+
+def test_acoustic_fixes_scatter_about_the_camera_and_come_no_sooner_than_their_interval():
+    noise, position = SensorNoise(0.02, 0.003, 0.01, usbl_m=0.5), np.array([3.0, -4.0, 2.0])
+    usbl, times = AcousticFix(noise, 1.0, np.random.default_rng(1)), np.arange(8000) * 0.4
+    fixes = [usbl.read(time_s, position) for time_s in times]
+    taken = np.array([fix is not None for fix in fixes])
+    np.testing.assert_allclose(np.diff(times[taken]), 1.2)  # the first key point at or after 1 s
+    errors = np.array([fix for fix in fixes if fix is not None]) - position
+    n = len(errors)
+    assert np.all(np.abs(errors.mean(axis=0)) < 4 * 0.5 / np.sqrt(n))
+    assert np.all(np.abs(errors.std(axis=0) / 0.5 - 1) < 4 / np.sqrt(2 * n))
+
+
+def test_beacons_are_seen_where_opencv_projects_them_but_for_their_noise():
+    rng, n = np.random.default_rng(2), 2000
+    world_from_camera = POSE_ABOVE @ geometry.exp(np.array([0.03, -0.05, 0.4, 0.1, 0.05, 0.0]))
+    camera_from_world = geometry.inverse(world_from_camera)
+    rotation = cv2.Rodrigues(camera_from_world[:3, :3])[0]
+    expected = cv2.projectPoints(np.array(SURVEYED), rotation, camera_from_world[:3, 3], RIG.matrix, None)[0][:2, 0]
+    sightings = [sight_beacons(world_from_camera, CLEAR, RIG, BEACONS, rng) for _ in range(n)]
+    assert {tuple(s.beacon for s in sighting) for sighting in sightings} == {(0, 1)}
+    errors = np.array([[s.pixel for s in sighting] for sighting in sightings]) - expected
+    assert np.all(np.abs(errors.mean(axis=0)) < 4 * 0.3 / np.sqrt(n))
+    assert np.all(np.abs(errors.std(axis=0) / 0.3 - 1) < 4 / np.sqrt(2 * n))
+
+
+def test_what_stands_before_a_beacon_hides_it():
+    rng = np.random.default_rng(0)
+    half = CLEAR.copy()
+    half[:, :160] = 2.0  # the cameras fly at 2.85 m, beacon 0 lies at 2.35 m depth on this side of the image
+    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG, BEACONS, rng)] == [1]
+    half[:, :160] = 2.35  # the floor that it stands on does not
+    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG, BEACONS, rng)] == [0, 1]
+
+
+def readings_of(aiding, n=40):
+    """Readings of a vehicle in one place, a key point each fifth frame."""
+    streams = zip(("navigation", "dvl", "usbl", "beacons"), np.random.SeedSequence(5).spawn(4), strict=True)
+    rng = {name: np.random.default_rng(seed) for name, seed in streams}
+    sensors = NavigationSensors(Navigation(aiding=tuple(aiding)), BEACONS, RIG, rng)
+    twist = np.array([0, 0, 0, 0.3, 0.0, 0.0])
+    return [sensors.read(k / 30, LEVEL, twist, CLEAR if k % 5 == 0 else None) for k in range(n)]
+
+
+SENSORS = {
+    "pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m", "beacons": "beacons",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_says_the_same_whatever_else_is_listed_and_nothing_where_it_is_not(name):
+    everything, alone, others = readings_of(SENSORS), readings_of((name,)), readings_of(set(SENSORS) - {name})
+    said = [getattr(r, SENSORS[name]) for r in everything]
+    assert any(value is not None for value in said)
+    for one, value, other in zip(alone, said, others, strict=True):
+        assert pickle.dumps(getattr(one, SENSORS[name])) == pickle.dumps(
+            value
+        )  # numbers, arrays, sightings: to the bit
+        assert getattr(other, SENSORS[name]) is None
+        assert all(getattr(one, field) is None for other_name, field in SENSORS.items() if other_name != name)
+
+
+def test_fixes_and_sightings_come_with_key_points():
+    readings = readings_of(SENSORS)
+    assert [k for k, r in enumerate(readings) if r.usbl_m is not None] == [0, 30]
+    assert [k for k, r in enumerate(readings) if r.beacons is not None] == list(range(0, 40, 5))

@@ -106,7 +106,9 @@ def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path
 
 def test_frames_carry_nothing_but_images_time_and_readings():
     assert set(records.Frame.__dataclass_fields__) == {"index", "time_s", "left", "right", "readings"}
-    assert set(records.Readings.__dataclass_fields__) == {"pressure_z_m", "ahrs_rpy_rad"}
+    assert set(records.Readings.__dataclass_fields__) == {
+        "pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", "beacons",
+    }  # fmt: skip
 
 
 def test_sensors_that_do_not_aid_do_not_reach_the_estimators(tmp_path):
@@ -114,7 +116,28 @@ def test_sensors_that_do_not_aid_do_not_reach_the_estimators(tmp_path):
     mission = prepare(scenario)
     with sea.Sea(mission, Stopwatch()) as world:
         readings = world.observe(next(mission.fly(1)), 1).readings
-    assert readings == records.Readings(None, None)
+    assert readings == records.Readings()
+
+
+def test_every_aid_reaches_position_and_alignment(tmp_path):
+    aids = [
+        'navigation.aiding=["dvl", "usbl", "beacons"]',
+        "navigation.usbl_sigma_m=0.0001",
+        "navigation.usbl_interval_s=0.01",
+        "beacons=[{position_m=[0.0, 0.0, 0.8]}]",
+    ]
+    mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
+    navigator, estimates = survey.make_navigator(mission, tmp_path, Stopwatch()), []
+    with sea.Sea(mission, Stopwatch()) as world:
+        survey.fly(mission, world, navigator, lambda _, estimate, __: estimates.append(estimate))
+        true = world.truth().trajectory
+    result = navigator.finish()
+    assert [node.walked is not None for node in navigator.nodes] == [False] + [True] * (len(navigator.nodes) - 1)
+    assert sum(len(node.readings.beacons) for node in navigator.nodes) > 3
+    sigma_m = [estimates[row].sigma_m for row in result.key_frames]
+    assert max(sigma_m) < np.sqrt(3) * 1.01e-4  # no worse than the fix just taken
+    for path in (result.online, result.final):
+        assert np.sqrt(((path.positions - true.positions) ** 2).sum(axis=1).mean()) < 4e-3
 
 
 @pytest.mark.parametrize("key", ["estimate.use_ga", "estimate.use_f2m"])

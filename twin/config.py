@@ -15,7 +15,7 @@ from twin.errors import TwinError
 from twin.records import SensorNoise, StereoRig
 
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
-AIDING = Literal["pressure", "ahrs"]
+AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
 Vector3 = tuple[float, float, float]
 Metres = Annotated[float, Field(gt=0)]
 
@@ -65,6 +65,11 @@ class Terrain(Section):
 class Vehicle(Section):
     """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); drag factors let a study vary it."""
 
+    dynamics: Literal["rigid", "kinematic"] = Field(
+        default="rigid",
+        description="a hull under thrust, drag and current; or a carrier that moves level, at constant height and at "
+        "exactly the commanded velocity, without any of them",
+    )
     buoyancy_n: float = Field(
         default=1.0, ge=-20, le=20, description="net buoyancy after trimming, positive floats [N]"
     )
@@ -137,22 +142,50 @@ class Navigation(Section):
     pressure_sigma_m: float = Field(default=0.01, gt=0, le=10, description="noise of height by pressure [m]")
     attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30, description="noise of roll and pitch [deg]")
     heading_sigma_deg: float = Field(default=0.5, gt=0, le=90, description="noise of heading [deg]")
+    dvl_sigma_mps: float = Field(
+        default=SensorNoise.dvl_mps, gt=0, le=10, description="noise of each axis of the velocity over ground [m/s]"
+    )
+    dvl_scale_sigma: float = Field(
+        default=SensorNoise.dvl_scale, gt=0, le=0.1, description="scale error of that velocity, drawn once a survey"
+    )
+    usbl_sigma_m: float = Field(
+        default=SensorNoise.usbl_m, gt=0, le=100, description="noise of each axis of an acoustic position fix [m]"
+    )
+    usbl_interval_s: float = Field(
+        default=1.0, gt=0, le=3600, description="least time between acoustic fixes, each taken at a key point [s]"
+    )
+    beacon_sigma_px: float = Field(
+        default=SensorNoise.beacon_px, gt=0, le=50, description="noise of a beacon's column and row in the image [px]"
+    )
+
+
+class Beacon(Section):
+    """A small light at a surveyed position."""
+
+    position_m: Vector3 = Field(description="in the world: east, north, up [m]")
 
 
 class Plan(Section):
-    """The lawnmower survey (Negahdaripour & Madjidi 2003, section III-A)."""
+    """The survey to fly (Negahdaripour & Madjidi 2003, sections III and III-A)."""
 
-    pattern: Literal["lawnmower"] = "lawnmower"
+    pattern: Literal["lawnmower", "loops"] = Field(
+        default="lawnmower", description="parallel legs, or loops that cross at the start in the middle of a disc"
+    )
     area_m: tuple[Metres, Metres] = Field(
-        default=(4.0, 2.0), description="extent along x (the legs) and y, centred [m]"
+        default=(4.0, 2.0),
+        description="extent along x (the legs) and y, centred; of loops both are the diameter of the disc [m]",
     )
     altitude_m: float = Field(
         default=2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
     )
-    speed_mps: float = Field(default=0.25, gt=0.01, le=2, description="speed along the legs [m/s]")
+    speed_mps: float = Field(
+        default=0.25, gt=0.01, le=2, description="speed along legs and loops; on tight loops less [m/s]"
+    )
     overlap_along: float = Field(default=0.9, gt=0, lt=1, description="overlap of consecutive key points")
     overlap_across: float = Field(default=0.8, gt=0, lt=1, description="overlap of neighbouring swaths")
-    tracks: int = Field(default=0, ge=0, le=1000, description="tracks to fly (two legs each); 0 fills the area")
+    tracks: int = Field(
+        default=0, ge=0, le=1000, description="tracks to fly (two legs or a loop each); 0 fills the area"
+    )
     clearance_m: float = Field(default=0.3, ge=0, le=10, description="least distance of the cameras to the floor [m]")
 
 
@@ -223,6 +256,7 @@ class Scenario(Section):
     control: Control = Control()
     estimate: Estimation = Estimation()
     map: Mapping = Mapping()
+    beacons: tuple[Beacon, ...] = ()
     require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
@@ -248,12 +282,17 @@ class Scenario(Section):
         )
 
     def believed_noise(self) -> SensorNoise:
-        """The navigation sensors' data sheet as the estimators know it."""
+        """The navigation sensors' data sheet and the survey of the beacons as the estimators know them."""
         navigation = self.navigation
         return SensorNoise(
             navigation.pressure_sigma_m,
             float(np.deg2rad(navigation.attitude_sigma_deg)),
             float(np.deg2rad(navigation.heading_sigma_deg)),
+            navigation.dvl_sigma_mps,
+            navigation.dvl_scale_sigma,
+            navigation.usbl_sigma_m,
+            navigation.beacon_sigma_px,
+            tuple(beacon.position_m for beacon in self.beacons),
         )
 
     def fingerprint(self) -> str:

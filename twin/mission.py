@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 import terrains
-from controllers import lawnmower
+from controllers import lawnmower, loops, segments
 from controllers.forecast import least_clearance
+from controllers.survey_plan import PlanFault, SurveyPlan, SurveyRequest
 from twin import geometry
-from twin.config import Scenario, Source
+from twin.config import Beacon, Scenario, Source
 from twin.errors import ScenarioError, TwinError
 from twin.geometry import Array
 from twin.judge.metrics import check_require
@@ -23,7 +24,7 @@ from twin.simulate.autopilot import top_speed_mps
 class Step(NamedTuple):
     """One frame of the survey: where the left camera shall be, whether it is a key point, whether it keeps station."""
 
-    reference: lawnmower.Reference
+    reference: segments.Reference
     key_point: bool
     holding: bool
 
@@ -34,7 +35,7 @@ class Mission:
 
     scenario: Scenario
     terrain: terrains.Terrain
-    plan: lawnmower.SurveyPlan
+    plan: SurveyPlan
     rig: StereoRig
     grid: MapGrid
 
@@ -45,10 +46,8 @@ class Mission:
 
     def fly(self, track: int) -> Iterator[Step]:
         """The frames of a track (from 1); every N-th is a key point, and the last one."""
-        n = round(self.plan.track_duration_s(track) * self.plan.frame_rate_hz)
-        for k in range(n + 1):
-            key_point = k % self.plan.n_frames_per_key == 0 or k == n
-            yield Step(self.plan.reference(track, k / self.plan.frame_rate_hz), key_point, False)
+        for time_s, key_point in self.plan.frames_of_track(track):
+            yield Step(self.plan.reference(track, time_s), key_point, False)
 
     def hold(self, track: int) -> Iterator[Step]:
         """The frames of half the station keeping after a track."""
@@ -78,7 +77,12 @@ def prepare(scenario: Scenario) -> Mission:
     terrain = _attempt(lambda: load_terrain(scenario), source, faults)
     plan = _attempt(lambda: make_plan(scenario), source, faults)
     _attempt(lambda: _check_speed(scenario), source, faults)
+    _attempt(lambda: _check_current(scenario), source, faults)
     _attempt(lambda: check_require(scenario.require), source, faults)
+    _attempt(lambda: _check_beacons_listed(scenario), source, faults)
+    if terrain is not None:
+        for k, beacon in enumerate(scenario.beacons):
+            _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, faults)
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
     if faults or terrain is None or plan is None:
@@ -90,7 +94,7 @@ def _attempt(build, source: Source, faults: list[str]):
     """What `build` returns, or None with its fault told."""
     try:
         return build()
-    except (terrains.TerrainFault, lawnmower.PlanFault) as fault:
+    except (terrains.TerrainFault, PlanFault) as fault:
         faults.append(source.fault(TwinError(fault.field, fault.problem, fault.allowed)))
     except TwinError as fault:
         faults.append(source.fault(fault))
@@ -112,25 +116,59 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     )
 
 
-def make_plan(scenario: Scenario) -> lawnmower.SurveyPlan:
+_PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
+
+
+def make_plan(scenario: Scenario) -> SurveyPlan:
     """The plan of the scenario."""
     p, rig = scenario.plan, scenario.believed_rig()
-    return lawnmower.plan(
+    request = SurveyRequest(
         p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
         rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz,
     )  # fmt: skip
+    return _PATTERNS[p.pattern](request)
 
 
 def _check_speed(scenario: Scenario) -> None:
-    """The vehicle can fly as fast as planned."""
-    reach = top_speed_mps(scenario.vehicle)
+    """The vehicle can fly as fast as planned: along the bow, on loops in every direction."""
+    if scenario.vehicle.dynamics == "kinematic":
+        return
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
+    directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
+    reach = min(top_speed_mps(scenario.vehicle, direction) for direction in directions)
     if scenario.plan.speed_mps > reach:
         raise TwinError(
             "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
         )
 
 
-def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: lawnmower.SurveyPlan) -> None:
+def _check_beacons_listed(scenario: Scenario) -> None:
+    """Where beacons aid, there are some."""
+    if "beacons" in scenario.navigation.aiding and not scenario.beacons:
+        raise TwinError("navigation.aiding", "'beacons': the scenario has none", "with a [[beacons]] position_m")
+
+
+def _check_beacon(number: int, beacon: Beacon, terrain: terrains.Terrain) -> None:
+    """The beacon stands on the floor or above it."""
+    x, y, z = beacon.position_m
+    floor_m = float(terrain.height_at(x, y))
+    if np.isnan(floor_m):
+        east, north = terrain.east_m, terrain.north_m
+        raise TwinError(
+            f"beacons.{number}.position_m", f"({x:g}, {y:g}) lies outside the terrain",
+            f"x {terrain.west_m:.2f} to {east:.2f}, y {terrain.south_m:.2f} to {north:.2f} m",
+        )  # fmt: skip
+    if z < floor_m:
+        raise TwinError(f"beacons.{number}.position_m", f"z {z:g} lies in the floor", f"above {floor_m:.3f} m")
+
+
+def _check_current(scenario: Scenario) -> None:
+    """A current moves a hull, not a carrier."""
+    if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
+        raise TwinError("current.velocity_mps", "moves no kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
+
+
+def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
     """The plan stays over the floor and clear of it."""
     size = terrain.size_m
     if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
@@ -151,9 +189,9 @@ def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: lawnmower.S
         )
 
 
-def _grid(scenario: Scenario, plan: lawnmower.SurveyPlan) -> MapGrid:
+def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
     """Cells that cover all that the plan can see at the reference plane, and half a metre more."""
-    corners = np.concatenate([plan.waypoints(t) for t in range(1, plan.n_tracks + 1)])[:, :2]
+    corners = plan.outline()[:, :2]
     across_m, along_m = plan.footprint_m
     margin = np.array([along_m, across_m]) / 2 + 0.5
     cell = scenario.map.cell_m

@@ -1,4 +1,4 @@
-"""From an estimate of the camera to thruster commands: the vehicle is steered by what it believes."""
+"""From an estimate of the camera to the vehicle's command: it is steered by what it believes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from controllers.lawnmower import Reference
-from controllers.tracking import body_reference
+from controllers.segments import Reference
+from controllers.tracking import body_reference, commanded_velocity
 from twin import geometry
 from twin.geometry import Array
 from twin.mission import Mission
@@ -17,8 +17,26 @@ from twin.simulate.autopilot import nominal_pilot
 _VELOCITY_SMOOTHING_S = 0.1  # frame-to-frame velocity is noisy; the hull cannot change its own faster
 
 
-def make_pilot(mission: Mission) -> Callable[[Estimate, Reference], Array]:
-    """A pilot that flies on estimates alone: (estimate of the left camera, its reference) -> thruster commands (8,)."""
+PilotOfEstimates = Callable[[Estimate, Reference], Array]
+
+
+def make_pilot(mission: Mission) -> PilotOfEstimates:
+    """A pilot that flies on estimates alone: (estimate of the left camera, its reference) -> command of the vehicle."""
+    return _rov_pilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
+
+
+def _carrier_pilot(mission: Mission) -> PilotOfEstimates:
+    """The pilot of a carrier that cannot turn, so that the camera moves as the body does: -> velocity (3,) [m/s]."""
+    frequency = mission.scenario.control.natural_frequency_radps
+
+    def command(estimate: Estimate, reference: Reference) -> Array:
+        return commanded_velocity(estimate.world_from_camera[:3, 3], reference, frequency)
+
+    return command
+
+
+def _rov_pilot(mission: Mission) -> PilotOfEstimates:
+    """The pilot of the ROV: -> thruster commands (8,), -1 to 1."""
     rig = mission.rig
     camera_from_body = geometry.inverse(rig.body_from_camera)
     to_body = geometry.adjoint(rig.body_from_camera)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Circle, Patch, Rectangle
 
 from controllers.forecast import forecast
 from twin.judge.style import COLOURS, FIGURE_STYLE, LABELS
@@ -20,24 +20,28 @@ from twin.mission import Mission
 #: Noise of disparity that good texture allows [px]; the promised depth noise is proportional to it.
 DISPARITY_SIGMA_PX = 0.1
 _SHADE_SAMPLES = 400
+#: What a swath of a pattern is called, and what a track has of it.
+_SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
 def numbers(mission: Mission) -> list[tuple[str, str]]:
     """The plan's figures in words, in the order in which they follow from each other."""
     f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     width_m, height_m = f.footprint_m
+    swath, of_track = _SWATHS[mission.scenario.plan.pattern]
     tracks = len(mission.tracks)
     hold_s = mission.scenario.control.hold_s * tracks
     return [
-        ("tracks L, two legs each", f"{tracks}"),
+        (f"tracks L, {of_track} each", f"{tracks}"),
         ("frames per key point N", f"{f.n_frames_per_key}"),
-        ("key points per leg M", f"{f.keys_per_leg}"),
+        (f"key points per {swath} M", f"{f.keys_per_swath}"),
         ("key points", f"{f.n_keys}"),
         ("frames", f"{mission.n_frames}"),
         ("time", f"{f.duration_s + hold_s:.0f} s, {hold_s:.0f} s of it keeping station"),
         ("path", length(f.path_m)),
+        ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
         ("footprint", f"{length(width_m)} across, {length(height_m)} along"),
-        ("spacing", f"{length(f.key_spacing_m)} of key points, {length(f.leg_spacing_m)} of legs"),
+        ("spacing", f"{length(f.key_spacing_m)} of key points, {length(f.swath_spacing_m)} of {swath}s"),
         ("overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("disparity", f"{f.disparity_px:.1f} px"),
         ("depth noise", f"{length(f.depth_sigma_m)} (1 sigma, for {DISPARITY_SIGMA_PX:g} px of disparity)"),
@@ -73,13 +77,19 @@ def _floor(axes: Axes, mission: Mission) -> None:
 
 
 def _path(axes: Axes, mission: Mission) -> None:
-    path = np.concatenate([mission.plan.waypoints(track) for track in mission.tracks])
+    path = mission.plan.outline()
     axes.plot(path[:, 0], path[:, 1], color=COLOURS["online"], label=f"{LABELS['reference']} path")
     axes.plot(*path[0, :2], "o", color=COLOURS["final"], label="start")
     across_m, along_m = mission.plan.footprint_m
     first_image = (path[0, 0] - along_m / 2, path[0, 1] - across_m / 2)
     style = {"fill": False, "linewidth": 1.4}
     axes.add_patch(Rectangle(first_image, along_m, across_m, ec=COLOURS["f2f"], label="one image", **style))
+    axes.add_patch(_area(mission, ec=COLOURS["limit"], ls="--", label="area", **style))
+
+
+def _area(mission: Mission, **style) -> Patch:
+    """The outline of what is to be covered."""
     area_x, area_y = mission.plan.area_m
-    corner = (-area_x / 2, -area_y / 2)
-    axes.add_patch(Rectangle(corner, area_x, area_y, ec=COLOURS["limit"], ls="--", label="area", **style))
+    if mission.scenario.plan.pattern == "loops":
+        return Circle((0, 0), area_x / 2, **style)
+    return Rectangle((-area_x / 2, -area_y / 2), area_x, area_y, **style)

@@ -52,27 +52,56 @@ class StereoRig:
         """(4, 4) pose of the right camera in the left."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
+    def project(self, points: Array) -> Array:
+        """Pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind it."""
+        depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
+        return points[:, :2] / depth_m * self.focal_px + [self.cx_px, self.cy_px]
+
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Standard deviations of the navigation sensors as their data sheets give them."""
+    """What is believed of the navigation sensors: standard deviations by their data sheets, beacons by a survey.
+
+    Args:
+        dvl_mps: white noise of each axis of velocity.
+        dvl_scale: of the scale error, one for a whole survey (the speed of sound and the beams' angles are not exact).
+        beacons_m: (x, y, z) of each beacon in the world, taken as exact.
+    """
 
     pressure_m: float
     attitude_rad: float
     heading_rad: float
+    dvl_mps: float = 0.005
+    dvl_scale: float = 0.002
+    usbl_m: float = 0.3
+    beacon_px: float = 0.2
+    beacons_m: tuple[tuple[float, float, float], ...] = ()
+
+
+class Sighting(NamedTuple):
+    """A beacon in the left image: which one of those surveyed (from 0), and its (column, row) [px]."""
+
+    beacon: int
+    pixel: tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What the navigation sensors said with this frame; None where a sensor is not fitted.
+    """What the navigation sensors said with this frame; None where a sensor is not fitted or has nothing new.
 
     Args:
         pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
         ahrs_rpy_rad: (3,) roll, pitch, yaw of the body in the world [rad].
+        dvl_mps: (3,) velocity of the body's origin over ground, in the body [m/s].
+        usbl_m: (3,) position of the left camera in the world, at some key points [m].
+        beacons: those in view, at key points.
     """
 
     pressure_z_m: float | None = None
     ahrs_rpy_rad: Array | None = None
+    dvl_mps: Array | None = None
+    usbl_m: Array | None = None
+    beacons: tuple[Sighting, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -108,5 +108,5 @@ def _judge(
         "status": "aborted" if reason else "complete",
         "reason": reason,
     }
-    plan = {"overlap_along": scenario.plan.overlap_along, "overlap_across": scenario.plan.overlap_across}
+    plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
     return evaluate(result, elevation, truth, mission.rig, plan, timing, identity, scenario.require)

@@ -55,10 +55,10 @@ def find_scene(path: str | Path) -> Path:
 def dump_toml(scenario: Scenario) -> str:
     """The scenario as TOML that `load_scenario` reads back to an equal one."""
     tree = scenario.model_dump(mode="json", exclude_none=True)
-    lamps, require = tree.pop("lamps"), tree.pop("require")
+    lists, require = {key: tree.pop(key) for key in ("lamps", "beacons")}, tree.pop("require")
     out = [f"{k} = {_toml(v)}" for k, v in tree.items() if not isinstance(v, dict)]
     sections = [(f"[{k}]", v) for k, v in tree.items() if isinstance(v, dict)]
-    sections += [("[[lamps]]", lamp) for lamp in lamps] + [("[require]", require)]
+    sections += [(f"[[{key}]]", item) for key, items in lists.items() for item in items] + [("[require]", require)]
     for head, body in sections:
         out += ["", head, *(f"{_toml_key(k)} = {_toml(v)}" for k, v in body.items())]
     return "\n".join(out) + "\n"

@@ -14,12 +14,13 @@ from twin.imaging.camera import StereoCamera
 from twin.imaging.renderer import Renderer
 from twin.judge.coverage import Coverage, true_heights
 from twin.mission import Mission, Step
-from twin.records import Frame, Readings, Trajectory, Truth
-from twin.simulate.sensors import read_sensors
+from twin.records import Frame, Trajectory, Truth
+from twin.simulate.carrier import Carrier
+from twin.simulate.sensors import NavigationSensors
 from twin.simulate.vehicle import Vehicle, physics_timestep_s
 
 #: Streams of randomness, in this order for ever: a draw of one never depends on another.
-_STREAMS = ("left_eye", "right_eye", "navigation")
+_STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons")
 
 
 class Sea:
@@ -36,10 +37,14 @@ class Sea:
         seeds = np.random.SeedSequence(scenario.seed).spawn(len(_STREAMS))
         rng = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
         body = mission.start @ geometry.inverse(rig.body_from_camera)
-        self.vehicle = Vehicle(world, scenario.vehicle, np.array(scenario.current.velocity_mps), body)
+        self.vehicle = (
+            Vehicle(world, scenario.vehicle, np.array(scenario.current.velocity_mps), body)
+            if scenario.vehicle.dynamics == "rigid"
+            else Carrier(body)
+        )
         self.renderer = Renderer(world, rig.width_px, rig.height_px, vfov_deg)
         self.camera = StereoCamera(self.renderer, scenario, rng["left_eye"], rng["right_eye"], watch)
-        self.noise, self.navigation_rng = scenario.believed_noise(), rng["navigation"]
+        self.sensors = NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
         self.coverage = Coverage(mission.grid, rig)
         self.true_poses: list[Array] = []
         self.steps: list[tuple[int, Step]] = []
@@ -63,17 +68,15 @@ class Sea:
         self.steps.append((track, step))
         if shot.depth_right is not None:
             self.coverage.add(self.world_from_camera, shot.depth_left, shot.depth_right)
-        return Frame(index, index / self.mission.rig.frame_rate_hz, shot.left, shot.right, self._readings())
+        time_s = index / self.mission.rig.frame_rate_hz
+        depth_m = shot.depth_left if step.key_point else None
+        readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
+        return Frame(index, time_s, shot.left, shot.right, readings)
 
-    def _readings(self) -> Readings:
-        aiding = self.mission.scenario.navigation.aiding
-        body, mount = self.vehicle.world_from_body, self.mission.rig.body_from_camera
-        return read_sensors(body, mount, self.noise, aiding, self.navigation_rng)
-
-    def act(self, thruster_commands: Array) -> None:
-        """One frame of physics under these commands (8,), -1 to 1."""
+    def act(self, command: Array) -> None:
+        """One frame of physics under a pilot's command."""
         with self.watch("physics"):
-            self.vehicle.step(thruster_commands, 1 / self.mission.rig.frame_rate_hz)
+            self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def truth(self) -> Truth:
         """All that the judge needs."""

@@ -12,16 +12,17 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from twin import geometry
-from twin.estimate import pose_filter
+from twin.estimate import aiding, pose_graph
 from twin.estimate.key_points import KeyPoint
 from twin.geometry import Array
 from twin.records import Link, SensorNoise, StereoRig
 
+Mask = NDArray[np.bool_]
+
 _OUTLIER_CHI2 = 40.0  # six degrees of freedom: one in 2 million
 _ROUNDS = 3
-_FREE_M = 1e3  # standard deviation that leaves a coordinate free
 _HUBER = 3.0
 
 
@@ -50,74 +51,65 @@ def align(
         rig, noise: calibration as believed.
         marginals_of: numbers of the nodes whose covariance is wanted; all if None, zeros for the others.
     """
-    kept, dropped = list(links), []
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph, values = _without_links(nodes, anchors, rig, noise)
+    fit = _Fit(graph, list(links), pose_graph.between_factors(links, _HUBER))
+    values, dropped = fit.optimise(values), []
     for _ in range(_ROUNDS):
-        graph, start = _graph(nodes, kept, anchors, rig, noise)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters()).optimize()
-        wrong = [link for link in kept if _chi2(link, values) > _OUTLIER_CHI2 and not _is_chain(link)]
-        if not wrong:
+        wrong = fit.contradictions(values)
+        if not wrong.any():
             break
-        dropped += wrong
-        kept = [link for link in kept if not any(link is w for w in wrong)]
+        dropped += [link for link, out in zip(fit.links, wrong, strict=True) if out]
+        fit = fit.without(wrong)
+        values = fit.optimise(values)
     return Aligned(
         np.stack([values.atPose3(k.number).matrix() for k in nodes]),
-        _marginals(graph, values, nodes, marginals_of),
+        _marginals(fit.graph(), values, nodes, marginals_of),
         dropped,
     )
 
 
-def _parameters() -> gtsam.LevenbergMarquardtParams:
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-9)
-    parameters.setAbsoluteErrorTol(1e-9)
-    return parameters
+class _Fit(NamedTuple):
+    """What a window knows: the factors of its nodes alone, and its links with a factor each."""
+
+    of_nodes: gtsam.NonlinearFactorGraph
+    links: list[Link]
+    of_links: list[gtsam.BetweenFactorPose3]
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(self.of_nodes)
+        for factor in self.of_links:
+            graph.add(factor)
+        return graph
+
+    def optimise(self, start: gtsam.Values) -> gtsam.Values:
+        return pose_graph.optimise(self.graph(), start)
+
+    def contradictions(self, values: gtsam.Values) -> Mask:
+        """(n,) links that contradict the rest; the path's own chain always stands."""
+        covs = np.array([link.cov for link in self.links]).reshape(-1, 6, 6)
+        chain = np.array([link.j - link.i == 1 for link in self.links], dtype=bool)
+        return (pose_graph.chi2(self.of_links, covs, values) > _OUTLIER_CHI2) & ~chain
+
+    def without(self, wrong: Mask) -> _Fit:
+        rows = np.flatnonzero(~wrong)
+        return _Fit(self.of_nodes, [self.links[k] for k in rows], [self.of_links[k] for k in rows])
 
 
-def _is_chain(link: Link) -> bool:
-    return link.j - link.i == 1
-
-
-def _graph(nodes, links, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _without_links(nodes, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    camera_from_body = geometry.inverse(rig.body_from_camera)
     for node in nodes:
         pose = gtsam.Pose3(node.world_from_camera)
         start.insert(node.number, pose)
         if node.number in anchors:
-            graph.add(gtsam.PriorFactorPose3(node.number, pose, _gaussian(anchors[node.number])))
-        _add_aiding(graph, node, camera_from_body, noise)
-    for link in links:
-        robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), _gaussian(link.cov))
-        graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), robust))
+            graph.add(gtsam.PriorFactorPose3(node.number, pose, aiding.gaussian(anchors[node.number])))
+    aiding.add_readings(graph, start, nodes, rig, noise)
     return graph, start
 
 
-def _add_aiding(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, camera_from_body: Array, noise: SensorNoise) -> None:
-    if node.readings.pressure_z_m is not None:
-        position = node.world_from_camera[:3, 3].copy()
-        position[2] = node.readings.pressure_z_m
-        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array([_FREE_M, _FREE_M, noise.pressure_m]))
-        graph.add(gtsam.GPSFactor(node.number, position, sigmas))
-    if node.readings.ahrs_rpy_rad is not None:
-        rotation, cov = pose_filter.attitude(node.readings.ahrs_rpy_rad, camera_from_body, noise)
-        graph.add(gtsam.PoseRotationPrior3D(node.number, gtsam.Rot3(rotation), _gaussian(cov)))
-
-
-def _gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
-    return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
-
-
-def _chi2(link: Link, values: gtsam.Values) -> float:
-    between = values.atPose3(link.i).between(values.atPose3(link.j))
-    error = gtsam.Pose3.Logmap(gtsam.Pose3(link.i_from_j).between(between))
-    return float(error @ np.linalg.solve(link.cov, error))
-
-
 def _marginals(graph, values, nodes: Sequence[KeyPoint], wanted: Sequence[int] | None) -> Array:
-    marginals = gtsam.Marginals(graph, values)
     covs = np.zeros((len(nodes), 6, 6))
-    for k, node in enumerate(nodes):
-        if wanted is None or node.number in wanted:
-            covs[k] = marginals.marginalCovariance(node.number)
+    rows = [k for k, node in enumerate(nodes) if wanted is None or node.number in wanted]
+    if rows:
+        covs[rows] = pose_graph.marginals(graph, values, [nodes[k].number for k in rows])
     return covs

@@ -113,7 +113,7 @@ def motion_depth(
         rig.focal_px,
         focal_baseline,
     )
-    sigma = np.sqrt(flow.sigma_px**2 + pose_variance + np.float32(MOTION_FLOOR_PX**2))
+    sigma = np.sqrt(flow.own_sigma_px**2 + pose_variance + np.float32(MOTION_FLOOR_PX**2))
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
 
 

@@ -18,14 +18,17 @@ Map = NDArray[np.float32]
 BLOCK_PX = 5
 #: Surfaces of fewer pixels are mismatches.
 SPECKLE_PX = 60
-#: Window of the contrast normalisation before the search [px].
-WINDOW_PX = 25
+#: Window of the contrast normalisation before the search [share of the image's width]: lamps and veil vary slowly. A
+#: small one (25 px) carries the grey of a near object to what lies beside it, differently in the two eyes.
+WINDOW = 1 / 7
+#: The two eyes' searches agree on a pixel to within this [px]; else one of them does not see it.
+AGREE_PX = 1.0
 #: What refinement cannot know (interpolation, relief inside the window): never claim less than this [px].
 FLOOR_PX = 0.03
 #: Widest search [share of the image's width].
 WIDEST = 0.4
 #: A disparity less certain than this is none [px].
-LIMIT_PX = 0.5
+LIMIT_PX = 1.0
 
 
 class Disparity(NamedTuple):
@@ -34,23 +37,29 @@ class Disparity(NamedTuple):
     disparity_px: Map
     sigma_px: Map
 
+    def surer_than(self, sigma_px: float) -> Disparity:
+        """The same without what is less certain."""
+        sure = self.sigma_px < sigma_px
+        nothing = np.float32(np.nan)
+        return Disparity(np.where(sure, self.disparity_px, nothing), np.where(sure, self.sigma_px, nothing))
+
 
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
     """Disparity of every left pixel that both eyes see.
 
-    Semi-global matching (Hirschmueller 2008, three-way) finds it to a pixel, on locally normalised contrast and with
-    the left-right check against half-occlusion. Its sub-pixel part locks to whole pixels (bias 0.02 px, spread 0.17 px
-    on a rendered reef), so `epipolar.refine` replaces it (bias 0.002 px, spread 0.06 px).
+    Semi-global matching (Hirschmueller 2008, three-way) finds it to a pixel, on locally normalised contrast, once from
+    each eye: what the two do not agree on is half-occluded or a mismatch. Its sub-pixel part locks to whole pixels
+    (bias 0.02 px, spread 0.17 px on a rendered reef), so `epipolar.refine` replaces it (bias 0.002 px, spread 0.06 px).
+    Sigma is that of the refinement as a measurement of its own, so that it grows where texture fades into noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
         max_disparity_px: largest disparity searched.
     """
-    coarse = search(_flattened(left), _flattened(right), max_disparity_px)
+    coarse = search_both(_flattened(left), _flattened(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
-    sigma = np.hypot(fine.sigma_px, np.float32(FLOOR_PX))
-    known = sigma < LIMIT_PX
-    return Disparity(np.where(known, fine.disparity_px, np.nan), np.where(known, sigma, np.nan).astype(np.float32))
+    sigma = np.hypot(fine.own_sigma_px, np.float32(FLOOR_PX))
+    return Disparity(fine.disparity_px, sigma).surer_than(LIMIT_PX)
 
 
 class Reach:
@@ -94,9 +103,23 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
     return disparity.astype(np.float32)
 
 
+def search_both(left: Gray, right: Gray, max_disparity_px: int) -> Map:
+    """`search` of the left image, kept where that of the right one sees the same."""
+    found = search(left, right, max_disparity_px)
+    mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
+    v, u = np.nonzero(np.isfinite(found))
+    forth = found[v, u]
+    # seen from the right, the pixel lies at u - d: at width - 1 - (u - d) of the mirrored image
+    back = mirrored[v, np.minimum(left.shape[1] - 1 - u + np.rint(forth).astype(np.int64), left.shape[1] - 1)]
+    agreed = np.full_like(found, np.nan)
+    agreed[v, u] = np.where(np.abs(back - forth) <= AGREE_PX, forth, np.nan)
+    return agreed
+
+
 def _flattened(image: Gray) -> Gray:
     """Local contrast normalised, so that lamps and veil do not steer the search; less so where noise prevails."""
+    window = (2 * int(image.shape[1] * WINDOW / 2) + 1,) * 2
     deviation = image.astype(np.float32)
-    deviation -= cv2.boxFilter(deviation, -1, (WINDOW_PX, WINDOW_PX))
-    variance = cv2.boxFilter(deviation * deviation, -1, (WINDOW_PX, WINDOW_PX))
+    deviation -= cv2.boxFilter(deviation, -1, window)
+    variance = cv2.boxFilter(deviation * deviation, -1, window)
     return np.clip(128 + 30 * deviation / np.sqrt(variance + 200), 0, 255).astype(np.uint8)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 #: Stands for "no disparity" inside the kernels; so far off that no neighbour counts it as support.
 NOTHING = np.float32(-1e4)
@@ -28,6 +29,10 @@ SPREAD_PX, MAX_SPREAD_PX, CALM_SIGMA_PX = 1.5, 2.5, 0.08
 BALANCE_PX = 13
 #: Windows that correlate less are mismatches.
 LEAST_CORRELATION = 0.4
+#: Variance of the difference of two images by rounding to grey levels alone.
+LEAST_NOISE = 1 / 6
+#: Per unit of noise variance: weights of the priors, and what noise adds to the square of a slope.
+_PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 
 
 class TwoView(NamedTuple):
@@ -43,11 +48,22 @@ class TwoView(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    """Refined disparity (H, W) [px], its standard deviation (H, W) [px], NaN where it failed; noise [grey levels]."""
+    """Refined disparity (H, W) [px], NaN where it failed, with its uncertainty and the images' noise [grey levels].
+
+    Args:
+        sigma_px: (H, W) standard deviation if the start was good to `PRIOR_PX`.
+        gain: (H, W) share of an error of the start that the images corrected: 1 on texture, 0 where there is none.
+    """
 
     disparity_px: Map
     sigma_px: Map
+    gain: Map
     noise: float
+
+    @property
+    def own_sigma_px(self) -> Map:
+        """(H, W) standard deviation as a measurement of its own, whatever the start was; infinite without texture."""
+        return _own_sigma(self.sigma_px, self.gain)
 
 
 STEREO = TwoView(np.eye(3), np.array([-1.0, 0.0, 0.0]))
@@ -67,9 +83,10 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     plane through the d + e of a window, weighted with (dO/dd)^2 and the window's taper, gives the disparity at its
     centre: unbiased on slopes, free of the pixel-locking of the integer search; neighbours on another surface do not
     count. Brightness and contrast of O are first balanced locally: veil and lamps look different from another place.
-    The variance is the least-squares one for the noise found in the residuals, raised where a window's own residuals
-    are larger. Where noise is strong, the last window grows. Sigma is the error's within 15 % in clear water; where
-    noise is a fifth and a half of the contrast, errors (mismatches and all) are 1.4 and 1.9 times sigma.
+    The variance is the least-squares one for the noise found in the residuals nearby (dark and even parts of an image
+    have less), raised where a window's own residuals are larger. Where noise is strong, the last window grows. Slopes
+    that noise alone could make count as none. `own_sigma_px` is the error's within 15 % in clear water; where noise is
+    a fifth and a half of the contrast, errors (mismatches and all) are 1.3 and 1.7 times that.
 
     Args:
         reference, other: (H, W) float32 grey images.
@@ -77,22 +94,27 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         view: where the other image sees a disparity.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, NOTHING).astype(np.float32)
-    sigma, excess, noise_variance, spread_px = fitted, fitted, 1.0, SPREAD_PX
+    sigma, gain, excess, noise_variance, spread_px = fitted, fitted, fitted, 1.0, SPREAD_PX
     for _ in range(iterations):
-        residual, slope = _balanced_warp(reference, other, fitted, view)
-        noise_variance = _noise_variance(residual, slope)
-        priors = np.array(
-            [noise_variance / PRIOR_PX**2, noise_variance / PRIOR_SLOPE**2, noise_variance / 8], np.float32
-        )
-        fitted, weight, excess = _fit_planes(fitted, residual, slope, _taper(spread_px), np.float32(SUPPORT_PX), priors)
-        sigma = np.sqrt(weight * np.maximum(excess, noise_variance))
-        spread_px = _spread(sigma, fitted, spread_px)
+        residual, slope, seen = _balanced_warp(reference, other, fitted, view)
+        fitted = np.where(seen, fitted, NOTHING)
+        noise_variance = _noise_variance(residual, seen)
+        noise = _local_noise(residual, seen, noise_variance)
+        fit = _fit_planes(fitted, residual, slope, noise, _taper(spread_px), np.float32(SUPPORT_PX), _PRIORS)
+        fitted, weight, gain, excess = fit
+        sigma = np.sqrt(weight * np.maximum(excess, noise))
+        spread_px = _spread(_own_sigma(sigma, gain), fitted, spread_px)
     known = (fitted > NOTHING) & (excess < 2 * (1 - LEAST_CORRELATION) * _contrast(reference))
     return Refinement(
         np.where(known, fitted, np.nan).astype(np.float32),
         np.where(known, sigma, np.nan).astype(np.float32),
+        np.where(known, gain, np.nan).astype(np.float32),
         float(noise_variance**0.5),
     )
+
+
+def _own_sigma(sigma: Map, gain: Map) -> Map:
+    return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
 def _spread(sigma: Map, fitted: Map, spread_px: float) -> float:
@@ -109,16 +131,16 @@ def _contrast(image: Map) -> Map:
     return np.maximum(cv2.boxFilter(image * image, -1, (7, 7)) - mean * mean, 0)
 
 
-def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map]:
-    """Residual I - O and slope dO/dd, with local mean and deviation of the warped O made those of I."""
-    warped, slope = np.empty_like(reference), np.empty_like(reference)
-    _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
-    seen = (slope != 0).astype(np.float32)
+def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Mask]:
+    """Residual I - O, slope dO/dd and which pixels O reaches; local mean and deviation of the warped O are made I's."""
+    warped, slope = np.zeros_like(reference), np.zeros_like(reference)
+    reached = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
+    seen = reached.astype(np.float32)
     gain, offset = (
         cv2.resize(layer, reference.shape[::-1], interpolation=cv2.INTER_LINEAR)
         for layer in _balance(reference[::2, ::2], warped[::2, ::2], seen[::2, ::2])
     )
-    return np.asarray((reference - gain * warped - offset) * seen, np.float32), slope
+    return np.asarray((reference - gain * warped - offset) * seen, np.float32), slope, reached
 
 
 def _balance(image: Map, other: Map, seen: Map) -> tuple[Map, Map]:
@@ -140,12 +162,18 @@ def _taper(spread_px: float) -> Map:
     return np.exp(-0.5 * (np.arange(-half, half + 1) / spread_px) ** 2).astype(np.float32)
 
 
-def _noise_variance(residual: Map, slope: Map) -> float:
+def _noise_variance(residual: Map, seen: Mask) -> float:
     """Variance of the residuals, robustly (normal consistent), never below that of rounding to grey levels."""
-    seen = np.abs(residual[::2, ::2][slope[::2, ::2] != 0])
-    if seen.size < 100:
+    sample = np.abs(residual[::2, ::2][seen[::2, ::2]])
+    if sample.size < 100:
         return 1.0
-    return max(float(1.4826 * np.median(seen)) ** 2, 1 / 6)
+    return max(float(1.4826 * np.median(sample)) ** 2, LEAST_NOISE)
+
+
+def _local_noise(residual: Map, seen: Mask, most: float) -> Map:
+    """(H, W) variance of the residuals around each pixel, at most that of the image: dark and even parts have less."""
+    count = _mean(seen.astype(np.float32)) + 1e-3
+    return np.clip(_mean(residual * residual) / count, LEAST_NOISE, most).astype(np.float32)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -159,31 +187,34 @@ def _cubic(a, b, c, e, t):
 
 @njit(cache=True, nogil=True, inline="always")
 def _sample(image, x, y):
-    """Bicubic value and gradient of an image at (x, y), at least one pixel inside."""
+    """Bicubic value and gradient of an image at (x, y) inside it; beyond its border it goes on as at the border."""
+    height, width = image.shape
     i, j = int(x), int(y)
     s, t = np.float32(x - i), np.float32(y - j)
-    b, gb = _cubic(image[j, i - 1], image[j, i], image[j, i + 1], image[j, i + 2], s)
+    i0, i2, i3 = max(i - 1, 0), min(i + 1, width - 1), min(i + 2, width - 1)
+    j0, j2, j3 = max(j - 1, 0), min(j + 1, height - 1), min(j + 2, height - 1)
+    b, gb = _cubic(image[j, i0], image[j, i], image[j, i2], image[j, i3], s)
     if t == 0:  # stereo: the same row
-        return b, gb, np.float32(0.5) * (image[j + 1, i] - image[j - 1, i])
-    a, ga = _cubic(image[j - 1, i - 1], image[j - 1, i], image[j - 1, i + 1], image[j - 1, i + 2], s)
-    c, gc = _cubic(image[j + 1, i - 1], image[j + 1, i], image[j + 1, i + 1], image[j + 1, i + 2], s)
-    e, ge = _cubic(image[j + 2, i - 1], image[j + 2, i], image[j + 2, i + 1], image[j + 2, i + 2], s)
+        return b, gb, np.float32(0.5) * (image[j2, i] - image[j0, i])
+    a, ga = _cubic(image[j0, i0], image[j0, i], image[j0, i2], image[j0, i3], s)
+    c, gc = _cubic(image[j2, i0], image[j2, i], image[j2, i2], image[j2, i3], s)
+    e, ge = _cubic(image[j3, i0], image[j3, i], image[j3, i2], image[j3, i3], s)
     value, gy = _cubic(a, b, c, e, t)
     return value, _cubic(ga, gb, gc, ge, t)[0], gy
 
 
 @njit(cache=True, nogil=True)
 def _warp(reference, other, disparity, matrix, epipole, warped, slope):
-    """The other image O warped to the reference and its slope dO/dd; slope 0 where the other image does not reach.
+    """Fills in the other image O warped to the reference and its slope dO/dd; returns which pixels it reaches.
 
     The gradient is the mean of both images': with one alone, its noise and the interpolation bias the answer.
     """
     height, width = reference.shape
+    reached = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
-            warped[v, u] = slope[v, u] = 0
             d = disparity[v, u]
-            if d < 0 or u < 1 or u > width - 2 or v < 1 or v > height - 2:
+            if d < 0:
                 continue
             px = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2] + epipole[0] * d
             py = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2] + epipole[1] * d
@@ -191,15 +222,17 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
             if pz <= 0:
                 continue
             x, y = px / pz, py / pz
-            if not (1 <= x < width - 2 and 1 <= y < height - 2):
+            if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
                 continue
             value, gx, gy = _sample(other, x, y)
-            rx = 0.5 * (reference[v, u + 1] - reference[v, u - 1])
-            ry = 0.5 * (reference[v + 1, u] - reference[v - 1, u])
+            rx = 0.5 * (reference[v, min(u + 1, width - 1)] - reference[v, max(u - 1, 0)])
+            ry = 0.5 * (reference[min(v + 1, height - 1), u] - reference[max(v - 1, 0), u])
             gx = 0.5 * (gx + matrix[0, 0] * rx + matrix[0, 1] * ry)
             gy = 0.5 * (gy + matrix[1, 0] * rx + matrix[1, 1] * ry)
             warped[v, u] = value
             slope[v, u] = (gx * (epipole[0] - x * epipole[2]) + gy * (epipole[1] - y * epipole[2])) / pz
+            reached[v, u] = True
+    return reached
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -229,12 +262,13 @@ def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support)
 
 
 @njit(cache=True, nogil=True)
-def _fit_planes(disparity, residual, slope, taper, support, priors):
-    """Disparity of the plane fitted around each pixel, its variance at unit noise, the mean square residual."""
+def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
+    """Disparity of the plane fitted around each pixel, its variance at unit noise, gain, the mean square residual."""
     height, width = disparity.shape
     half = taper.size // 2
     fitted = np.full((height, width), NOTHING, np.float32)
     weight = np.full((height, width), np.float32(np.inf))
+    gain = np.ones((height, width), np.float32)
     excess = np.zeros((height, width), np.float32)
     sums = np.empty((12, width), np.float32)
     for v in range(height):
@@ -255,17 +289,20 @@ def _fit_planes(disparity, residual, slope, taper, support, priors):
                     support,
                 )
         for u in range(width):
-            if disparity[v, u] < 0 or slope[v, u] == 0:
+            if disparity[v, u] < 0:
                 continue
-            a00, a11, a22 = sums[0, u] + priors[0], sums[3, u] + priors[1], sums[5, u] + priors[1]
+            p0, p1 = noise[v, u] * priors[0], noise[v, u] * priors[1]
+            a00, a11, a22 = sums[0, u] + p0, sums[3, u] + p1, sums[5, u] + p1
             a01, a02, a12 = sums[1, u], sums[2, u], sums[4, u]
             c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
             det = a00 * c00 + a01 * c01 + a02 * c02
             step = (c00 * sums[6, u] + c01 * sums[7, u] + c02 * sums[8, u]) / det
             if abs(step) < 1:
                 fitted[v, u] = disparity[v, u] + step
-                # the taper's own loss is sum w^2 / sum w; what is noise in the slopes informs of nothing
-                genuine = max(sums[0, u] - priors[2] * sums[10, u], 0.1 * sums[0, u]) / a00
-                weight[v, u] = c00 / det * (sums[11, u] + priors[0]) / a00 / (genuine * genuine)
+                # the taper's own loss is sum w^2 / sum w
+                weight[v, u] = c00 / det * (sums[11, u] + p0) / a00
+                # what noise alone adds to the slopes, mean and three deviations, informs of nothing
+                by_noise = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))
+                gain[v, u] = max(sums[0, u] - by_noise, 0.03 * sums[0, u]) / a00
                 excess[v, u] = sums[9, u] / sums[10, u]
-    return fitted, weight, excess
+    return fitted, weight, gain, excess

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin import geometry
 from twin.estimate import matching, motion
-from twin.estimate.stereo import StereoPoints, normalised, project
+from twin.estimate.stereo import StereoPoints, normalised
 from twin.records import StereoRig
 
 
@@ -33,7 +33,7 @@ class FrameToFrame:
             self.image = image
             return motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         expected = geometry.transform(geometry.inverse(self.last_motion), self.xyz)
-        guess = project(expected, self.rig)
+        guess = self.rig.project(expected)
         found, ok = matching.track(self.image, image, self.pixels, guess, self.patch_px)
         result = motion.frame_motion(self.xyz[ok], normalised(found[ok], self.rig), self.last_motion)
         self.image = image

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from twin.estimate import matching
 from twin.estimate.stereo import StereoPoints
+from twin.estimate.velocity_log import Displacement
 from twin.geometry import Array
 from twin.records import Image, Readings
 
@@ -30,6 +31,7 @@ class KeyPoint:
         world_from_camera: (4, 4) best pose so far.
         points: matched points of the pair; None where stereo failed.
         readings: of the navigation sensors.
+        walked: displacement since the node before by the DVL; None without.
     """
 
     number: int
@@ -38,6 +40,7 @@ class KeyPoint:
     world_from_camera: Array
     points: StereoPoints | None
     readings: Readings
+    walked: Displacement | None = None
 
 
 class ImageSpool:

@@ -19,6 +19,10 @@ from twin.records import ElevationMap, Image, MapGrid, StereoRig
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
+#: Stereo less certain than this [px] stays out of the map. Where texture fades into noise, half of what is less certain
+#: is a mismatch: with a limit of 1 px the cells that err by more than 0.1 m double, with 0.35 px they are a third.
+SURE_PX = 0.5
+
 
 class KeyPointImages(NamedTuple):
     """The stereo pair of a key point, (H, W, 3) uint8 RGB."""
@@ -97,7 +101,7 @@ def _ahead(items: Iterator[_Seen]) -> Iterator[_Seen]:
 def _look(pair: KeyPointImages, reach: disparity.Reach, rig: StereoRig) -> _Seen:
     """A stereo pair with its left image in grey and its depth map."""
     left, right = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in pair)
-    stereo = disparity.dense_disparity(left, right, reach.max_disparity_px)
+    stereo = disparity.dense_disparity(left, right, reach.max_disparity_px).surer_than(SURE_PX)
     reach.see(stereo.disparity_px)
     return _Seen(pair, left.astype(np.float32), depth_filter.stereo_depth(stereo, rig))
 

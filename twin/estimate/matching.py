@@ -17,6 +17,7 @@ Mask = NDArray[np.bool_]
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
+_SMOOTH_PX = 0.5  # takes the finest detail, which sampling has folded, before it pulls matches towards whole pixels
 _FLAT_GRAY = 2.0  # deviations below this are sensor noise, not texture
 _ROUND_TRIP_PX = 0.5
 
@@ -30,7 +31,7 @@ def normalise(rgb: Image) -> Image:
     Returns:
         (height, width) uint8, local mean 128, local deviation about 36 grey levels.
     """
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    gray = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), _SMOOTH_PX)
     size = (gray.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
     variance = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT) - mean * mean
@@ -89,7 +90,7 @@ def _lucas_kanade(
     return np.asarray(found, np.float32), np.asarray(status).ravel() > 0
 
 
-def inside(points: Points, shape: tuple[int, ...], margin_px: float) -> Mask:
+def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: float) -> Mask:
     """Which points (n, 2) keep this distance from the image border."""
     x, y = points[:, 0], points[:, 1]
     return (x >= margin_px) & (y >= margin_px) & (x < shape[1] - margin_px) & (y < shape[0] - margin_px)

@@ -89,7 +89,8 @@ def _huber(size: Array, sigma: float, cut: float) -> Array:
 def pair_motion(
     a: Array,
     b: Array,
-    point_cov: Array,
+    cov_a: Array,
+    cov_b: Array,
     baseline_m: float,
     guess: Array,
     common_sigma: float = 0.0,
@@ -104,7 +105,7 @@ def pair_motion(
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
-        point_cov: (3, 3) covariance of the three, normalised.
+        cov_a, cov_b: (n, 3, 3) covariance of each, normalised.
         baseline_m: of the rig.
         guess: (4, 4) expected pose of b in a.
         common_sigma: standard deviation of a bias that all points share in each of the three, normalised: it does not
@@ -119,9 +120,9 @@ def pair_motion(
     a_from_b, structure = guess, b.copy()
     weight, normal, by_bias, scale = np.zeros(len(a)), np.eye(6), np.zeros((6, 3)), 1.0
     for _ in range(iterations):
-        predicted, by_point, by_motion = _transfer(structure, a_from_b, baseline_m)
+        predicted, by_point, by_motion = transfer(structure, a_from_b, baseline_m)
         error = a - predicted - np.einsum("nij,nj->ni", by_point, b - structure)
-        information = np.linalg.inv(point_cov + by_point @ point_cov @ by_point.transpose(0, 2, 1))
+        information = np.linalg.inv(cov_a + by_point @ cov_b @ by_point.transpose(0, 2, 1))
         size = np.sqrt(np.einsum("ni,nij,nj->n", error, information, error) / 3)
         scale = max(float(np.median(size)) / 0.888, 1e-3)  # root of the median of chi2 with 3 degrees, over 3
         weight = _huber(size, scale, cut=4.0)
@@ -130,7 +131,7 @@ def pair_motion(
         twist = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weight, projected, error))
         by_bias = np.linalg.solve(normal, np.einsum("n,nij->ij", weight, projected)) * common_sigma
         left = np.einsum("nij,nj->ni", information, error - by_motion @ twist)
-        structure = b + np.einsum("ij,nkj,nk->ni", point_cov, by_point, left)
+        structure = b + np.einsum("nij,nkj,nk->ni", cov_b, by_point, left)
         structure[:, 2] = np.maximum(structure[:, 2], 1e-4)
         a_from_b = a_from_b @ geometry.exp(twist)
     n_points = int(np.count_nonzero(weight))
@@ -138,7 +139,7 @@ def pair_motion(
     return None if n_points < _MIN_POINTS else Motion(a_from_b, cov, n_points, scale)
 
 
-def _transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:
+def transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:
     """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
     rotation, translation = a_from_b[:3, :3], a_from_b[:3, 3]
     disparity = z_b[:, 2]

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from twin import geometry
-from twin.estimate import matching, motion, stereo
+from twin.estimate import matching, motion, patches, stereo
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.geometry import Array
 from twin.records import Link, StereoRig
 
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
 _LEAST_SHARE = 0.3  # of matched points that agree on one motion
-_COMMON_PX = 0.013  # bias that all points of a match share: the largest of Lucas-Kanade measured on low contrast
-#: Relief inside the patches makes neighbouring matches err together: over reefs the links' NEES is half more than noise
-#: and shared pixels explain, alike for links along the swath and across, on generated and real reefs.
-_RELIEF = 1.5
-_SMALL_TURN_RAD = 0.06  # patches of 21 px are skewed by less than a pixel
+_COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
+_LEVELS = 2  # a quarter of the image: matches are found though positions err by 8 pixels
 
 
 def overlap(node: KeyPoint, other: KeyPoint, rig: StereoRig, patch_px: int) -> float:
@@ -30,7 +27,7 @@ def overlap(node: KeyPoint, other: KeyPoint, rig: StereoRig, patch_px: int) -> f
     if node.points is None or len(node.points.xyz) == 0:
         return 0.0
     other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-    pixels = stereo.project(geometry.transform(other_from_node, node.points.xyz), rig)
+    pixels = rig.project(geometry.transform(other_from_node, node.points.xyz))
     return float(np.mean(matching.inside(pixels, (rig.height_px, rig.width_px), patch_px // 2)))
 
 
@@ -39,7 +36,8 @@ def choose_links(
 ) -> list[tuple[KeyPoint, float]]:
     """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
 
-    The last links of a run of overlapping nodes carry the longest base; links to other swaths tie the legs together.
+    The last link of a run of overlapping nodes carries the longest base; links to other swaths tie the legs together,
+    and the oldest of them ties loops to where they all began.
     """
     reach_m = _reach(node, rig)
     near = [k for k in earlier if np.linalg.norm(k.world_from_camera[:3, 3] - node.world_from_camera[:3, 3]) < reach_m]
@@ -49,7 +47,9 @@ def choose_links(
     rest = [s for s in linked if s[0] not in earlier[-_SAME_SWATH:]]
     same = _unbroken(rest, earlier)
     others = sorted((s for s in rest if s not in same), key=lambda s: -s[1])
-    return (previous + same[-1:] + _spread(others, rig, max_links))[:max_links]
+    oldest = [min(others, key=lambda s: s[0].number)] if others else []
+    rest = [s for s in others if s not in oldest]
+    return (previous + same[-1:] + oldest + _spread(rest, max_links))[:max_links]
 
 
 def share_noise(links: Sequence[Link]) -> list[Link]:
@@ -73,7 +73,7 @@ def _unbroken(linked: list[tuple[KeyPoint, float]], earlier: Sequence[KeyPoint])
     return run
 
 
-def _spread(others: list[tuple[KeyPoint, float]], rig: StereoRig, count: int) -> list[tuple[KeyPoint, float]]:
+def _spread(others: list[tuple[KeyPoint, float]], count: int) -> list[tuple[KeyPoint, float]]:
     """The best of other swaths, no two of them neighbours on theirs as long as there is a choice."""
     chosen: list[tuple[KeyPoint, float]] = []
     for item in others:
@@ -89,69 +89,63 @@ def _reach(node: KeyPoint, rig: StereoRig) -> float:
     return float(node.points.xyz[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
 
 
+class Matched(NamedTuple):
+    """The same points as two stereo pairs measure them, normalised (x, y, disparity): (n, 3) with (n, 3, 3)."""
+
+    other: Array
+    other_cov: Array
+    node: Array
+    node_cov: Array
+
+
 class PairMatch:
     """Matches one node with an earlier one and measures the motion between them."""
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
 
-    def flow(self, node: KeyPoint, other: KeyPoint) -> tuple[Array, Array, float] | None:
-        """The same points as measured in the other pair and in the node's: (n, 3), (n, 3), sigma [px]; None if none.
+    def flow(self, node: KeyPoint, other: KeyPoint) -> Matched | None:
+        """The node's points found in both images of the other pair; None if there are none.
 
-        Matching starts from the flow that positions and depth predict (P11). The node's image is first turned into the
-        other's attitude, so that patches differ by parallax alone.
+        Matching starts from the flow that positions and depth predict (P11), and from how the plane under each patch
+        looks from there.
         """
         if node.points is None:
             return None
+        rig, points = self.rig, node.points
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        source, pixels = self._turned(self.spool.normalised(node.row)[0], node.points.pixels, other_from_node)
-        guess = stereo.project(geometry.transform(other_from_node, node.points.xyz), self.rig)
-        shape, margin = source.shape, self.patch_px // 2
-        usable = matching.inside(guess, shape, margin) & matching.inside(pixels, shape, margin)
+        expected, by_point, _ = motion.transfer(points.measured, other_from_node, rig.baseline_m)
+        warp = by_point[:, :, :2] + by_point[:, :, 2:] * points.slope[:, None, :]
+        left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
+        left_px = expected[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
+        shift_px = np.column_stack([expected[:, 2] * rig.focal_px, np.zeros(len(expected))])
+        source = patches.pyramid(self.spool.normalised(node.row)[0], _LEVELS)
         left, right = self.spool.normalised(other.row)
-        found, ok = matching.track(source, left, pixels[usable], guess[usable], self.patch_px)
-        node_points = node.points.subset(usable).subset(ok)
-        predicted = geometry.transform(other_from_node, node_points.xyz)
-        disparity_px = self.rig.focal_px * self.rig.baseline_m / predicted[:, 2]
-        points, both = stereo.measure(left, right, found[ok], disparity_px, self.rig, self.patch_px)
-        if not np.isfinite(points.sigma_px):  # too few to tell their noise
-            return None
-        return points.measured, node_points.measured[both], max(points.sigma_px, node_points.sigma_px)
+        left_target = patches.splines(patches.pyramid(left, _LEVELS))
+        in_left = patches.register(source, left_target, points.pixels, left_px, left_warp, self.patch_px)
+        right_px, right_target = in_left.points - shift_px, patches.splines([right])
+        in_right = patches.register(source, right_target, points.pixels, right_px, right_warp, self.patch_px)
+        ok = in_left.ok & in_right.ok & stereo.on_one_row(in_left.points, in_right.points)
+        in_node_px = (in_left.cov[ok] + in_right.cov[ok]) / 2
+        cov = left_warp[ok] @ in_node_px @ left_warp[ok].transpose(0, 2, 1)
+        measured, measured_cov = stereo.fuse(in_left.points[ok], in_right.points[ok], cov, rig)
+        return Matched(measured, measured_cov, points.measured[ok], points.cov[ok])
 
-    def motion(self, node: KeyPoint, other: KeyPoint, matched: tuple[Array, Array, float]) -> motion.Motion | None:
+    def motion(self, node: KeyPoint, other: KeyPoint, matched: Matched) -> motion.Motion | None:
         """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted."""
-        measured_other, measured_node, sigma_px = matched
         guess = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         shape = (self.rig.height_px, self.rig.width_px)
         result = motion.pair_motion(
-            measured_other,
-            measured_node,
-            stereo.point_cov(sigma_px / self.rig.focal_px),
+            matched.other,
+            matched.node,
+            matched.other_cov,
+            matched.node_cov,
             self.rig.baseline_m,
             guess,
             common_sigma=_COMMON_PX / self.rig.focal_px,
-            correlation=_RELIEF * matching.correlation(len(measured_node), self.patch_px, shape),
+            correlation=matching.correlation(len(matched.node), self.patch_px, shape),
         )
-        return None if result is None or result.n_points < _LEAST_SHARE * len(measured_node) else result
-
-    def _turned(
-        self, image: matching.Image, pixels: matching.Points, other_from_node: Array
-    ) -> tuple[matching.Image, matching.Points]:
-        """Image and pixels as a camera in the same place with the other's attitude sees them: exact at any depth.
-
-        Small turns are left to the matcher: OpenCV rounds the coordinates of a warp to 1/32 pixel, and where the turn
-        is nearly a shift all pixels round alike (0.034 px common to the image, ten times the noise of its mean flow).
-        """
-        if np.linalg.norm(geometry.so3_log(other_from_node[:3, :3])) < _SMALL_TURN_RAD:
-            return image, pixels
-        camera = self.rig.matrix
-        homography = camera @ other_from_node[:3, :3] @ np.linalg.inv(camera)
-        size = (self.rig.width_px, self.rig.height_px)
-        turned = cv2.warpPerspective(
-            image, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT, borderValue=128
-        )
-        moved = cv2.perspectiveTransform(pixels[:, None].astype(np.float32), homography)[:, 0]
-        return np.asarray(turned, np.uint8), np.asarray(moved, np.float32)
+        return None if result is None or result.n_points < _LEAST_SHARE * len(matched.node) else result
 
 
 def to_link(node: KeyPoint, other: KeyPoint, share: float, result: motion.Motion) -> Link:

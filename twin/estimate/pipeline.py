@@ -20,10 +20,12 @@ from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.mosaic import Mosaic
 from twin.estimate.pose_filter import PoseFilter
 from twin.estimate.trajectory import interpolate_between_keys
+from twin.estimate.velocity_log import VelocityLog
 from twin.geometry import Array
 from twin.records import Alignment, Estimate, Frame, Link, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
+_START_NODES = 4  # the reference position stays in the window: loops come back to it
 _HELD_COV = np.eye(6) * 1e-10  # nodes older than the window are held
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # what the mosaic's own sampling leaves [rad, m]
 
@@ -55,6 +57,7 @@ class Navigator:
         self.rig, self.noise, self.settings, self.watch = rig, noise, settings, watch
         self.spool = ImageSpool(folder)
         self.f2f = FrameToFrame(rig, settings.patch_px)
+        self.velocity_log = VelocityLog(rig, noise)
         self.filter = PoseFilter(start.copy(), rig, noise)
         shape = (int(np.ceil(grid.rows * grid.cell_m / cell_m)), int(np.ceil(grid.cols * grid.cell_m / cell_m)))
         self.mosaic = Mosaic(grid.west_m, grid.north_m - shape[0] * cell_m, cell_m, shape)
@@ -80,9 +83,10 @@ class Navigator:
         """Takes one frame; a frame with a right image is a key point of the track (from 1)."""
         with self.watch("f2f"):
             image = matching.normalise(frame.left)
-            motion, status = self.f2f.step(image)
+            seen, status = self.f2f.step(image)
+        self.f2f_pose = self.f2f_pose @ seen.a_from_b
+        motion = self.velocity_log.aid(seen, frame.readings.dvl_mps)
         self.filter.predict(motion.a_from_b, motion.cov)
-        self.f2f_pose = self.f2f_pose @ motion.a_from_b
         carry = geometry.adjoint(geometry.inverse(motion.a_from_b))
         relative, cov = self.since_node
         self.since_node = (relative @ motion.a_from_b, carry @ cov @ carry.T + motion.cov)
@@ -151,6 +155,7 @@ class Navigator:
                 image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
         if len(points.xyz) < 12:
+            self.filter.fix(frame.readings)
             return "too few points in stereo"
         depth_m = self._depth(dense_px)
         key = KeyPoint(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
@@ -158,6 +163,7 @@ class Navigator:
         self.keys.append(key)
         is_node = key.number % self.settings.node_stride == 0
         chain = self._follow_chain(key) if is_node else None
+        self.filter.fix(frame.readings)  # after the chain, so that it corrects what the chain leaves
         with self.watch("f2m"):
             self._register_with_mosaic(image, points)
             key.world_from_camera = self.filter.world_from_camera
@@ -205,11 +211,15 @@ class Navigator:
         """Links a new node to earlier ones by measured motions; to the last one by F2F where that failed."""
         s = self.settings
         with self.watch("network"):
-            window = [k for k in self.nodes if k.track >= node.track - s.window_tracks]
+            window = [
+                k for n, k in enumerate(self.nodes) if n < _START_NODES or k.track >= node.track - s.window_tracks
+            ]
             chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
         others = [(k, share) for k, share in chosen if k is not self.nodes[-1]]
         measured = [link for other, share in others if (link := self._measure(node, other, share)) is not None]
         self.links += network.share_noise(measured + ([chain] if chain else []))
+        walked = self.velocity_log.at_node(node.number)
+        node.walked = walked if chain else None  # without a chain, the F2F motion has it in
         if self.nodes and chain is None:
             relative, cov = self.since_node
             self.links.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))

@@ -18,7 +18,7 @@ class PoseFilter:
         self.world_from_camera = world_from_camera
         self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
         self.camera_from_body = geometry.inverse(rig.body_from_camera)
-        self.noise = noise
+        self.rig, self.noise = rig, noise
 
     def predict(self, a_from_b: Array, cov: Array) -> None:
         """Composes a relative motion with its covariance, eqs. (3) to (5)."""
@@ -35,7 +35,7 @@ class PoseFilter:
         return True
 
     def aid(self, readings: Readings) -> None:
-        """Fuses what the navigation sensors said."""
+        """Fuses what the navigation sensors said of height and attitude."""
         if readings.pressure_z_m is not None:
             jacobian = np.concatenate([np.zeros(3), self.world_from_camera[2, :3]])[None]
             residual = np.array([readings.pressure_z_m - self.world_from_camera[2, 3]])
@@ -44,6 +44,25 @@ class PoseFilter:
             measured, cov = attitude(readings.ahrs_rpy_rad, self.camera_from_body, self.noise)
             residual = geometry.so3_log(self.world_from_camera[:3, :3].T @ measured)
             self._update(residual, np.eye(3, 6), cov)
+
+    def fix(self, readings: Readings) -> None:
+        """Fuses what tells the position at key points: an acoustic fix, beacons in view."""
+        if readings.usbl_m is not None:
+            rotation = self.world_from_camera[:3, :3]
+            residual = readings.usbl_m - self.world_from_camera[:3, 3]
+            self._update(residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
+        for sighting in readings.beacons or ():
+            beacon = np.array(self.noise.beacons_m[sighting.beacon])
+            predicted, jacobian = self._sight(beacon)
+            if np.isfinite(predicted).all():
+                self._update(np.array(sighting.pixel) - predicted, jacobian, np.eye(2) * self.noise.beacon_px**2)
+
+    def _sight(self, beacon_m: Array) -> tuple[Array, Array]:
+        """Pixel (2,) where a beacon (3,) is to be seen, NaN behind the camera; its derivative (2, 6) by the motion."""
+        point = geometry.transform(geometry.inverse(self.world_from_camera), beacon_m[None])
+        x, y, depth = point[0]
+        by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * self.rig.focal_px / depth
+        return self.rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
         """Takes a pose and covariance from elsewhere: a measured motion, a global alignment."""

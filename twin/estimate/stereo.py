@@ -1,4 +1,4 @@
-"""Stereo at a key point: well-textured points with the disparity that Lucas-Kanade sees, and how noisy it is."""
+"""Stereo at a key point: well-textured points with their disparity, each with its own covariance."""
 
 from __future__ import annotations
 
@@ -7,80 +7,66 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.estimate import matching
+from twin.estimate import matching, patches
+from twin.geometry import Array
 from twin.records import StereoRig
 
 _EPIPOLAR_PX = 1.0
-_FLOOR_PX = 0.01  # no matcher on 8-bit images is better (largest bias measured on low contrast: 0.013 px)
+_FLOOR_PX = 0.005  # what interpolation leaves: no match is better
 
 
 class StereoPoints(NamedTuple):
     """Points of one stereo pair.
 
     Args:
-        pixels: (n, 2) in the left image [px].
+        pixels: (n, 2) whole pixels in the left image.
+        slope: (n, 2) of the disparity around them, by column and row.
         measured: (n, 3) normalised (x, y, disparity).
+        cov: (n, 3, 3) of these.
         xyz: (n, 3) in the left camera [m].
-        sigma_px: standard deviation of localising a patch in one image, from what should be zero: the vertical
-            disparity, which errs by two of them.
     """
 
     pixels: NDArray[np.float32]
-    measured: NDArray[np.float64]
-    xyz: NDArray[np.float64]
-    sigma_px: float
+    slope: Array
+    measured: Array
+    cov: Array
+    xyz: Array
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
-        return StereoPoints(self.pixels[keep], self.measured[keep], self.xyz[keep], self.sigma_px)
+        return StereoPoints(self.pixels[keep], self.slope[keep], self.measured[keep], self.cov[keep], self.xyz[keep])
 
 
-def normalised(pixels: NDArray[np.floating], rig: StereoRig) -> NDArray[np.float64]:
+def normalised(pixels: NDArray[np.floating], rig: StereoRig) -> Array:
     """(x, y) = (pixel - principal point) / focal length. (n, 2) -> (n, 2)"""
     return (pixels.astype(np.float64) - [rig.cx_px, rig.cy_px]) / rig.focal_px
 
 
-def project(xyz: NDArray[np.float64], rig: StereoRig) -> NDArray[np.float32]:
-    """Pixels of points (n, 3) in front of the left camera; behind it NaN. -> (n, 2)"""
-    depth = np.where(xyz[:, 2:] > 1e-3, xyz[:, 2:], np.nan)
-    return (xyz[:, :2] / depth * rig.focal_px + [rig.cx_px, rig.cy_px]).astype(np.float32)
+def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """(x, y, disparity) and its covariance from a patch's place in both images, given that both show it on one row.
 
-
-def point_cov(sigma: float) -> NDArray[np.float64]:
-    """Covariance (3, 3) of (x, y, disparity) where each image localises a patch to `sigma`.
-
-    The disparity is the difference of two places, and x is one of them: they err together.
-    """
-    return sigma**2 * np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 2.0]])
-
-
-def measure(
-    left: matching.Image,
-    right: matching.Image,
-    pixels: matching.Points,
-    disparity_guess_px: NDArray,
-    rig: StereoRig,
-    patch_px: int,
-) -> tuple[StereoPoints, matching.Mask]:
-    """Disparity of given points of the left image.
+    Each image errs by `cov`; the disparity is the difference of two columns, x is one of them: they err together. The
+    rows' difference must be zero, and observing that (a Kalman update) also tells the columns what they share with it.
 
     Args:
-        pixels: (n, 2) [px].
-        disparity_guess_px: (n,).
+        left, right: (n, 2) [px].
+        cov: (n, 2, 2) of a place in one image [px^2].
 
     Returns:
-        The m points that were matched, and which of the n they are.
+        (n, 3) and (n, 3, 3), normalised.
     """
-    guess = pixels.copy()
-    guess[:, 0] -= disparity_guess_px
-    found, ok = matching.track(left, right, pixels, guess, patch_px, levels=0)
-    vertical_px = found[:, 1] - pixels[:, 1]
-    disparity_px = (pixels[:, 0] - found[:, 0]).astype(np.float64)
-    ok &= (np.abs(vertical_px) < _EPIPOLAR_PX) & (disparity_px > 0.5)
-    sigma_px = max(matching.robust_sigma(vertical_px[ok]) / np.sqrt(2), _FLOOR_PX)
-    measured = np.column_stack([normalised(pixels[ok], rig), disparity_px[ok] / rig.focal_px])
-    depth = rig.baseline_m / measured[:, 2:]
-    xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * depth
-    return StereoPoints(pixels[ok], measured, xyz, sigma_px), ok
+    xx, xy, yy = cov[:, 0, 0] + _FLOOR_PX**2, cov[:, 0, 1], cov[:, 1, 1] + _FLOOR_PX**2
+    state = np.column_stack([left, left[:, 0] - right[:, 0]])
+    joint = np.stack([np.stack([xx, xy, xx], 1), np.stack([xy, yy, xy], 1), np.stack([xx, xy, 2 * xx], 1)], axis=1)
+    with_rows = np.column_stack([xy, yy, 2 * xy])  # covariance with the rows' difference, whose variance is 2 yy
+    state = state - with_rows * ((left[:, 1] - right[:, 1]) / (2 * yy))[:, None]
+    joint = joint - with_rows[:, :, None] * with_rows[:, None, :] / (2 * yy)[:, None, None]
+    measured = np.column_stack([normalised(state[:, :2], rig), state[:, 2] / rig.focal_px])
+    return measured, joint / rig.focal_px**2
+
+
+def on_one_row(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which matches (n, 2), (n, 2) [px] a rectified pair can show: rows alike, disparity positive."""
+    return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
 def points_of_pair(
@@ -92,8 +78,16 @@ def points_of_pair(
     patch_px: int,
 ) -> StereoPoints:
     """Corners of the left image with their disparity, started from a dense disparity map (NaN where unknown)."""
-    pixels = matching.corners(left, count, patch_px)
-    columns, rows = np.round(pixels).astype(int).T
-    guess = dense_px[rows, columns]
-    known = np.isfinite(guess)
-    return measure(left, right, pixels[known], guess[known], rig, patch_px)[0]
+    pixels = np.round(matching.corners(left, count, patch_px)).astype(np.float32)
+    columns, rows = pixels.astype(int).T
+    known = np.isfinite(dense_px[rows, columns])
+    pixels, disparity_px = pixels[known], dense_px[rows, columns][known]
+    slope = patches.disparity_slope(dense_px, pixels, patch_px)
+    warp = np.tile(np.eye(2), (len(pixels), 1, 1))
+    warp[:, 0] -= slope
+    guess = pixels - np.column_stack([disparity_px, np.zeros(len(pixels))])
+    match = patches.register([left], patches.splines([right]), pixels, guess, warp, patch_px)
+    ok = match.ok & on_one_row(pixels, match.points)
+    measured, cov = fuse(pixels[ok].astype(np.float64), match.points[ok], match.cov[ok], rig)
+    xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
+    return StereoPoints(pixels[ok], slope[ok], measured, cov, xyz)

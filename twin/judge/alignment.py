@@ -1,4 +1,4 @@
-"""What each global alignment gained: key-point errors just before and just after it."""
+"""What each global alignment gained, and how far off each track is at its far end."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.numbers import number, rms
-from twin.judge.trajectory import anchor
+from twin.judge.trajectory import anchor, path_errors
 from twin.records import Alignment, Array, SurveyResult, Truth
+
+#: The far end of a track: as planned, at least this share of its greatest distance from the survey's start.
+FAR_SHARE = 0.9
 
 
 def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
@@ -29,10 +32,25 @@ def _row(alignment: Alignment, before: Array, after: Array, result: SurveyResult
         "track": int(alignment.track),
         "before_ga_rmse_m": _key_point_rmse(before, frames, result, truth),
         "after_ga_rmse_m": _key_point_rmse(after, frames, result, truth),
+        "farthest_error_m": farthest_error_m(alignment.track, result, truth),
         "ga_ms": number(alignment.ms),
         "nodes": int(alignment.nodes),
         "edges": int(alignment.edges),
     }
+
+
+def farthest_error_m(track: int, result: SurveyResult, truth: Truth) -> float | None:
+    """RMS error of the final trajectory at a track's far end [m]: the last tenth of its distance from the start.
+
+    There drift is greatest (Negahdaripour & Madjidi 2003, section III). A single frame would tell the noise of its
+    frame-to-frame motion instead.
+    """
+    error_m = path_errors(result.final, truth.trajectory).distance_m
+    frames = np.flatnonzero(truth.track[: len(error_m)] == track)
+    if len(frames) == 0:
+        return None
+    distance_m = np.linalg.norm(truth.reference[frames] - truth.reference[0], axis=1)
+    return rms(error_m[frames[distance_m >= FAR_SHARE * distance_m.max()]])
 
 
 def _key_point_rmse(poses: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:

@@ -35,7 +35,7 @@ def evaluate(
     """All of metrics.json (DESIGN.md), None where there is nothing to judge, never NaN.
 
     Args:
-        plan_numbers: overlap_along and overlap_across of the plan.
+        plan_numbers: pattern, overlap_along and overlap_across of the plan.
         timing: wall_s, simulated_s, peak_rss_mb and the stages' summary (`Stopwatch.summary`).
         identity: name, seed, version, scenario_hash, status ("complete" or "aborted") and reason.
         require: limit for each named metric, e.g. {"map.le90_m": 0.05}.

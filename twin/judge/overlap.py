@@ -15,29 +15,37 @@ from scipy.spatial import KDTree
 
 from twin import geometry
 from twin.judge.numbers import number, percentile
-from twin.judge.path import leg_numbers
+from twin.judge.path import swath_numbers, travel_direction
 from twin.records import Array, MapGrid, StereoRig, SurveyResult, Truth
 
 
 class Footprints(NamedTuple):
-    """Of n key points: centre (n, 2) [m], bow (n, 2) unit vector, width and length (n,) on the floor [m], leg or -1."""
+    """Of n key points.
+
+    Args:
+        centre_m: (n, 2) position [m].
+        bow, travel: (n, 2) unit vectors of heading, and of the planned motion.
+        width_m, length_m: (n,) across and along the bow, on the floor [m].
+        swath: (n,) number of the leg or loop, or -1.
+    """
 
     centre_m: Array
     bow: Array
+    travel: Array
     width_m: Array
     length_m: Array
-    leg: NDArray[np.int64]
+    swath: NDArray[np.int64]
 
 
 def overlap_metrics(
     result: SurveyResult, truth: Truth, rig: StereoRig, grid: MapGrid | None, planned: dict[str, Any]
 ) -> dict[str, float | None]:
-    """`overlap.*` of metrics.json; `planned` holds overlap_along and overlap_across of the plan.
+    """`overlap.*` of metrics.json; `planned` holds pattern, overlap_along and overlap_across of the plan.
 
-    Along: shared area of consecutive key points of one leg. Across: shared width (sidelap) of a key point and the
-    nearest one of the next leg.
+    Along: shared area of consecutive key points of one swath (a leg, a loop). Across: sidelap, the area shared with the
+    nearest key point of the next swath, were it abeam.
     """
-    prints = footprints(result.key_frames, truth, rig, grid)
+    prints = footprints(result.key_frames, truth, rig, grid, planned.get("pattern", "lawnmower"))
     along, across = along_overlap(prints), across_overlap(prints)
     return {
         "along_planned": number(planned.get("overlap_along")),
@@ -48,15 +56,17 @@ def overlap_metrics(
     }
 
 
-def footprints(key_frames: NDArray[np.int64], truth: Truth, rig: StereoRig, grid: MapGrid | None) -> Footprints:
-    """True footprints of the key points."""
+def footprints(
+    key_frames: NDArray[np.int64], truth: Truth, rig: StereoRig, grid: MapGrid | None, pattern: str = "lawnmower"
+) -> Footprints:
+    """True footprints of the key points of a survey of this pattern."""
     pose = truth.trajectory.world_from_camera[key_frames]
     heading = geometry.heading_of_camera(pose)
     bow = np.column_stack([np.cos(heading), np.sin(heading)])
     depth = np.array([mean_depth(p[:3, 3], truth.height_m, grid, rig) for p in pose])
-    leg = leg_numbers(truth.reference)[key_frames]
+    travel, swath = travel_direction(truth.reference)[key_frames], swath_numbers(truth, pattern)[key_frames]
     scale = depth / rig.focal_px
-    return Footprints(pose[:, :2, 3], bow, rig.width_px * scale, rig.height_px * scale, leg)
+    return Footprints(pose[:, :2, 3], bow, travel, rig.width_px * scale, rig.height_px * scale, swath)
 
 
 def mean_depth(position: Array, height_m: NDArray[np.float32], grid: MapGrid | None, rig: StereoRig) -> float:
@@ -80,45 +90,38 @@ def _window(height_m: NDArray[np.float32], grid: MapGrid, position: Array, half_
 
 
 def along_overlap(prints: Footprints) -> Array:
-    """(m,) shared share of the area of consecutive key points that are on the same leg."""
-    first = np.flatnonzero((prints.leg[:-1] == prints.leg[1:]) & (prints.leg[1:] >= 0))
-    along, across = _displacement(prints, first, first + 1)
-    length, width = _mean_size(prints, first, first + 1)
-    return _shared(along, length) * _shared(across, width)
+    """(m,) shared share of the area of consecutive key points that are on the same swath."""
+    first = np.flatnonzero((prints.swath[:-1] == prints.swath[1:]) & (prints.swath[1:] >= 0))
+    return _shared(prints, first, first + 1, prints.centre_m[first + 1] - prints.centre_m[first])
 
 
 def across_overlap(prints: Footprints) -> Array:
-    """(m,) shared share of the width of each key point with the nearest one of the next leg."""
-    pairs = [_neighbours(prints, leg) for leg in range(int(prints.leg.max(initial=-1)))]
+    """(m,) shared share of the area of each key point with the nearest one of the next swath, were it abeam.
+
+    Where legs run along the bow this is the shared width.
+    """
+    pairs = [_neighbours(prints, swath) for swath in range(int(prints.swath.max(initial=-1)))]
     if not pairs:
         return np.zeros(0)
     first, second = np.concatenate(pairs, axis=1)
-    _, across = _displacement(prints, first, second)
-    return _shared(across, _mean_size(prints, first, second)[1])
+    abeam = prints.travel[first][:, ::-1] * [-1, 1]
+    sideways = np.einsum("ni,ni->n", prints.centre_m[second] - prints.centre_m[first], abeam)
+    return _shared(prints, first, second, sideways[:, None] * abeam)
 
 
-def _neighbours(prints: Footprints, leg: int) -> NDArray[np.int64]:
-    """(2, m) key points of a leg and, for each, the nearest key point of the next leg."""
-    here, there = np.flatnonzero(prints.leg == leg), np.flatnonzero(prints.leg == leg + 1)
+def _neighbours(prints: Footprints, swath: int) -> NDArray[np.int64]:
+    """(2, m) key points of a swath and, for each, the nearest key point of the next swath."""
+    here, there = np.flatnonzero(prints.swath == swath), np.flatnonzero(prints.swath == swath + 1)
     if len(here) == 0 or len(there) == 0:
         return np.zeros((2, 0), dtype=np.int64)
     _, nearest = KDTree(prints.centre_m[there]).query(prints.centre_m[here])
     return np.stack([here, there[nearest]])
 
 
-def _displacement(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Array, Array]:
-    """How far the second is from the first, along and across the first's bow [m]."""
-    step, bow = prints.centre_m[second] - prints.centre_m[first], prints.bow[first]
-    return np.einsum("ni,ni->n", step, bow), bow[:, 0] * step[:, 1] - bow[:, 1] * step[:, 0]
-
-
-def _mean_size(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Mean length and width of two footprints [m]."""
-    return (
-        (prints.length_m[first] + prints.length_m[second]) / 2,
-        (prints.width_m[first] + prints.width_m[second]) / 2,
-    )
-
-
-def _shared(displacement: Array, size: Array) -> Array:
-    return np.clip(1 - np.abs(displacement) / size, 0, 1)
+def _shared(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64], step: Array) -> Array:
+    """Share of the area that footprints of the two's mean size share after a step (m, 2) [m] in the first's axes."""
+    bow = prints.bow[first]
+    along, across = np.einsum("ni,ni->n", step, bow), bow[:, 0] * step[:, 1] - bow[:, 1] * step[:, 0]
+    length = (prints.length_m[first] + prints.length_m[second]) / 2
+    width = (prints.width_m[first] + prints.width_m[second]) / 2
+    return np.clip(1 - np.abs(along) / length, 0, 1) * np.clip(1 - np.abs(across) / width, 0, 1)

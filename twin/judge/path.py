@@ -1,11 +1,11 @@
-"""The reference path: its direction of travel, its legs."""
+"""The reference path: its direction of travel, its swaths."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.records import Array
+from twin.records import Array, Truth
 
 #: A frame is on a leg while the reference travels within this cosine of the legs' axis (26 degrees).
 ON_LEG_COSINE = 0.9
@@ -24,6 +24,11 @@ def travel_direction(reference: Array) -> Array:
     last_moving = np.maximum(np.searchsorted(moving, np.arange(n), side="right") - 1, 0)
     row = moving[last_moving]
     return step[row] / length[row, None]
+
+
+def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
+    """(n,) number of the leg or loop, from 0, that each frame of the reference is on; -1 between legs."""
+    return truth.track - 1 if pattern == "loops" else leg_numbers(truth.reference)
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:

@@ -109,7 +109,7 @@ def _survey_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
             "Overlap along", percent(shared["along_median"]), f"median; {percent(shared['along_planned'])} planned"
         ),
         KeyFigure("Overlap across", percent(shared["across_median"]), f"{percent(shared['across_planned'])} planned"),
-        KeyFigure("Cross-track", length(control["cross_track_rmse_m"]), "RMS distance from the planned legs"),
+        KeyFigure("Cross-track", length(control["cross_track_rmse_m"]), "RMS distance from the planned path"),
         KeyFigure("Real-time factor", plain(timing["real_time_factor"]), counts),
     ]
 

@@ -1,0 +1,300 @@
+"""Aiding sensors against closed forms, dense Kalman updates and finite differences."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from twin import geometry
+from twin.estimate import aiding
+from twin.estimate.alignment import align
+from twin.estimate.key_points import KeyPoint
+from twin.estimate.motion import Motion
+from twin.estimate.pose_filter import PoseFilter
+from twin.estimate.velocity_log import Displacement, VelocityLog, body_displacement, fuse
+from twin.records import Link, Readings, SensorNoise, Sighting, StereoRig
+
+MOUNT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
+RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, MOUNT)
+BEACONS = ((0.3, 0.2, 0.1), (-0.4, 0.3, 0.0), (0.2, -0.5, 0.3), (-0.3, -0.2, 0.2))
+NOISE = SensorNoise(0.01, 0.003, 0.01, dvl_mps=0.005, dvl_scale=0.002, usbl_m=0.3, beacon_px=0.2, beacons_m=BEACONS)
+POSE = geometry.pose(geometry.rotation_from_rpy(0.04, -0.03, 0.5) @ MOUNT[:3, :3], np.array([0.1, -0.1, 2.2]))
+
+
+def numeric(function, at, step=1e-6):
+    return np.column_stack([(function(at + d) - function(at - d)) / (2 * step) for d in np.eye(len(at)) * step])
+
+
+def key_points(poses, readings=None, walked=None):
+    n = len(poses)
+    rows = zip(poses, readings or [Readings()] * n, walked or [None] * n, strict=True)
+    return [KeyPoint(k, k, 1, pose.copy(), None, r, w) for k, (pose, r, w) in enumerate(rows)]
+
+
+def pixels_of(pose):
+    return RIG.project(geometry.transform(geometry.inverse(pose), np.array(BEACONS)))
+
+
+def sightings_of(pixels):
+    return tuple(Sighting(k, (float(u), float(v))) for k, (u, v) in enumerate(pixels))
+
+
+def dense_update(cov, jacobian, noise_cov, residual):
+    """Kalman's update in information form: no gain that the filter's own code could share."""
+    information = np.linalg.inv(noise_cov)
+    after = np.linalg.inv(np.linalg.inv(cov) + jacobian.T @ information @ jacobian)
+    return after @ jacobian.T @ information @ residual, after
+
+
+def some_cov(rng, size=1e-3):
+    root = rng.normal(size=(6, 6)) * size
+    return root @ root.T + np.eye(6) * (0.3 * size) ** 2
+
+
+def test_an_acoustic_fix_updates_the_online_position_as_kalman_does():
+    believed, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(0), 0.1)
+    believed.cov = cov
+    fix = POSE[:3, 3] + [0.2, -0.1, 0.3]
+    jacobian = numeric(lambda m: (POSE @ geometry.exp(m))[:3, 3], np.zeros(6))
+    moved, after = dense_update(cov, jacobian, np.eye(3) * 0.3**2, fix - POSE[:3, 3])
+    believed.fix(Readings(usbl_m=fix))
+    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ believed.world_from_camera), moved, atol=1e-8)
+    np.testing.assert_allclose(believed.cov, after, atol=1e-8)
+
+
+def test_a_beacon_updates_the_online_position_as_kalman_does():
+    believed, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(1))
+    believed.cov = cov
+    pixel = pixels_of(POSE)[2] + [0.4, -0.3]
+    jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m))[2], np.zeros(6))
+    moved, after = dense_update(cov, jacobian, np.eye(2) * 0.2**2, pixel - pixels_of(POSE)[2])
+    believed.fix(Readings(beacons=(Sighting(2, tuple(pixel)),)))
+    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ believed.world_from_camera), moved, atol=1e-9)
+    np.testing.assert_allclose(believed.cov, after, rtol=1e-5, atol=1e-12)
+
+
+def test_a_beacon_behind_the_camera_says_nothing():
+    above = geometry.pose(MOUNT[:3, :3], np.array([0.3, 0.2, -1.0]))
+    believed = PoseFilter(above, RIG, NOISE)
+    believed.fix(Readings(beacons=(Sighting(0, (100.0, 100.0)),)))
+    np.testing.assert_array_equal(believed.world_from_camera, above)
+
+
+def test_the_way_of_the_body_and_its_derivative_agree_with_finite_differences():
+    motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
+    way, by_motion = body_displacement(motion, MOUNT)
+    body = MOUNT @ motion @ geometry.inverse(MOUNT)
+    np.testing.assert_allclose(way, body[:3, 3], atol=1e-12)
+    expected = numeric(lambda m: body_displacement(motion @ geometry.exp(m), MOUNT)[0], np.zeros(6))
+    np.testing.assert_allclose(by_motion, expected, atol=1e-8)
+
+
+def test_a_frame_motion_and_a_displacement_are_fused_as_kalman_does():
+    rng = np.random.default_rng(2)
+    motion = Motion(geometry.exp(np.array([0.01, 0, 0.02, 0.01, -0.02, 0])), some_cov(rng), 100, 1.0)
+    step_cov = np.diag([1e-6, 2e-6, 3e-6])
+    way = body_displacement(motion.a_from_b, MOUNT)[0]
+    step = way + [1e-3, -2e-3, 5e-4]
+    jacobian = numeric(lambda m: body_displacement(motion.a_from_b @ geometry.exp(m), MOUNT)[0], np.zeros(6))
+    moved, after = dense_update(motion.cov, jacobian, step_cov, step - way)
+    fused = fuse(motion, step, step_cov, MOUNT)
+    np.testing.assert_allclose(geometry.log(geometry.inverse(motion.a_from_b) @ fused.a_from_b), moved, atol=1e-9)
+    np.testing.assert_allclose(fused.cov, after, atol=1e-11)
+
+
+def sea_path(n):
+    """Poses of a body that surges, sways and turns, (n, 4, 4), and its exact velocities in the body (n, 3)."""
+    t = np.arange(n) / RIG.frame_rate_hz
+    yaw, speed = 0.3 * np.sin(1.5 * t), 0.4 + 0.1 * np.sin(2 * t)
+    velocity = np.column_stack([speed, 0.1 * np.cos(t), 0.05 * np.sin(t)])
+    fine = np.arange((n - 1) * 100 + 1) / RIG.frame_rate_hz / 100  # the position by a hundred times finer steps
+    turns = np.array([geometry.rotation_from_rpy(0, 0, a) for a in 0.3 * np.sin(1.5 * fine)])
+    world = np.einsum(
+        "nij,nj->ni", turns, np.column_stack([0.4 + 0.1 * np.sin(2 * fine), 0.1 * np.cos(fine), 0.05 * np.sin(fine)])
+    )
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum((world[1:] + world[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
+    poses = [geometry.pose(geometry.rotation_from_rpy(0, 0, a), p) for a, p in zip(yaw, way[::100], strict=True)]
+    return np.array(poses), velocity
+
+
+def walk(poses, velocity, noise, motion_cov, rng=None):
+    """The displacement that the log tells over a path whose attitude vision sees with this covariance."""
+    log = VelocityLog(RIG, noise)
+    log.aid(Motion(np.eye(4), np.eye(6) * 1e-12, 100, 0.0), velocity[0])
+    log.at_node(0)
+    root = np.linalg.cholesky(motion_cov)
+    for a, b, v in zip(poses, poses[1:], velocity[1:], strict=False):
+        true = geometry.inverse(a @ MOUNT) @ b @ MOUNT
+        seen = true if rng is None else true @ geometry.exp(root @ rng.normal(size=6))
+        log.aid(Motion(seen, motion_cov, 100, 0.0), v)
+    return log.at_node(1)
+
+
+def test_velocities_sum_to_the_way_along_a_bent_path():
+    poses, velocity = sea_path(61)
+    walked = walk(poses, velocity, NOISE, np.diag([1e-12] * 3 + [1.0] * 3))
+    # the trapezoidal rule errs by dt^2 / 12 of the change of acceleration, here below 1 m/s^2: 2e-4 m
+    np.testing.assert_allclose(walked.metres, (geometry.inverse(poses[0]) @ poses[-1])[:3, 3], atol=2e-4)
+    assert np.linalg.norm(walked.metres) > 0.7
+
+
+def test_the_displacement_of_a_node_errs_as_its_covariance_says():
+    poses, velocity = sea_path(31)
+    true, motion_cov, rng = geometry.inverse(poses[0]) @ poses[-1], np.diag([1e-4**2] * 3 + [1e-2**2] * 3), None
+    nees, n = [], 600
+    for seed in range(n):
+        rng = np.random.default_rng(seed)
+        noisy = velocity + rng.normal(size=velocity.shape) * NOISE.dvl_mps
+        walked = walk(poses, noisy, NOISE, motion_cov, rng)
+        error = walked.metres - true[:3, 3]
+        nees.append(error @ np.linalg.solve(walked.cov, error))
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * n) / n
+    # the covariance counts the attitude's whole error for all the way (a third of its variance is true: here 2 %) and
+    # the first and last reading in full (half of their noise is: 1 of 31 frames)
+    assert 0.94 * low < np.mean(nees) < high
+
+
+def test_the_scale_error_of_a_straight_way_adds_up_frame_by_frame():
+    velocity = np.tile([0.3, 0.0, 0.0], (31, 1))
+    scale_only = SensorNoise(0.01, 0.003, 0.01, dvl_mps=1e-9, dvl_scale=0.01)
+    log, blind = VelocityLog(RIG, scale_only), np.eye(6)
+    blind[:3, :3] *= 1e-16
+    log.aid(Motion(np.eye(4), blind, 0, 0.0), velocity[0])
+    log.at_node(0)
+    variance = 0.0
+    for v in velocity[1:]:
+        fused = log.aid(Motion(np.eye(4), blind, 0, 0.0), v)
+        variance += (MOUNT[:3, :3] @ fused.cov[3:, 3:] @ MOUNT[:3, :3].T)[0, 0]
+    assert np.sqrt(variance) == pytest.approx(0.01 * 0.3, rel=1e-4)  # a second at 0.3 m/s
+
+
+def test_without_readings_the_motion_stays_and_no_displacement_is_told():
+    log, motion = VelocityLog(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.01)), np.eye(6) * 1e-6, 100, 1.0)
+    log.at_node(0)
+    assert log.aid(motion, None) is motion
+    assert log.at_node(1) is None
+    log.aid(motion, np.zeros(3))
+    log.at_node(2)
+    log.aid(motion, np.zeros(3))
+    assert log.at_node(3) is not None
+    log.aid(motion, None)
+    assert log.at_node(4) is None  # one reading lacks
+
+
+def test_vision_that_fails_leaves_the_motion_to_the_log():
+    velocity = np.array([0.3, -0.1, 0.05])
+    log, blind = VelocityLog(RIG, NOISE), Motion(np.eye(4), np.diag([1e-10] * 3 + [1e-2] * 3), 0, np.inf)
+    log.aid(blind, velocity)
+    fused = log.aid(blind, velocity)
+    np.testing.assert_allclose(body_displacement(fused.a_from_b, MOUNT)[0], velocity / 30, atol=1e-5)
+
+
+RIGID = 1e-12  # variance of what a graph of the tests shall not move
+
+
+def level(x):
+    return geometry.pose(MOUNT[:3, :3], np.array([x, 0.0, 2.0]))
+
+
+def test_displacements_and_links_agree_with_the_dense_adjustment_and_share_one_scale_error():
+    """On a line: links of 1 mm, displacements of 1 mm with a common scale: generalised least squares in x."""
+    n, step, link_m, log_m = 30, 0.3, 1e-3, 1e-3
+    noise = SensorNoise(0.01, 0.003, 0.01, dvl_scale=0.01)
+    rng = np.random.default_rng(0)
+    linked, logged = step + rng.normal(size=n) * link_m, 1.008 * step + rng.normal(size=n) * log_m
+    cov = np.diag([RIGID] * 3 + [link_m**2] * 3)
+    links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(d), cov, 1.0, 100) for k, d in enumerate(linked)]
+    walked = [None] + [Displacement(k, np.array([d, 0, 0]), np.eye(3) * log_m**2) for k, d in enumerate(logged)]
+    start = [level(x) for x in np.concatenate([[0], np.cumsum(linked)])]
+    aligned = align(key_points(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, noise)
+
+    # unknown: steps (n,) and scale; (1 + s) d = logged is linearised at the links' mean, second order 1e-5 of a step
+    rows = np.vstack([np.eye(n, n + 1), np.eye(n, n + 1), np.eye(1, n + 1, n)])
+    rows[n : 2 * n, n] = step
+    weight = np.diag(np.concatenate([np.full(n, link_m), np.full(n, log_m), [noise.dvl_scale]]) ** -2.0)
+    observed = np.concatenate([linked, logged, [0.0]])
+    after = np.linalg.inv(rows.T @ weight @ rows)
+    steps = (after @ rows.T @ weight @ observed)[:n]
+    np.testing.assert_allclose(aligned.poses[1:, 0, 3], np.cumsum(steps), atol=5e-4)
+    summed = np.tril(np.ones((n, n)))
+    variance = np.diag(summed @ after[:n, :n] @ summed.T)
+    world = np.array([p[:3, :3] @ c[3:, 3:] @ p[:3, :3].T for p, c in zip(aligned.poses, aligned.covs, strict=True)])
+    np.testing.assert_allclose(world[1:, 0, 0], variance, rtol=0.03)
+    assert abs(aligned.poses[-1, 0, 3] - n * step) < 4 * np.sqrt(variance[-1])  # 0.8 % of 9 m would be 72 mm
+
+
+def test_true_displacements_return_the_true_poses_of_a_turning_vehicle():
+    rng = np.random.default_rng(4)
+    poses = [level(0) @ geometry.exp(np.array([0.02 * k, -0.05 * k, 0.1 * k, 0.1 * k, -0.3 * k, 0])) for k in range(6)]
+    motions = [geometry.inverse(a) @ b for a, b in zip(poses, poses[1:], strict=False)]
+    walked = [None] + [Displacement(k, body_displacement(m, MOUNT)[0], np.eye(3) * 1e-8) for k, m in enumerate(motions)]
+    cov = np.diag([1e-10] * 3 + [1.0] * 3)  # the links tell the attitude alone
+    links = [
+        Link(k, k + 1, m @ geometry.exp(np.array([0, 0, 0, 0.1, 0.1, 0.1])), cov, 1.0, 100)
+        for k, m in enumerate(motions)
+    ]
+    start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 1e-3) for p in poses[1:]]
+    exact_scale = SensorNoise(0.01, 0.003, 0.01, dvl_scale=1e-9)
+    aligned = align(key_points(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, exact_scale)
+    # corrections of 1 mrad and 1 mm leave out 0.3 m * (1e-3)^2 / 2 a link
+    np.testing.assert_allclose(aligned.poses, poses, atol=5e-6)
+
+
+def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
+    poses = [level(0), level(0.3) @ geometry.exp(np.array([0.02, -0.05, 0.1, 0, 0, 0]))]
+    walked = [None, Displacement(0, np.array([0.301, 0.002, -0.001]), np.eye(3) * 1e-6)]
+    graph, start, moved = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()
+    away = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
+    for k, pose in enumerate(poses):
+        start.insert(k, gtsam.Pose3(pose))
+        moved.insert(k, gtsam.Pose3(away @ pose))
+    aiding.add_readings(graph, start, key_points(poses, walked=walked), RIG, NOISE)
+    moved.insert(gtsam.symbol("s", 0), np.zeros(1))
+    assert graph.error(start) > 0.5
+    assert graph.error(moved) == pytest.approx(graph.error(start), rel=1e-9)
+
+
+def test_a_displacement_from_a_node_outside_the_window_is_left_out():
+    walked = [None, Displacement(7, np.full(3, 9.0), np.eye(3) * 1e-6)]
+    link = Link(0, 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-6, 1.0, 100)
+    aligned = align(key_points([level(0), level(0.3)], walked=walked), [link], {0: np.eye(6) * RIGID}, RIG, NOISE)
+    np.testing.assert_allclose(aligned.poses[1], level(0.3), atol=1e-9)
+
+
+def test_acoustic_fixes_of_a_rigid_chain_have_the_weighted_mean():
+    """A free start and rigid links: the chain goes where prior and fixes have their mean, with its variance."""
+    fixes = np.array([[0.3, 0.1, 2.2], [0.6, -0.2, 1.9], [0.5, 0.3, 2.3]])
+    poses = [level(x) for x in (0.0, 0.3, 0.6)]
+    links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-8, 1.0, 100) for k in range(2)]
+    prior = np.diag([1e-8] * 3 + [0.2**2] * 3)
+    readings = [Readings(usbl_m=fix) for fix in fixes]
+    aligned = align(key_points(poses, readings), links, {0: prior}, RIG, NOISE)
+    variance = 1 / (1 / 0.2**2 + 3 / 0.3**2)
+    shift = variance * (fixes - np.array(poses)[:, :3, 3]).sum(axis=0) / 0.3**2
+    np.testing.assert_allclose(aligned.poses[:, :3, 3] - np.array(poses)[:, :3, 3], np.tile(shift, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(aligned.covs[0][3:, 3:], np.eye(3) * variance, rtol=1e-3, atol=1e-6)
+
+
+def test_four_beacons_resect_the_camera_with_the_covariance_of_their_pixels():
+    wide = {0: np.eye(6) * 1e2}
+    readings = Readings(beacons=sightings_of(pixels_of(POSE)))
+    key = key_points([POSE @ geometry.exp(np.array([0.03, -0.02, 0.05, 0.1, -0.1, 0.15]))], [readings])
+    aligned = align(key, [], wide, RIG, NOISE)
+    jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m)).ravel(), np.zeros(6))
+    expected = np.linalg.inv(jacobian.T @ jacobian) * NOISE.beacon_px**2
+    np.testing.assert_allclose(aligned.poses[0], POSE, atol=1e-5)
+    # beacons are held to 0.1 mm, of 1.6 mm that 0.2 px are at this depth: 0.4 % of variance
+    np.testing.assert_allclose(aligned.covs[0], expected, atol=0.02 * np.abs(expected).max())
+
+
+def test_online_and_alignment_hold_the_same_of_the_same_beacons():
+    rng = np.random.default_rng(3)
+    cov = some_cov(rng)
+    readings = Readings(beacons=sightings_of(pixels_of(POSE) + rng.normal(size=(4, 2)) * 0.2))
+    believed = PoseFilter(POSE, RIG, NOISE)
+    believed.cov = cov
+    believed.fix(readings)
+    aligned = align(key_points([POSE], [readings]), [], {0: cov}, RIG, NOISE)
+    # corrections of 1 mm and 1 mrad: their product is left out by both in ways of their own
+    np.testing.assert_allclose(believed.world_from_camera, aligned.poses[0], atol=2e-5)
+    np.testing.assert_allclose(believed.cov, aligned.covs[0], atol=0.02 * np.abs(believed.cov).max())

@@ -1,0 +1,143 @@
+"""The alignment's core on public pose graphs against gtsam's optimum, and its parts against closed forms."""
+
+import os
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from evo.core.metrics import APE, PoseRelation
+from evo.core.trajectory import PosePath3D
+
+from twin import geometry
+from twin.estimate import pose_graph
+from twin.exchange import posegraph
+from twin.records import Link
+
+DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
+
+
+def public(name):
+    if not (DATA / name).is_file():
+        pytest.skip(f"no ../shared/data (or TWIN_DATA): {name} is not shipped")
+    return posegraph.read(DATA / name).links
+
+
+def per_quaternion(link):
+    """The same link with its information on rotation read as that on the vector part of a quaternion, half an angle."""
+    scale = np.diag([0.5] * 3 + [1.0] * 3)
+    return link._replace(cov=scale @ link.cov @ scale)
+
+
+def ring(rng, n=12, sigma=0.02, share_of_sigma=1.0):
+    """Poses around a ring and links with that noise; all they have in common is the loop."""
+    poses = [geometry.exp(np.array([0, 0, 2 * np.pi * k / n, 0, 0, 0.0])) for k in range(n)]
+    for k, pose in enumerate(poses):
+        pose[:3, 3] = [np.cos(2 * np.pi * k / n), np.sin(2 * np.pi * k / n), 0.1 * k]
+    pairs = [(k, k + 1) for k in range(n - 1)] + [(0, n - 1), (0, n // 2), (2, n - 3)]
+    cov = np.eye(6) * sigma**2
+    links = [
+        Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error * sigma), cov, 1.0, 9)
+        for (i, j), error in zip(pairs, share_of_sigma * rng.normal(size=(len(pairs), 6)), strict=True)
+    ]
+    return poses, links
+
+
+def gtsam_on_its_own(links):
+    """gtsam's optimum of the same graph, built here and run to the last digit."""
+    graph = gtsam.NonlinearFactorGraph()
+    for link in links:
+        noise = gtsam.noiseModel.Gaussian.Information(np.linalg.inv(link.cov))
+        graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), noise))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setRelativeErrorTol(1e-12)
+    start = gtsam.InitializePose3.initialize(graph)
+    return graph.error(gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize())
+
+
+def test_the_small_grid_reaches_gtsams_optimum():
+    links = public("smallGrid3D.g2o")
+    assert pose_graph.solve(links).cost == pytest.approx(517.93, rel=1e-4)
+
+
+def test_the_sphere_reaches_gtsams_optimum_and_the_truth():
+    links = public("sphere2500.txt")
+    solved = pose_graph.solve(links)
+    assert solved.cost == pytest.approx(gtsam_on_its_own(links), rel=1e-5)
+    assert truth_error_m(solved.poses) <= 0.21
+
+
+def test_the_sphere_read_per_quaternion_component_costs_what_is_asked():
+    solved = pose_graph.solve([per_quaternion(link) for link in public("sphere2500.txt")])
+    assert solved.cost == pytest.approx(675.70, rel=1e-3)  # it is 676.26, 0.08 % above
+    assert truth_error_m(solved.poses) <= 0.21
+
+
+def truth_error_m(poses):
+    """RMSE of the positions after a rigid alignment, by evo."""
+    true = [np.eye(4)]
+    for link in public("sphere2500_groundtruth.txt"):
+        if link.j == link.i + 1:
+            true.append(true[-1] @ link.i_from_j)
+    reference, found = (
+        PosePath3D(poses_se3=true),
+        PosePath3D(poses_se3=[geometry.rigid(poses[k]) for k in sorted(poses)]),
+    )
+    found.align(reference)
+    error = APE(PoseRelation.translation_part)
+    error.process_data((reference, found))
+    return error.get_all_statistics()["rmse"]
+
+
+def test_the_chordal_start_needs_no_poses():
+    """Without noise it is the answer; with noise it leads to the same minimum as the true poses."""
+    poses, exact = ring(np.random.default_rng(0), share_of_sigma=0.0)
+    start = pose_graph.chordal_start(exact)
+    zero = geometry.inverse(poses[0])
+    for k, pose in enumerate(poses):
+        np.testing.assert_allclose(start.atPose3(k).matrix(), zero @ pose, atol=1e-6)
+    poses, links = ring(np.random.default_rng(1))
+    by_chords, by_truth = (pose_graph.solve(links, start) for start in (None, dict(enumerate(poses))))
+    assert by_chords.cost == pytest.approx(by_truth.cost, abs=1e-3)
+
+
+def test_the_lowest_number_stays_where_it_starts():
+    poses, links = ring(np.random.default_rng(2))
+    moved = geometry.exp(np.array([0.3, -0.2, 1.0, 4.0, 5.0, 6.0]))
+    solved = pose_graph.solve(links, {k: moved @ pose for k, pose in enumerate(poses)})
+    np.testing.assert_allclose(solved.poses[0], moved @ poses[0], atol=1e-9)
+    still = pose_graph.solve(links, dict(enumerate(poses)))
+    assert solved.cost == pytest.approx(still.cost, abs=1e-3)
+    np.testing.assert_allclose(solved.poses[7], moved @ still.poses[7], atol=2e-4)  # 0.01 of its standard deviation
+
+
+def test_a_robust_kernel_bends_less_to_a_wrong_link():
+    poses, links = ring(np.random.default_rng(3))
+    links[-1] = links[-1]._replace(i_from_j=links[-1].i_from_j @ geometry.exp(np.array([0, 0, 0, 1.0, 0, 0])))
+    plain, robust = (pose_graph.solve(links, huber=huber).poses for huber in (None, 1.0))
+    zero = geometry.inverse(poses[0])
+    off = [max(np.linalg.norm((zero @ poses[k] - found[k])[:3, 3]) for k in found) for found in (plain, robust)]
+    assert off[1] < 0.5 * off[0]
+
+
+def test_chi2_is_the_squared_residual_in_units_of_the_covariance():
+    poses, links = ring(np.random.default_rng(4))
+    start = gtsam.Values()
+    for k, pose in enumerate(poses):
+        start.insert(k, gtsam.Pose3(pose))
+    found = pose_graph.chi2(pose_graph.between_factors(links, 3.0), np.array([link.cov for link in links]), start)
+    for value, link in zip(found, links, strict=True):
+        error = geometry.log(geometry.inverse(link.i_from_j) @ geometry.inverse(poses[link.i]) @ poses[link.j])
+        assert value == pytest.approx(error @ np.linalg.inv(link.cov) @ error, rel=1e-9)
+
+
+def test_a_few_marginals_are_those_of_all():
+    _, links = ring(np.random.default_rng(5))
+    graph, start = gtsam.NonlinearFactorGraph(), pose_graph.chordal_start(links)
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    for factor in pose_graph.between_factors(links):
+        graph.add(factor)
+    oracle = gtsam.Marginals(graph, start)
+    for number, cov in zip([11, 3], pose_graph.marginals(graph, start, [11, 3]), strict=True):
+        np.testing.assert_allclose(cov, oracle.marginalCovariance(number), rtol=1e-6, atol=1e-12)

@@ -1,0 +1,32 @@
+"""Faults of a scenario that only show beside its floor are told by line, before anything is flown."""
+
+import pytest
+
+from twin.errors import ScenarioError
+from twin.mission import prepare
+from twin.scenario_file import load_scenario
+
+BAD_BEACONS = [
+    (
+        '[navigation]\naiding = ["beacons"]',
+        ["3: navigation.aiding: 'beacons': the scenario has none (allowed: with a [[beacons]] position_m)"],
+    ),
+    (
+        "[[beacons]]\nposition_m = [0, 0, 1]\n[[beacons]]\nposition_m = [5, 1, 1]\n"
+        "[[beacons]]\nposition_m = [1, 1, 0.4]",
+        [
+            "5: beacons.1.position_m: (5, 1) lies outside the terrain (allowed: x -4.50 to 4.50, y -3.50 to 3.50 m)",
+            "7: beacons.2.position_m: z 0.4 lies in the floor (allowed: above 0.500 m)",
+        ],
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "faults"), BAD_BEACONS)
+def test_beacons_that_cannot_be_are_told_by_line_all_at_once(tmp_path, text, faults):
+    file = tmp_path / "beacons.toml"
+    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
+    flat = ["terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.5"]
+    with pytest.raises(ScenarioError) as told:
+        prepare(load_scenario(file, flat))
+    assert told.value.lines == [f"{file}:{fault}" for fault in faults]

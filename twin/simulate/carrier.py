@@ -1,0 +1,44 @@
+"""A carrier instead of a vehicle: the paper's own motion, level and at constant height, as if on rails."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import SurveyAborted
+
+Array = NDArray[np.float64]
+
+
+class Carrier:
+    """Moves at exactly the commanded velocity without turning or rising; without thrust, drag or current.
+
+    The paper's simulated vehicle: t_Z and all rotation are zero (Negahdaripour & Madjidi 2003, section V-A).
+
+    Args:
+        world_from_body: (4, 4) pose at the start, at rest.
+    """
+
+    def __init__(self, world_from_body: Array):
+        self.world_from_body = world_from_body.copy()
+        self.time_s = 0.0
+        self._velocity = np.zeros(3)
+
+    @property
+    def twist_body(self) -> Array:
+        """True [angular, linear] velocity in the body (6,) [rad/s, m/s]."""
+        return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
+
+    def step(self, command: Array, duration_s: float) -> None:
+        """Moves for a while with the horizontal part of a velocity in the world (3,) [m/s].
+
+        Raises:
+            SurveyAborted: the command is not finite.
+        """
+        if not np.isfinite(command).all():
+            raise SurveyAborted(f"the commanded velocity is not finite at {self.time_s:.3f} s")
+        self._velocity = np.array([command[0], command[1], 0.0])
+        pose = self.world_from_body.copy()
+        pose[:3, 3] += self._velocity * duration_s
+        self.world_from_body = pose
+        self.time_s += duration_s
