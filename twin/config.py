@@ -211,7 +211,7 @@ class Estimation(Section):
         default=True, description="correct the position at key points by registration with the mosaic"
     )
     use_ga: bool = Field(default=True, description="global alignment at the end of each track and of the survey")
-    points: int = Field(default=300, ge=30, le=5000, description="matched points per frame")
+    points: int = Field(default=500, ge=30, le=5000, description="most matched points of a key point")
     patch_px: int = Field(default=11, ge=7, le=61, description="window of matching, one for stereo and flow alike [px]")
 
 

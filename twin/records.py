@@ -176,7 +176,9 @@ class Link(NamedTuple):
         i_from_j: (4, 4) pose of camera j in camera i.
         cov: (6, 6) covariance of [rotation, translation] in j (rad, m).
         overlap: share of image j that is seen in image i (0 to 1).
-        n_points: matched points used.
+        n_points: matched points used; 0 where frame-to-frame motion stands in.
+        shared_by: links of node j that rest on its one stereo look: `cov` is that of this motion alone, so many times.
+        closed_form: (4, 4) the same motion by eq. (2), depth taken as exact; None without.
     """
 
     i: int
@@ -185,6 +187,13 @@ class Link(NamedTuple):
     cov: Array
     overlap: float
     n_points: int
+    shared_by: int = 1
+    closed_form: Array | None = None
+
+    @property
+    def own_cov(self) -> Array:
+        """(6, 6) covariance of this motion alone, beside no other link of its node."""
+        return self.cov / self.shared_by
 
 
 class Alignment(NamedTuple):

@@ -9,6 +9,8 @@ from twin.estimate import matching, motion
 from twin.estimate.stereo import StereoPoints, normalised
 from twin.records import StereoRig
 
+_MOST_POINTS = 150  # the best ones: key points correct what the frames between them drift
+
 
 class FrameToFrame:
     """Carries the points of the last key point from frame to frame.
@@ -25,7 +27,7 @@ class FrameToFrame:
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
         """Takes the points of a new key point."""
-        self.image, self.pixels, self.xyz = image, points.pixels, points.xyz
+        self.image, self.pixels, self.xyz = image, points.pixels[:_MOST_POINTS], points.xyz[:_MOST_POINTS]
 
     def step(self, image: matching.Image) -> tuple[motion.Motion, str]:
         """Motion from the last frame to this one, and "ok" or why it failed."""
@@ -39,7 +41,7 @@ class FrameToFrame:
         self.image = image
         if result is None:
             return self._coast()
-        result = result._replace(cov=result.cov * matching.correlation(result.n_points, self.patch_px, image.shape))
+        result = result._replace(cov=result.cov * matching.correlation(found[ok], self.patch_px))
         self.last_motion = result.a_from_b
         self.pixels = found[ok]
         self.xyz = geometry.transform(geometry.inverse(result.a_from_b), self.xyz[ok])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -53,6 +54,7 @@ class ImageSpool:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = ThreadPoolExecutor(1)  # compression takes the second core
+        self._lock = threading.Lock()  # links are measured two at a time
         self._writing: Future[None] | None = None
         self._normalised: OrderedDict[int, tuple[matching.Image, matching.Image]] = OrderedDict()
 
@@ -79,11 +81,12 @@ class ImageSpool:
 
     def normalised(self, row: int) -> tuple[matching.Image, matching.Image]:
         """Left and right image, locally normalised."""
-        if row not in self._normalised:
-            left, right = self.pair(row)
-            self._remember(row, (matching.normalise(left), matching.normalise(right)))
-        self._normalised.move_to_end(row)
-        return self._normalised[row]
+        with self._lock:
+            if row not in self._normalised:
+                left, right = self.pair(row)
+                self._remember(row, (matching.normalise(left), matching.normalise(right)))
+            self._normalised.move_to_end(row)
+            return self._normalised[row]
 
     def _remember(self, row: int, pair: tuple[matching.Image, matching.Image]) -> None:
         self._normalised[row] = pair

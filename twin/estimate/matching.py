@@ -101,6 +101,12 @@ def robust_sigma(values: NDArray[np.floating]) -> float:
     return float(1.4826 * np.median(np.abs(values))) if len(values) >= 8 else float("inf")
 
 
-def correlation(n_points: int, patch_px: int, shape: tuple[int, ...]) -> float:
-    """By how much a covariance of independent points is too small: overlapping patches share their pixels."""
-    return max(1.0, n_points * patch_px**2 / (shape[0] * shape[1]))
+def correlation(points: NDArray[np.floating], patch_px: int) -> float:
+    """By how much a covariance of independent points (n, 2) is too small: overlapping patches share their pixels.
+
+    The variance of a mean grows by the mean sum of what each patch shares with all (itself included).
+    """
+    if len(points) == 0:
+        return 1.0
+    gap = np.abs(points[:, None] - points[None]) / patch_px
+    return float(np.mean(np.prod(np.maximum(1 - gap, 0), axis=2).sum(axis=1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +59,7 @@ def share_noise(links: Sequence[Link]) -> list[Link]:
     They all start from the node's own stereo points, whose noise is most of what a link's motion errs by. Taken as
     independent, n links would count the node's one look n times: positions came out over-sure by n, about 5.
     """
-    return [link._replace(cov=link.cov * len(links)) for link in links]
+    return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
 def _unbroken(linked: list[tuple[KeyPoint, float]], earlier: Sequence[KeyPoint]) -> list[tuple[KeyPoint, float]]:
@@ -103,6 +104,11 @@ class PairMatch:
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
+        self._workers = ThreadPoolExecutor(2)
+
+    def flows(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Matched | None]:
+        """`flow` to each of the others, two at a time."""
+        return list(self._workers.map(lambda other: self.flow(node, other), others))
 
     def flow(self, node: KeyPoint, other: KeyPoint) -> Matched | None:
         """The node's points found in both images of the other pair; None if there are none.
@@ -132,22 +138,29 @@ class PairMatch:
         return Matched(measured, measured_cov, points.measured[ok], points.cov[ok])
 
     def motion(self, node: KeyPoint, other: KeyPoint, matched: Matched) -> motion.Motion | None:
-        """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted."""
-        guess = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        shape = (self.rig.height_px, self.rig.width_px)
+        """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted.
+
+        It starts from the closed form of eq. (2), or where that has none from the predicted poses.
+        """
+        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
+        closed_form = motion.exact_depth_motion(matched.other, matched.node, self.rig.baseline_m, predicted)
         result = motion.pair_motion(
             matched.other,
             matched.node,
             matched.other_cov,
             matched.node_cov,
             self.rig.baseline_m,
-            guess,
+            predicted if closed_form is None else closed_form,
             common_sigma=_COMMON_PX / self.rig.focal_px,
-            correlation=matching.correlation(len(matched.node), self.patch_px, shape),
+            correlation=matching.correlation(matched.node[:, :2] * self.rig.focal_px, self.patch_px),
         )
-        return None if result is None or result.n_points < _LEAST_SHARE * len(matched.node) else result
+        if result is None or result.n_points < _LEAST_SHARE * len(matched.node):
+            return None
+        return result._replace(closed_form=closed_form)
 
 
 def to_link(node: KeyPoint, other: KeyPoint, share: float, result: motion.Motion) -> Link:
     """The network's record of a measured motion."""
-    return Link(other.number, node.number, result.a_from_b, result.cov, share, result.n_points)
+    return Link(
+        other.number, node.number, result.a_from_b, result.cov, share, result.n_points, closed_form=result.closed_form
+    )

@@ -198,9 +198,10 @@ class Navigator:
         if not self.nodes:
             return None
         last, (walked, _) = self.nodes[-1], self.since_node
-        link = self._measure(node, last, network.overlap(node, last, self.rig, self.settings.patch_px))
-        if link is None:
+        links = self._measure(node, [(last, network.overlap(node, last, self.rig, self.settings.patch_px))])
+        if not links:
             return None
+        link = links[0]
         aided = geometry.inverse(last.world_from_camera @ walked) @ self.filter.world_from_camera
         carry = geometry.adjoint(geometry.inverse(link.i_from_j))
         self.filter.reset(last.world_from_camera @ link.i_from_j @ aided, carry @ self.cov_at_node @ carry.T + link.cov)
@@ -215,8 +216,7 @@ class Navigator:
                 k for n, k in enumerate(self.nodes) if n < _START_NODES or k.track >= node.track - s.window_tracks
             ]
             chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
-        others = [(k, share) for k, share in chosen if k is not self.nodes[-1]]
-        measured = [link for other, share in others if (link := self._measure(node, other, share)) is not None]
+        measured = self._measure(node, [(k, share) for k, share in chosen if k is not self.nodes[-1]])
         self.links += network.share_noise(measured + ([chain] if chain else []))
         walked = self.velocity_log.at_node(node.number)
         node.walked = walked if chain else None  # without a chain, the F2F motion has it in
@@ -227,14 +227,17 @@ class Navigator:
         self.cov_at_node = self.filter.cov
         self.since_node = (np.eye(4), np.zeros((6, 6)))
 
-    def _measure(self, node: KeyPoint, other: KeyPoint, share: float) -> Link | None:
+    def _measure(self, node: KeyPoint, others: list[tuple[KeyPoint, float]]) -> list[Link]:
+        """The links from earlier nodes (with the share of the node that they see) that could be measured."""
         with self.watch("flow"):
-            matched = self.matcher.flow(node, other)
-        if matched is None:
-            return None
-        with self.watch("network"):
-            result = self.matcher.motion(node, other, matched)
-        return None if result is None else network.to_link(node, other, share, result)
+            matches = self.matcher.flows(node, [other for other, _ in others])
+        links = []
+        for (other, share), matched in zip(others, matches, strict=True):
+            with self.watch("network"):
+                result = None if matched is None else self.matcher.motion(node, other, matched)
+            if result is not None:
+                links.append(network.to_link(node, other, share, result))
+        return links
 
     def _align(self, nodes: list[KeyPoint], track: int, marginals: list[int] | None) -> Aligned:
         """Aligns nodes (with those older ones that they are linked to, held) and moves all key points along."""

@@ -17,8 +17,10 @@ from matplotlib.figure import Figure
 
 from twin.judge.budget import budget
 from twin.judge.run_folder import Raster, Run
+from twin.judge.stages import stage_rows
 from twin.judge.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
 from twin.judge.trajectory import path_errors
+from twin.judge.wording import factor, length
 
 WIDTH_IN = 9.6
 #: Longest side of a map in a figure [cells]; finer maps are thinned.
@@ -35,6 +37,7 @@ def draw_all(run: Run) -> dict[str, str]:
     drawings: dict[str, Callable[[Run], Figure | None]] = {
         "plan_view": plan_view,
         "path_errors": path_error_curves,
+        "stages": stage_bars,
         "tracks": track_bars,
         "elevation": elevation_maps,
         "error": error_maps,
@@ -118,6 +121,28 @@ def _log_scale(axes: Axes) -> None:
     sizes = sizes[sizes > 0]
     if len(sizes):
         axes.set(yscale="log", ylim=(0.7 * float(np.percentile(sizes, 1)), None))
+
+
+def stage_bars(run: Run) -> Figure | None:
+    """Error of the key points after each stage of positioning, and by what factor that is less than before."""
+    rows = stage_rows(run.metrics or {}, run.scenario)
+    errors_m = [row.rmse_m for row in rows if row.rmse_m]
+    if not errors_m:
+        return None
+    figure = Figure(figsize=(WIDTH_IN, 0.7 + 0.4 * len(rows)))
+    axes = figure.add_subplot()
+    at = np.arange(len(rows))[::-1]
+    widths = [row.rmse_m or 0.0 for row in rows]
+    axes.barh(at, widths, 0.62, color=[COLOURS[row.stage] for row in rows])
+    for y, row in zip(at, rows, strict=True):
+        gain = f"   {factor(row.gain)} better" if row.gain and row.gain > 1.05 else ""
+        off = f"   ({row.off})" if row.off else ""
+        text = f" {length(row.rmse_m)}{gain}{off}"
+        axes.annotate(text, (row.rmse_m or min(errors_m), y), va="center", fontsize=9)
+    axes.set_yticks(at, [LABELS[row.stage] for row in rows])
+    axes.set(xscale="log", xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="RMS error of the key points [m]")
+    axes.grid(visible=False, axis="y")
+    return figure
 
 
 def track_bars(run: Run) -> Figure | None:

@@ -11,10 +11,12 @@ import numpy as np
 from twin.judge.alignment import track_metrics
 from twin.judge.consistency import consistency_metrics
 from twin.judge.control import control_metrics
+from twin.judge.links import link_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.numbers import finite_tree, number
 from twin.judge.overlap import overlap_metrics
 from twin.judge.require import check_names, judge_requirements
+from twin.judge.stages import stage_metrics
 from twin.judge.trajectory import path_errors, trajectory_metrics
 from twin.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.timing import Stopwatch
@@ -53,6 +55,8 @@ def evaluate(
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),
         "consistency": consistency_metrics(result, elevation, truth),
+        "links": link_metrics(result, truth),
+        "stages": stage_metrics(result, truth),
         "control": control_metrics(truth),
         "overlap": overlap_metrics(result, truth, rig, grid, dict(plan_numbers)),
         "timing": _timing(timing, len(result.online), len(result.key_frames)),
@@ -70,6 +74,7 @@ def _flown(result: SurveyResult, truth: Truth) -> SurveyResult:
         key_frames=result.key_frames[:n],
         track_of_key=result.track_of_key[:n],
         node_cov=result.node_cov[:n],
+        links=[link for link in result.links if link.j < n],
     )
 
 

@@ -19,6 +19,7 @@ from twin.judge.figures import draw_all
 from twin.judge.mesh_picture import surface_picture
 from twin.judge.pictures import jpeg_bytes, read_rgb
 from twin.judge.run_folder import Run, load_run
+from twin.judge.stages import stage_rows
 from twin.judge.style import COLOURS, ESTIMATES, LABELS
 
 #: Longest side of a photograph in the report [px].
@@ -50,6 +51,8 @@ def render(run: Run) -> str:
         plain=wording.plain,
         ms=wording.milliseconds,
         angle=wording.angle,
+        small_angle=wording.small_angle,
+        factor=wording.factor,
     )
     source = files("twin.judge").joinpath("report.html.j2").read_text(encoding="utf-8")
     return environment.from_string(source).render(**context(run))
@@ -65,6 +68,8 @@ def context(run: Run) -> dict[str, Any]:
         "metrics": metrics,
         "cards": wording.key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
+        "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
+        "closed_form_verdict": wording.closed_form_verdict(metrics["links"]) if "links" in metrics else "",
         "budget": budget(metrics, run.scenario, run.key_points.n_per_key) if metrics else [],
         "figures": draw_all(run),
         "mosaic": mosaic_photo(run),

@@ -9,6 +9,7 @@ COLOURS = {
     "truth": "#1b2a33",
     "reference": "#9aa8b0",
     "f2f": "#d55e00",
+    "chain": "#cc79a7",
     "online": "#0072b2",
     "final": "#009e73",
     "limit": "#cc3311",
@@ -18,6 +19,7 @@ LABELS = {
     "truth": "true",
     "reference": "planned",
     "f2f": "frame to frame only",
+    "chain": "chain of key points",
     "online": "online (flown on)",
     "final": "final, after global alignment",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -32,6 +33,16 @@ def percent(share: float | None) -> str:
 
 def angle(value_deg: float | None) -> str:
     return DASH if value_deg is None else f"{value_deg:.2f}°"
+
+
+def small_angle(value_deg: float | None) -> str:
+    """An angle of motions: 1 mrad is 1 mm at 1 m."""
+    return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
+
+
+def factor(value: float | None) -> str:
+    """By what an error fell: two digits below ten, whole above."""
+    return DASH if value is None else f"{value:.1f} ×" if value < 9.95 else f"{value:.0f} ×"  # noqa: RUF001
 
 
 def milliseconds(value_ms: float | None) -> str:
@@ -70,6 +81,21 @@ def _result(metrics: Mapping[str, Any]) -> str:
         share, error = percent(floor["completeness"]), length(floor["le90_m"])
         said.append(f"The map holds {share} of the floor that was seen, nine tenths of it right within {error}.")
     return " ".join(said) or "There is no map and no path to judge."
+
+
+def closed_form_verdict(links: Mapping[str, Any]) -> str:
+    """What taking the depth as exact costs the motions between key points, in a sentence."""
+    said = []
+    for where in ("along", "across"):
+        joint, exact = links[where]["translation_rmse_m"], links[where]["closed_form_translation_rmse_m"]
+        if joint and exact is not None:
+            said.append(f"{length(exact)} to {length(joint)} {where}")
+    if not said:
+        return "No motion between key points was measured."
+    return (
+        "Eq. (2) takes the depth of one stereo pair as exact; structure and motion together weigh both pairs by their "
+        f"noise, which takes the error of translation from {' and from '.join(said)}."
+    )
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
