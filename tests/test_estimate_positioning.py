@@ -108,7 +108,8 @@ def test_frame_to_frame_says_so_when_it_sees_nothing(diver):
 
 def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees(diver):
     cell_m = ALTITUDE_M / RIG.focal_px
-    mosaic = Mosaic(-6, -6, cell_m, (int(12 / cell_m),) * 2)
+    mosaic = Mosaic(cell_m, diver.spool.folder / "mosaic")
+    mosaic.cells.most_tiles = 4  # so few that tiles come back from the disk
     for x in np.arange(-1.0, 0.3, 0.3):
         pose = scene.down_camera(x, 0, ALTITUDE_M)
         _, image, depth = diver.key_point(pose)
@@ -126,9 +127,9 @@ def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees
     assert np.all(np.std(errors, axis=0) < 1.5e-3)
 
 
-def test_an_empty_mosaic_gives_no_position(diver):
+def test_an_empty_mosaic_gives_no_position(diver, tmp_path):
     _, image, _ = diver.key_point(scene.down_camera(0, 0, ALTITUDE_M))
-    assert Mosaic(-6, -6, 0.01, (1200, 1200)).register(image, scene.down_camera(0, 0, ALTITUDE_M), 1.9, RIG) is None
+    assert Mosaic(0.01, tmp_path).register(image, scene.down_camera(0, 0, ALTITUDE_M), 1.9, RIG) is None
 
 
 @pytest.mark.parametrize(
@@ -147,6 +148,11 @@ def test_pair_motion_is_right_to_millimetres_though_matching_starts_a_centimetre
     assert found is not None
     assert np.linalg.norm(error_of(true, found.a_from_b)[3:]) < 6e-3
     assert np.linalg.norm(error_of(true, found.a_from_b)[:3]) < 3e-3
+    link = network.to_link(node, earlier, 0.8, found)
+    assert link.closed_form is not None
+    # depth from one pair instead of two: no more than a few times the bound above, and not the start, 1.8 cm off
+    assert np.linalg.norm(error_of(true, link.closed_form)[3:]) < 1.2e-2
+    assert not np.allclose(link.closed_form, link.i_from_j, atol=1e-6)
 
 
 def test_overlap_is_of_the_true_footprint_and_falls_with_relief(diver):
@@ -176,6 +182,8 @@ def test_links_of_one_node_together_know_no_more_than_its_own_stereo_noise_lets_
     links = network.share_noise([link, link._replace(i=1), link._replace(i=2)])
     together = np.linalg.inv(sum(np.linalg.inv(shared.cov) for shared in links))
     np.testing.assert_allclose(together, link.cov)
+    for shared in links:
+        np.testing.assert_allclose(shared.own_cov, link.cov)
 
 
 def test_pressure_corrects_height_alone_and_by_the_weight_of_its_noise():

@@ -78,7 +78,7 @@ def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Ste
 
 
 def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigator:
-    """The estimators with all they may know: calibration, data sheets, settings, the planned start and area."""
+    """The estimators with all they may know: calibration, data sheets, settings, the planned start."""
     scenario, rig = mission.scenario, mission.rig
     pixel_m = scenario.plan.altitude_m / rig.focal_px
     return Navigator(
@@ -86,7 +86,6 @@ def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigato
         scenario.believed_noise(),
         scenario.estimate,
         mission.start,
-        mission.grid,
         pixel_m,
         folder / "keypoints",
         watch,

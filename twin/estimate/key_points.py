@@ -30,7 +30,7 @@ class KeyPoint:
         row: index of its frame in the trajectories.
         track: number of its track, from 1.
         world_from_camera: (4, 4) best pose so far.
-        points: matched points of the pair; None where stereo failed.
+        points: matched points of the pair while it is the newest.
         readings: of the navigation sensors.
         walked: displacement since the node before by the DVL; None without.
     """

@@ -7,12 +7,15 @@ projected into it, and the pose is moved until their brightness agrees (Gauss-Ne
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
 from twin.estimate import matching, motion
+from twin.estimate.tiles import TiledRaster
 from twin.geometry import Array
 from twin.records import StereoRig
 
@@ -24,34 +27,32 @@ _ITERATIONS = 8
 
 
 class Mosaic:
-    """Brightness and elevation of the floor around the vehicle.
+    """Brightness and elevation of the floor around the vehicle, in tiles: memory does not grow with the area.
 
     Args:
-        west_m, south_m: corner of the raster.
-        cell_m: cell size, about a pixel's footprint.
-        shape: (rows, columns); row 0 = south.
+        cell_m: cell size, about a pixel's footprint; cell (0, 0) begins at the world's origin, rows run north.
+        folder: where tiles are spooled.
     """
 
-    def __init__(self, west_m: float, south_m: float, cell_m: float, shape: tuple[int, int]):
-        self.west_m, self.south_m, self.cell_m = west_m, south_m, cell_m
-        self.brightness = np.zeros(shape, np.uint8)
-        self.height_m = np.full(shape, np.nan, np.float32)
+    def __init__(self, cell_m: float, folder: Path):
+        self.cell_m, self.cells = cell_m, TiledRaster(2, folder)
 
     def clear(self) -> None:
         """Forgets everything: after a global alignment the mosaic is laid anew."""
-        self.height_m.fill(np.nan)
+        self.cells.clear()
 
     def add(
         self, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
     ) -> None:
         """Lays a frame with its depth (height, width), NaN where unknown, into the empty cells."""
         reach_m = float(np.nanmax(depth_m, initial=0.0)) * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
-        window, left, top = self._window(world_from_camera[:3, 3], reach_m)
+        row, col, side = self._window(world_from_camera[:3, 3], reach_m)
+        cells = self.cells.read(row, col, side, side)
         _lay(
             image, depth_m, world_from_camera, geometry.inverse(world_from_camera), rig.focal_px, rig.cx_px, rig.cy_px,
-            self.west_m + left * self.cell_m, self.south_m + top * self.cell_m, self.cell_m,
-            self.brightness[window], self.height_m[window],
+            col * self.cell_m, row * self.cell_m, self.cell_m, cells[0], cells[1],
         )  # fmt: skip
+        self.cells.write(row, col, cells)
 
     def register(
         self, image: matching.Image, world_from_camera: Array, footprint_m: float, rig: StereoRig
@@ -83,18 +84,16 @@ class Mosaic:
         correction = geometry.inverse(world_from_camera) @ current
         return motion.Motion(correction, np.asarray(np.linalg.inv(normal) * sigma**2, np.float64), n_used, sigma)
 
-    def _window(self, centre: Array, half_m: float) -> tuple[tuple[slice, slice], int, int]:
-        """The cells within a square, with the column and row of their first."""
-        row, col = (int((centre[1] - self.south_m) / self.cell_m), int((centre[0] - self.west_m) / self.cell_m))
+    def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
+        """First row, first column and side of the square of cells around a place."""
         half = int(np.ceil(half_m / self.cell_m))
-        top, left = max(row - half, 0), max(col - half, 0)
-        return (slice(top, max(row + half, 0)), slice(left, max(col + half, 0))), left, top
+        return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
     def _textured_cells(self, centre: Array, half_m: float) -> tuple[Array, NDArray[np.float32]] | None:
         """World points (n, 3) and brightness (n,) of cells with a gradient, within a square."""
-        window, left, top = self._window(centre, half_m)
-        height, bright = self.height_m[window], self.brightness[window].astype(np.float32)
-        if min(height.shape) < 8:
+        row, col, side = self._window(centre, half_m)
+        bright, height = self.cells.read(row, col, side, side)
+        if side < 8:
             return None
         strength = _gradient(bright, height)
         rows, cols = np.nonzero(strength > _MIN_GRADIENT)
@@ -102,8 +101,8 @@ class Mosaic:
             return None
         keep = slice(None, None, max(1, len(rows) // _MAX_CELLS))
         rows, cols = rows[keep], cols[keep]
-        x = self.west_m + (left + cols + 0.5) * self.cell_m
-        y = self.south_m + (top + rows + 0.5) * self.cell_m
+        x = (col + cols + 0.5) * self.cell_m
+        y = (row + rows + 0.5) * self.cell_m
         points = np.column_stack([x, y, height[rows, cols]])
         return np.asarray(points, np.float64), bright[rows, cols]
 
@@ -152,7 +151,7 @@ def _lay(image, depth, pose, inverse, focal, cx, cy, west, south, cell, brightne
             top = image[i, j] * (1 - b) + image[i, j + 1] * b
             bottom = image[i + 1, j] * (1 - b) + image[i + 1, j + 1] * b
             height[row, col] = z
-            brightness[row, col] = np.uint8(top * (1 - a) + bottom * a + 0.5)
+            brightness[row, col] = top * (1 - a) + bottom * a
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ from twin.estimate.pose_filter import PoseFilter
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.geometry import Array
-from twin.records import Alignment, Estimate, Frame, Link, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.records import Alignment, Estimate, Frame, Link, SensorNoise, StereoRig, SurveyResult, Trajectory
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
@@ -37,7 +37,6 @@ class Navigator:
         rig, noise: calibration as believed.
         settings: the scenario's [estimate].
         start: (4, 4) world_from_camera of the reference position, where the survey begins by plan.
-        grid: the survey's map cells; their extent bounds the mosaic.
         cell_m: cell of the mosaic, about a pixel's footprint.
         folder: where the key points' images are spooled.
         watch: context manager per stage name.
@@ -49,7 +48,6 @@ class Navigator:
         noise: SensorNoise,
         settings: Estimation,
         start: Array,
-        grid: MapGrid,
         cell_m: float,
         folder: Path,
         watch: Callable[[str], AbstractContextManager[None]],
@@ -59,8 +57,7 @@ class Navigator:
         self.f2f = FrameToFrame(rig, settings.patch_px)
         self.velocity_log = VelocityLog(rig, noise)
         self.filter = PoseFilter(start.copy(), rig, noise)
-        shape = (int(np.ceil(grid.rows * grid.cell_m / cell_m)), int(np.ceil(grid.cols * grid.cell_m / cell_m)))
-        self.mosaic = Mosaic(grid.west_m, grid.north_m - shape[0] * cell_m, cell_m, shape)
+        self.mosaic = Mosaic(cell_m, folder / "mosaic")
         self.matcher = network.PairMatch(rig, self.spool, settings.patch_px)
         self.f2f_pose = start.copy()
         self.since_node = (np.eye(4), np.zeros((6, 6)))
@@ -172,6 +169,7 @@ class Navigator:
         if is_node:
             self._connect(key, chain)
         self.f2f.restart(image, points)
+        key.points = None  # links start from the new node's points: memory need not hold the old ones
         return status
 
     def _depth(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
