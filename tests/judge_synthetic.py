@@ -96,7 +96,7 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     estimate[40:48, 60:70] = np.nan
     shade = np.clip(90 + 200 * height + rng.normal(0, 8, height.shape), 0, 255)[..., None] * [1.0, 0.95, 0.8]
     mosaic = np.where(np.isfinite(estimate)[..., None], shade, 0).astype(np.uint8)
-    links = [Link(i, i + d, np.eye(4), np.eye(6), 0.8, 200) for d in (1, 2) for i in range(len(keys) - d)]
+    links = [link_between(poses[keys], i, i + d, rng) for d in (1, 2, 4) for i in range(len(keys) - d)]
     ends = [int((track[keys] <= t).sum()) for t in (1, 2)]
     result = SurveyResult(
         f2f, online, final, keys, track[keys], np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (len(keys), 1, 1)), links,
@@ -106,6 +106,15 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     )  # fmt: skip
     truth = Truth(Trajectory(times, poses), reference, holding, track, height, seen)
     return result, ElevationMap(grid, estimate, np.where(np.isfinite(estimate), sigma, np.nan), mosaic), truth, rig
+
+
+def link_between(world_from_key: np.ndarray, i: int, j: int, rng: np.random.Generator) -> Link:
+    """A link that errs as its covariance says, and its closed form, three times as far off."""
+    true = geometry.inverse(world_from_key[i]) @ world_from_key[j]
+    error = rng.normal(0, 1, 6) * [2e-4, 2e-4, 2e-4, 5e-4, 5e-4, 5e-4]
+    cov = 3 * np.diag([4e-8] * 3 + [25e-8] * 3)
+    exact = true @ geometry.exp(3 * error)
+    return Link(i, j, true @ geometry.exp(error), cov, 0.8, 200, shared_by=3, closed_form=exact)
 
 
 def evaluated(result: SurveyResult, elevation: ElevationMap | None, truth: Truth, rig: StereoRig) -> dict:

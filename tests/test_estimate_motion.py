@@ -52,6 +52,19 @@ def test_frame_motion_is_exact_for_finite_motion_and_ignores_outliers():
     np.testing.assert_allclose(found.a_from_b, true, atol=1e-6)
 
 
+def test_motion_by_exact_depth_is_the_pose_of_the_later_pair_in_the_earlier():
+    true = geometry.exp(np.array([0.02, -0.03, 0.05, 0.1, -0.05, 0.04]))
+    start = true @ geometry.exp(np.array([0.003, 0.003, -0.003, 0.01, -0.01, 0.01]))
+    a, b = seen(floor_points(np.random.default_rng(7)), true)
+    found = motion.exact_depth_motion(a, b, BASELINE_M, start)
+    assert found is not None
+    np.testing.assert_allclose(found, true, atol=1e-9)
+    a[:, 2] *= 2  # the depth of a is not looked at
+    again = motion.exact_depth_motion(a, b, BASELINE_M, start)
+    assert again is not None
+    np.testing.assert_array_equal(again, found)
+
+
 def pair_motion(a, b, sigma, guess):
     cov = np.tile(np.diag(sigma**2), (len(a), 1, 1))
     return motion.pair_motion(a, b, cov, cov, BASELINE_M, guess)
@@ -62,6 +75,7 @@ def test_too_few_points_are_a_status_not_a_motion():
     assert motion.frame_motion(points, points[:, :2] / points[:, 2:], np.eye(4)) is None
     a, b = seen(points, np.eye(4))
     assert pair_motion(a, b, np.full(3, 1e-3), np.eye(4)) is None
+    assert motion.exact_depth_motion(a, b, BASELINE_M, np.eye(4)) is None
 
 
 def test_transfer_derivatives_agree_with_finite_differences():

@@ -14,6 +14,7 @@ from twin.judge import figures, wording
 from twin.judge.budget import budget
 from twin.judge.report import sample_photos, write_report
 from twin.judge.run_folder import load_run
+from twin.judge.stages import stage_rows
 from twin.records import Trajectory
 
 
@@ -56,7 +57,13 @@ def test_the_report_tells_the_figures_of_metrics_json(folder):
     for row in metrics["tracks"]:
         assert f"<td>{wording.length(row['farthest_error_m'])}</td>" in page
     assert '<td class="good">passed</td>' in page.replace("\n", "")
-    for section in "plan_view path_errors tracks elevation error histogram mosaic samples network timing".split():
+    for where in ("along", "across"):
+        assert f"<td>{metrics['links'][where]['count']}</td>" in page
+    for stage in metrics["stages"].values():
+        assert f"<td>{wording.length(stage['ate_rmse_m'])}</td>" in page
+    for (
+        section
+    ) in "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing".split():
         assert f'<section id="{section}">' in page, section
 
 
@@ -107,6 +114,48 @@ def test_trajectories_survive_the_tum_file(folder):
     run.trajectories["f2f"].save(copy)
     back = Trajectory.load(copy)
     np.testing.assert_allclose(back.world_from_camera, run.trajectories["f2f"].world_from_camera, atol=1e-8)
+
+
+def test_a_run_judged_before_there_were_stages_and_links_still_has_its_report(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    page = write_report(folder, {k: v for k, v in metrics.items() if k not in ("links", "stages")}).read_text()
+    assert '<section id="network">' in page and '<section id="stages">' not in page and "Eq. (2)" not in page
+
+
+def stages(**errors_m):
+    return {"stages": {stage: {"ate_rmse_m": error_m, "ate_max_m": None} for stage, error_m in errors_m.items()}}
+
+
+def test_a_stage_gains_what_the_one_before_it_was_worse():
+    rows = stage_rows(stages(f2f=0.4, chain=0.04, online=0.08, final=0.001), {})
+    assert [row.gain for row in rows] == [None, pytest.approx(10), pytest.approx(0.5), pytest.approx(80)]
+    assert [wording.better(row.gain) for row in rows] == ["", "10 × better", "2.0 × worse", "80 × better"]
+
+
+def test_a_broken_chain_is_left_out_and_the_next_stage_measured_against_the_one_before():
+    rows = stage_rows(stages(f2f=0.4, chain=None, online=0.1, final=0.0), {})
+    assert [(row.stage, row.gain) for row in rows] == [("f2f", None), ("online", pytest.approx(4)), ("final", None)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "online", "final"),
+    [
+        ({}, "chain, mosaic (F2M), ahrs, GA so far", "all links, ahrs"),
+        ({"use_f2m": False}, "chain, ahrs, GA so far / F2M switched off", "all links, ahrs"),
+        ({"use_ga": False}, "chain, mosaic (F2M), ahrs / GA switched off", "as online / GA switched off"),
+        (
+            {"use_f2m": False, "use_ga": False},
+            "chain, ahrs / F2M and GA switched off",
+            "as online / GA switched off",
+        ),
+    ],
+)
+def test_stages_say_what_they_work_from_and_what_was_switched_off(settings, online, final):
+    scenario = {"navigation": {"aiding": ["ahrs"]}, "estimate": settings}
+    rows = {row.stage: row for row in stage_rows(stages(f2f=1.0, chain=1.0, online=1.0, final=1.0), scenario)}
+    told = {stage: " / ".join(filter(None, [row.uses, row.off])) for stage, row in rows.items()}
+    assert (told["online"], told["final"]) == (online, final)
+    assert rows["f2f"].off == rows["chain"].off == ""
 
 
 @pytest.mark.parametrize(

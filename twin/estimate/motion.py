@@ -84,7 +84,7 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
 
 
 def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
-    """Motion between two stereo pairs by eq. (2): the depth that b measures is taken as exact, the disparity of a unused.
+    """Motion between two stereo pairs by eq. (2): depth as b measures it is taken as exact, the disparity of a unused.
 
     The closed form of P14: quick, and biased by the noise of the depth. Arguments as of `pair_motion`.
 

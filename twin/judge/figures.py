@@ -20,7 +20,7 @@ from twin.judge.run_folder import Raster, Run
 from twin.judge.stages import stage_rows
 from twin.judge.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
 from twin.judge.trajectory import path_errors
-from twin.judge.wording import factor, length
+from twin.judge.wording import better, length
 
 WIDTH_IN = 9.6
 #: Longest side of a map in a figure [cells]; finer maps are thinned.
@@ -135,12 +135,11 @@ def stage_bars(run: Run) -> Figure | None:
     widths = [row.rmse_m or 0.0 for row in rows]
     axes.barh(at, widths, 0.62, color=[COLOURS[row.stage] for row in rows])
     for y, row in zip(at, rows, strict=True):
-        gain = f"   {factor(row.gain)} better" if row.gain and row.gain > 1.05 else ""
-        off = f"   ({row.off})" if row.off else ""
-        text = f" {length(row.rmse_m)}{gain}{off}"
-        axes.annotate(text, (row.rmse_m or min(errors_m), y), va="center", fontsize=9)
+        notes = [length(row.rmse_m), better(row.gain), row.off]
+        axes.text(row.rmse_m or min(errors_m), y, "   ".join(["", *filter(None, notes)]), va="center")
     axes.set_yticks(at, [LABELS[row.stage] for row in rows])
-    axes.set(xscale="log", xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="RMS error of the key points [m]")
+    axes.set(xscale="log", xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="RMS error of the key points")
+    axes.xaxis.set_major_formatter(lambda value_m, _: length(value_m))
     axes.grid(visible=False, axis="y")
     return figure
 

@@ -45,6 +45,13 @@ def factor(value: float | None) -> str:
     return DASH if value is None else f"{value:.1f} ×" if value < 9.95 else f"{value:.0f} ×"  # noqa: RUF001
 
 
+def better(gain: float | None) -> str:
+    """What a stage bought, in words; nothing where that is within a twentieth."""
+    if gain is None or 0.95 <= gain <= 1.05:
+        return ""
+    return f"{factor(gain)} better" if gain > 1 else f"{factor(1 / gain)} worse"
+
+
 def milliseconds(value_ms: float | None) -> str:
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
