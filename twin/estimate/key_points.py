@@ -54,7 +54,7 @@ class ImageSpool:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = ThreadPoolExecutor(1)  # compression takes the second core
-        self._lock = threading.Lock()  # links are measured two at a time
+        self._lock = threading.Lock()  # links are measured by other threads
         self._writing: Future[None] | None = None
         self._normalised: OrderedDict[int, tuple[matching.Image, matching.Image]] = OrderedDict()
 
@@ -66,7 +66,8 @@ class ImageSpool:
         """
         self.settle()
         self._writing = self._writer.submit(self._write, row, left, right)
-        self._remember(row, normalised)
+        with self._lock:
+            self._remember(row, normalised)
 
     def settle(self) -> None:
         """Waits for what is being written. Raises OSError where that failed."""

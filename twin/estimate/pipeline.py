@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +29,7 @@ from twin.records import Alignment, Estimate, Frame, Link, SensorNoise, StereoRi
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
+_MOST_BEHIND = 8  # nodes whose links are still being measured
 _HELD_COV = np.eye(6) * 1e-10  # nodes older than the window are held
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # what the mosaic's own sampling leaves [rad, m]
 
@@ -67,6 +71,8 @@ class Navigator:
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
         self.links: list[Link] = []
+        self.measuring: deque[Future[list[Link]]] = deque()
+        self.behind = ThreadPoolExecutor(1)
         self.depth_of_key: dict[int, NDArray[np.float16]] = {}
         self.times_s: list[float] = []
         self.f2f_poses: list[Array] = []
@@ -97,6 +103,7 @@ class Navigator:
         if not self.settings.use_ga or len(self.nodes) < 2:
             return
         self.before_ga.append(self._key_poses())
+        self._take_links()
         first = track - self.settings.window_tracks
         with self.watch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
@@ -136,6 +143,7 @@ class Navigator:
 
     def _forget_unfinished(self) -> None:
         """Drops a key point whose frame was interrupted before it was recorded."""
+        self._take_links()
         n_frames = len(self.times_s)
         self.keys = [k for k in self.keys if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
@@ -214,16 +222,32 @@ class Navigator:
                 k for n, k in enumerate(self.nodes) if n < _START_NODES or k.track >= node.track - s.window_tracks
             ]
             chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
-        measured = self._measure(node, [(k, share) for k, share in chosen if k is not self.nodes[-1]])
-        self.links += network.share_noise(measured + ([chain] if chain else []))
+        others = [(replace(k), share) for k, share in chosen if k is not self.nodes[-1]]
+        bridge = self._bridge(node) if self.nodes and chain is None else None
+        self.measuring.append(self.behind.submit(self._links_of, replace(node), others, chain, bridge))
+        self._take_links(all_but=_MOST_BEHIND)
         walked = self.velocity_log.at_node(node.number)
         node.walked = walked if chain else None  # without a chain, the F2F motion has it in
-        if self.nodes and chain is None:
-            relative, cov = self.since_node
-            self.links.append(Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0))
         self.nodes.append(node)
         self.cov_at_node = self.filter.cov
         self.since_node = (np.eye(4), np.zeros((6, 6)))
+
+    def _bridge(self, node: KeyPoint) -> Link:
+        """The F2F motion since the last node, where the two stereo pairs do not tell it."""
+        relative, cov = self.since_node
+        return Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0)
+
+    def _links_of(
+        self, node: KeyPoint, others: list[tuple[KeyPoint, float]], chain: Link | None, bridge: Link | None
+    ) -> list[Link]:
+        """All links of one new node."""
+        measured = self._measure(node, others)
+        return network.share_noise([*measured, chain] if chain else measured) + ([bridge] if bridge else [])
+
+    def _take_links(self, all_but: int = 0) -> None:
+        """Takes over the links that were measured while the survey went on; only the alignment needs them."""
+        while len(self.measuring) > all_but:
+            self.links += self.measuring.popleft().result()
 
     def _measure(self, node: KeyPoint, others: list[tuple[KeyPoint, float]]) -> list[Link]:
         """The links from earlier nodes (with the share of the node that they see) that could be measured."""
