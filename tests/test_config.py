@@ -12,8 +12,8 @@ from twin.scenario_file import dump_toml, load_scenario
 
 PLAN_KEYS = "pattern, area_m, altitude_m, speed_mps, overlap_along, overlap_across, tracks, clearance_m"
 TOP_KEYS = (
-    "name, seed, terrain, vehicle, rig, imaging, water, lamps, sun, current, navigation, plan, control, estimate, "
-    "map, beacons, require"
+    "name, seed, terrain, vehicle, rig, imaging, water, lamps, sun, snow, current, navigation, plan, control, "
+    "estimate, map, beacons, require"
 )
 
 BAD_FILES = [
@@ -37,6 +37,10 @@ BAD_FILES = [
     ),
     ("seed = -1", ["1: seed: -1: not allowed (allowed: greater than or equal to 0)"]),
     ('name = ""', ["1: name: '': not allowed (allowed: a text that is not empty)"]),
+    ("[imaging]\nshadows = 2", ["2: imaging.shadows: 2: not allowed (allowed: true or false)"]),
+    ("[snow]\nalbedo = 1.2", ["2: snow.albedo: 1.2: not allowed (allowed: less than or equal to 1)"]),
+    ("[snow]\ndensity_per_m3 = -1", ["2: snow.density_per_m3: -1: not allowed (allowed: greater than or equal to 0)"]),
+    ("[snow]\ndiameter_m = 0", ["2: snow.diameter_m: 0: not allowed (allowed: greater than or equal to 0.0001)"]),
     ("[rig]\nimage_width_px = 320.5", ["2: rig.image_width_px: 320.5: not allowed (allowed: a whole number)"]),
     ("[rig]\nframe_rate_hz = 3", ["2: rig.frame_rate_hz: 3: not allowed (allowed: greater than or equal to 5)"]),
     ('[rig]\nbaseline_m = "wide"', ["2: rig.baseline_m: 'wide': not allowed (allowed: a number)"]),

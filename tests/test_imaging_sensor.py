@@ -1,10 +1,13 @@
 """The sensor: noise by its line, exposure with its lag, streams that do not mix."""
 
+import types
+
 import numpy as np
 import pytest
 
 from twin.config import Imaging, Scenario
 from twin.imaging.camera import StereoCamera
+from twin.imaging.light import Light
 from twin.imaging.sensor import Exposure, expose
 from twin.timing import Stopwatch
 
@@ -66,6 +69,9 @@ class FlatFloor:
         return rng.integers(50, 200, (48, 64, 3), dtype=np.uint8), np.full((48, 64), 2.0, np.float32)
 
 
+FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
+
+
 def shots(stereo):
     scenario = Scenario.model_validate(
         {
@@ -74,7 +80,7 @@ def shots(stereo):
         }
     )
     left, right = np.random.default_rng(7).spawn(2)
-    camera = StereoCamera(FlatFloor(), scenario, left, right, Stopwatch())
+    camera = StereoCamera(FlatFloor(), Light(scenario, FLAT, left), scenario, left, right, Stopwatch())
     poses = [np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3) for k in range(5)]
     return [camera.shoot(pose, flag) for pose, flag in zip(poses, stereo, strict=True)]
 

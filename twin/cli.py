@@ -35,6 +35,10 @@ SetOption = Annotated[
 SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all randomness.")]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/NAME-SEED where not given.")]
 PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-plan.png where not given.")]
+SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-look.png where not given.")]
+AtOption = Annotated[
+    str | None, typer.Option("--at", metavar="X,Y,Z", help="Place of the left camera [m]; mid-survey where not given.")
+]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as JSON and nothing else.")]
 
@@ -90,6 +94,32 @@ def plan(
     mission = prepare(load_scenario(scene, overrides))
     console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
     print(f"Picture: {planning.draw(mission, out or Path(f'runs/{mission.scenario.name}-plan.png'))}")
+
+
+@app.command()
+def look(
+    scene: SceneArgument,
+    overrides: SetOption = [],  # noqa: B006  typer copies it
+    at: AtOption = None,
+    out: SheetOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Look through the cameras at one place: the stereo pair, and all that the left image consists of, as one sheet."""
+    from twin import look as looking
+    from twin import look_sheet
+    from twin.mission import prepare
+    from twin.scenario_file import load_scenario
+
+    place = None if at is None else looking.parse_place(at)
+    mission = prepare(load_scenario(scene, overrides))
+    seen = looking.look(mission, place)
+    sheet = look_sheet.draw(mission.scenario, seen, out or Path(f"runs/{mission.scenario.name}-look.png"))
+    figures = looking.figures(seen)
+    if as_json:
+        print(json.dumps({"name": mission.scenario.name, "sheet": str(sheet)} | figures, indent=1))
+    else:
+        console.table(f"Look at {mission.scenario.name}", looking.table(figures))
+        print(f"Sheet: {sheet}")
 
 
 @app.command()

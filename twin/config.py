@@ -103,6 +103,11 @@ class Imaging(Section):
     shot_noise: float = Field(
         default=0.006, ge=0, le=0.5, description="shot noise at full scale, grows with the root of signal"
     )
+    shadows: bool = Field(default=False, description="the floor throws shadows in the light of each lamp")
+    forward_scatter: bool = Field(
+        default=False,
+        description="light scattered forward on its way to the eye arrives as a blur that grows with range",
+    )
 
 
 class Water(Section):
@@ -127,6 +132,14 @@ class Sun(Section):
     """Even daylight on the floor."""
 
     illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="white daylight on the floor [lx]")
+
+
+class Snow(Section):
+    """Marine snow: white particles that drift with the current through the light."""
+
+    density_per_m3: float = Field(default=0.0, ge=0, le=5000, description="particles in a cubic metre; 0 = none [1/m3]")
+    diameter_m: float = Field(default=0.001, ge=0.0001, le=0.02, description="size of a particle [m]")
+    albedo: float = Field(default=0.5, gt=0, le=1, description="brightness: share of the light that it sends back")
 
 
 class Current(Section):
@@ -250,6 +263,7 @@ class Scenario(Section):
     water: Water = Water()
     lamps: tuple[Lamp, ...] = ()
     sun: Sun = Sun()
+    snow: Snow = Snow()
     current: Current = Current()
     navigation: Navigation = Navigation()
     plan: Plan = Plan()

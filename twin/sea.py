@@ -11,6 +11,7 @@ import scenes.builder
 from twin import geometry
 from twin.geometry import Array
 from twin.imaging.camera import StereoCamera
+from twin.imaging.light import Light
 from twin.imaging.renderer import Renderer
 from twin.judge.coverage import Coverage, true_heights
 from twin.mission import Mission, Step
@@ -20,7 +21,7 @@ from twin.simulate.sensors import NavigationSensors
 from twin.simulate.vehicle import Vehicle, physics_timestep_s
 
 #: Streams of randomness, in this order for ever: a draw of one never depends on another.
-_STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons")
+_STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons", "snow")
 
 
 class Sea:
@@ -43,7 +44,8 @@ class Sea:
             else Carrier(body)
         )
         self.renderer = Renderer(world, rig.width_px, rig.height_px, vfov_deg)
-        self.camera = StereoCamera(self.renderer, scenario, rng["left_eye"], rng["right_eye"], watch)
+        light = Light(scenario, mission.terrain, rng["snow"])
+        self.camera = StereoCamera(self.renderer, light, scenario, rng["left_eye"], rng["right_eye"], watch)
         self.sensors = NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
         self.coverage = Coverage(mission.grid, rig)
         self.true_poses: list[Array] = []

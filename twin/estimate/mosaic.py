@@ -45,7 +45,11 @@ class Mosaic:
         self, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
     ) -> None:
         """Lays a frame with its depth (height, width), NaN where unknown, into the empty cells."""
-        reach_m = float(np.nanmax(depth_m, initial=0.0)) * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
+        known = depth_m[np.isfinite(depth_m)]
+        if known.size == 0:
+            return
+        farthest_m = 1.2 * float(np.quantile(known, 0.99))  # a mismatch may lie at any depth
+        reach_m = farthest_m * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
         row, col, side = self._window(world_from_camera[:3, 3], reach_m)
         cells = self.cells.read(row, col, side, side)
         _lay(

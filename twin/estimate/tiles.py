@@ -40,7 +40,8 @@ class TiledRaster:
     def write(self, row: int, col: int, window: Layers) -> None:
         """Puts a window (n_layers, rows, cols) back. Raises OSError where the disk is full."""
         for key, inside, outside in _pieces(row, col, *window.shape[1:]):
-            self._tile(key)[inside] = window[outside]
+            if key in self._tiles or key in self._spooled or not np.isnan(window[outside]).all():
+                self._tile(key)[inside] = window[outside]
 
     def clear(self) -> None:
         """Forgets all cells."""

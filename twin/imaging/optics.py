@@ -6,8 +6,8 @@ Radiance of a pixel whose floor lies at range r, with albedo rho, seen by an eye
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_sun) * exp(-c r)  +  veil(r)
     veil(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds, summed over lamps, and the sun's
 
-with d_i the distance to lamp i and psi_i the angle of scattering. No free factors. Left out: light scattered forward
-into neighbouring pixels (blur), light scattered more than once, and shadows.
+with d_i the distance to lamp i and psi_i the angle of scattering. No free factors. Left out here: shadows and light
+scattered forward into neighbouring pixels, which have modules of their own, and light scattered more than once.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from twin.records import Image, StereoRig
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
+Depth = NDArray[np.float32]
+Lit = NDArray[np.uint8]
 
 #: Measured beam of an LED lamp: share of the intensity on the axis by angle from it [deg] (Song et al. 2021).
 BEAM_DEG = (0, 10, 20, 30, 35, 40, 45, 50, 60, 90)
@@ -34,6 +36,7 @@ BEAM_SHARE = (1, 0.96, 0.87, 0.75, 0.63, 0.5, 0.28, 0.2, 0.12, 0)
 LAMP_RADIUS_M = 0.03  # nothing comes nearer to the source than its housing
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # of the table of transmission
 FAR_M = 1e6  # no floor beyond
+LEAST_TRANSMISSION = 1e-25  # what is left of less is lost in single precision
 RANGE_SCALE_M = 2.0  # of the table of the veil: even steps of r / (r + scale)
 VEIL_GRID, VEIL_RANGES, VEIL_SUBSTEPS = (16, 20), 48, 8
 
@@ -69,22 +72,48 @@ class Optics:
         self._lights = [lights_of_eye(rig, lamps, sun, eye) for eye in (0, 1)]
         self._tables = [_tables(rig, self._medium, lights) for lights in self._lights]
 
-    def radiance(self, albedo: Image, depth: NDArray[np.float32], eye: int) -> Radiance:
+    def radiance(self, albedo: Image, depth: Depth, eye: int, lit: Lit | None = None) -> Radiance:
         """Light that reaches an eye.
 
         Args:
             albedo: (H, W, 3) uint8, 255 = white.
             depth: (H, W) float32 along the optical axis [m]; inf where there is no floor, which shows the veil alone.
             eye: 0 left, 1 right.
+            lit: (lamps, H, W) uint8, 0 where the floor is in the shadow of a lamp; None without shadows.
 
         Returns:
             (H, W, 3) float32 [cd/m2].
         """
-        rig, lights, tables = self._rig, self._lights[eye], self._tables[eye]
         out = np.empty(albedo.shape, np.float32)
-        lamps = np.column_stack([lights.position_m, lights.axis, lights.intensity_cd]).astype(np.float32)
-        _shade(albedo, depth, np.float32(rig.focal_px), lamps, np.float32(lights.daylight_lx), *tables, out)
+        self._run(albedo, depth, eye, lit, out, None)
         return out
+
+    def split(self, albedo: Image, depth: Depth, eye: int, lit: Lit | None = None) -> tuple[Radiance, Radiance]:
+        """The same light in two parts: from the floor, and the veil."""
+        direct, veil = np.empty(albedo.shape, np.float32), np.empty(albedo.shape, np.float32)
+        self._run(albedo, depth, eye, lit, direct, veil)
+        return direct, veil
+
+    def floor_lx(self, depth: Depth, eye: int, lit: Lit | None = None) -> Radiance:
+        """Illuminance of the floor (H, W, 3): what a white one shows without its way back; NaN where none is left."""
+        white, _ = self.split(np.full((*depth.shape, 3), 255, np.uint8), depth, eye, lit)
+        back = np.exp(-self._medium.attenuation_per_m * range_of(depth, self._rig)[..., None])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(back > LEAST_TRANSMISSION, np.pi * white / back, np.nan).astype(np.float32)
+
+    def _run(
+        self, albedo: Image, depth: Depth, eye: int, lit: Lit | None, out: Radiance, veil_out: Radiance | None
+    ) -> None:
+        lights, focal = self._lights[eye], np.float32(self._rig.focal_px)
+        lamps = np.column_stack([lights.position_m, lights.axis, lights.intensity_cd]).astype(np.float32)
+        _shade(albedo, depth, focal, lamps, np.float32(lights.daylight_lx), *self._tables[eye], out, lit, veil_out)
+
+
+def range_of(depth: Depth, rig: StereoRig) -> Array:
+    """Distance (H, W) of the floor from the eye [m], from its depth along the optical axis."""
+    x = (np.arange(rig.width_px) - rig.cx_px) / rig.focal_px
+    y = (np.arange(rig.height_px) - rig.cy_px) / rig.focal_px
+    return depth.astype(np.float64) * np.sqrt(1 + x**2 + y[:, None] ** 2)
 
 
 def lights_of_eye(rig: StereoRig, lamps: Sequence[Lamp], sun: Sun, eye: int) -> Lights:
@@ -223,8 +252,12 @@ def _blend_rows(veil, row, out):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)
-def _shade(albedo, depth, focal, lamps, daylight, beam, transmission, veil, out):
-    """Fills `out` (H, W, 3) with radiance; the formulas are at the top of the module."""
+def _shade(albedo, depth, focal, lamps, daylight, beam, transmission, veil, out, lit, veil_out):
+    """Fills `out` (H, W, 3) with radiance; the formulas are at the top of the module.
+
+    Where `veil_out` is given, the veil goes there. What is None is compiled away: without shadows and layers nothing
+    of either costs time.
+    """
     one, half, per_step = np.float32(1.0), np.float32(0.5), np.float32(1 / PATH_STEP_M)
     height, width = depth.shape
     cols, ranges = veil.shape[1:3]
@@ -245,12 +278,18 @@ def _shade(albedo, depth, focal, lamps, daylight, beam, transmission, veil, out)
                 red, green, blue = daylight * red, daylight * green, daylight * blue
                 normal = _normal(depth, v, u, x, y, focal)
                 for k in range(lamps.shape[0]):
+                    if lit is not None:
+                        if not lit[k, v, u]:
+                            continue
                     e, way = _lamplight(lamps[k], beam, x * z, y * z, z, normal)
                     t = _lookup(transmission, (way + distance) * per_step)
                     red, green, blue = red + e * t[0], green + e * t[1], blue + e * t[2]
             red *= reflected * np.float32(albedo[v, u, 0])
             green *= reflected * np.float32(albedo[v, u, 1])
             blue *= reflected * np.float32(albedo[v, u, 2])
+            if veil_out is not None:
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = red, green, blue
+                red = green = blue = np.float32(0.0)
             if ranges:
                 at = np.float32(u) * np.float32(cols - 1) / np.float32(width - 1)
                 i = min(int(at), cols - 2)
@@ -260,4 +299,7 @@ def _shade(albedo, depth, focal, lamps, daylight, beam, transmission, veil, out)
                 red += a[0] + w * (b[0] - a[0])
                 green += a[1] + w * (b[1] - a[1])
                 blue += a[2] + w * (b[2] - a[2])
-            out[v, u, 0], out[v, u, 1], out[v, u, 2] = red, green, blue
+            if veil_out is not None:
+                veil_out[v, u, 0], veil_out[v, u, 1], veil_out[v, u, 2] = red, green, blue
+            else:
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = red, green, blue

@@ -14,6 +14,8 @@ from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
+NEAR_M = 0.05  #: nothing nearer is drawn
+
 
 class Renderer:
     """Draws a world's floor from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
@@ -33,7 +35,7 @@ class Renderer:
         width_px: int,
         height_px: int,
         vfov_deg: float,
-        znear_m: float = 0.05,
+        znear_m: float = NEAR_M,
         zfar_m: float = 100.0,
     ):
         self._world = world

@@ -1,0 +1,184 @@
+"""Shadows: MuJoCo's rays, a wall's closed form, every pixel against the lattice."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+
+import numpy as np
+import pytest
+
+import terrains
+from scenes.builder import World, build
+from scenes.floor import FLOOR_GROUP
+from scenes.gl import mujoco
+from twin import geometry
+from twin.config import Lamp, Scenario
+from twin.imaging import shadows
+from twin.imaging.light import Light, Moment
+from twin.imaging.renderer import Renderer
+from twin.imaging.shadows import BLOCK_CELLS, Shadows
+
+LAMPS = [{"position_m": (0.25, 0.6, -0.05), "pan_deg": -15.0}, {"position_m": (0.25, -0.6, -0.05), "pan_deg": 15.0}]
+SCENARIO = Scenario.model_validate(
+    {
+        "rig": {"image_width_px": 320, "image_height_px": 240},
+        "lamps": LAMPS,
+        "water": {"jerlov": "clear"},
+        "imaging": {"shadows": True},
+    }
+)
+RIG = SCENARIO.believed_rig()
+VFOV = float(np.rad2deg(2 * np.arctan(RIG.height_px / 2 / RIG.focal_px)))
+POSES = [
+    geometry.pose(geometry.rotation_from_rpy(*rpy) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
+    for rpy, position in [((0.0, 0.0, 0.0), (0.2, 0.1, 2.4)), ((0.1, -0.15, 2.0), (-1.3, 0.4, 2.2))]
+]
+
+
+def lamps_in(eye: int) -> np.ndarray:
+    left_from_body = geometry.inverse(RIG.body_from_camera @ (RIG.left_from_right if eye else np.eye(4)))
+    return geometry.transform(left_from_body, np.array([lamp["position_m"] for lamp in LAMPS]))
+
+
+def points_of(depth: np.ndarray, world_from_eye: np.ndarray) -> np.ndarray:
+    """(H, W, 3) floor of the pixels in the world."""
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    ray = np.stack([(u - RIG.cx_px) / RIG.focal_px, (v - RIG.cy_px) / RIG.focal_px, np.ones(u.shape)], -1)
+    return geometry.transform(world_from_eye, (ray * depth[..., None]).reshape(-1, 3)).reshape(ray.shape)
+
+
+def cliffs() -> terrains.Terrain:
+    """A reef whose slopes are made steep: plateaus 0.7 m above their surroundings, rough all over."""
+    reef = terrains.generate("reef", (8.0, 6.0), 1.0, 0.0, 0.025, 0.02, 5)
+    plateau = np.clip((reef.height_m - np.median(reef.height_m)) / 0.04, 0, 1)
+    rough = np.random.default_rng(1).normal(scale=0.004, size=plateau.shape)
+    return dataclasses.replace(reef, height_m=(0.2 * reef.height_m + 0.7 * plateau + rough).astype(np.float32))
+
+
+def world_of(terrain: terrains.Terrain) -> World:
+    return build(terrain, RIG.width_px, RIG.height_px, VFOV, RIG.baseline_m, RIG.body_from_camera, 0.01)
+
+
+def sees(world: World, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether MuJoCo's ray from a lamp reaches points (n, 3)."""
+    data = mujoco.MjData(world.model)
+    data.qpos[2] = 100.0  # the vehicle out of the way
+    mujoco.mj_forward(world.model, data)
+    geom, group, result = np.zeros(1, np.int32), np.zeros(6, np.uint8), []
+    group[FLOOR_GROUP] = 1
+    for point in points:
+        reach = np.linalg.norm(point - lamp)
+        hit = mujoco.mj_ray(world.model, data, lamp, (point - lamp) / reach, group, 1, -1, geom, None)
+        result.append(hit < 0 or hit > reach - 2e-4)
+    return np.array(result)
+
+
+def test_a_pixel_is_lit_where_mujocos_ray_from_the_lamp_arrives() -> None:
+    """At 99.5 % of the pixels at least, on a reef so steep that shadows fall; in both eyes."""
+    terrain = cliffs()
+    world, rng = world_of(terrain), np.random.default_rng(0)
+    casting = Shadows(terrain, RIG, [lamps_in(0), lamps_in(1)])
+    agree, dark = [], []
+    with Renderer(world, RIG.width_px, RIG.height_px, VFOV) as renderer:
+        for pose in POSES:
+            for eye in (0, 1):
+                world_from_eye = pose @ RIG.left_from_right if eye else pose
+                _, depth = renderer.render(world_from_eye)
+                lit = casting.lit(depth, world_from_eye, eye)
+                v, u = rng.integers(0, RIG.height_px, 3000), rng.integers(0, RIG.width_px, 3000)
+                points = points_of(depth, world_from_eye)[v, u]
+                for k, lamp in enumerate(geometry.transform(world_from_eye, lamps_in(eye))):
+                    expected = sees(world, lamp, points)
+                    agree.append(np.mean(lit[k, v, u] == expected))
+                    dark.append(1 - expected.mean())
+    assert np.min(agree) >= 0.995
+    assert np.mean(dark) > 0.03, "a floor without shadows says nothing"
+
+
+def wall(height_m: float, spacing_m: float = 0.05) -> types.SimpleNamespace:
+    """A flat floor, 10 m by 10 m, with a wall along y at x = 0, one cell to its foot on both sides."""
+    n = round(10 / spacing_m) + 1
+    height = np.zeros((n, n), np.float32)
+    height[:, n // 2] = height_m
+    return types.SimpleNamespace(height_m=height, spacing_m=spacing_m, west_m=-5.0, south_m=-5.0)
+
+
+def test_behind_a_wall_the_shadow_is_as_long_as_similar_triangles_say() -> None:
+    """Lamp 2 m high and 1 m before a wall of 0.5 m: dark up to 0.5 / (2 - 0.5) * 1 m behind it."""
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    lamp = geometry.transform(geometry.inverse(pose), np.array([[-1.0, 0.0, 2.0]]))
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)  # as if the eye saw through the wall
+    lit = Shadows(wall(0.5), RIG, [lamp, lamp]).lit(depth, pose, 0)[0]
+    x = points_of(depth, pose)[..., 0]
+    end_m, pixel_m = 0.5 / 1.5, 2.0 / RIG.focal_px
+    dark = (x > 0.06) & (x < end_m - pixel_m)  # beside the wall's own foot
+    assert not lit[dark].any() and lit[(x > end_m + pixel_m) | (x < -0.06)].all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> None:
+    """Spikes in every cell, lamps at all heights and beyond the grid: no block is skipped that should not be."""
+    rng = np.random.default_rng(seed)
+    floor = terrains.Terrain(
+        rng.normal(scale=0.2, size=(3 * BLOCK_CELLS + 2, 2 * BLOCK_CELLS + 1)).astype(np.float32), 0.1, -0.8, -1.2,
+        np.zeros((2, 2, 3), np.uint8), 1.0,
+    )  # fmt: skip
+    tops, rises = shadows._blocks(floor.height_m)
+    share = (np.arange(20000) + 0.5) / 20000
+    wrong = total = 0
+    for _ in range(250):
+        x, y = rng.uniform(-0.79, 0.79), rng.uniform(-1.19, 1.19)
+        start = np.array([x, y, float(floor.height_at(x, y))])
+        lamp = rng.uniform([-1.5, -1.5, 0.3], [1.5, 1.5, 2.0])
+        way = start + share[:, None] * (lamp - start)
+        over = floor.height_at(way[:, 0], way[:, 1]) - way[:, 2]
+        margin = np.nanmax(over)
+        if abs(margin - shadows.BIAS_M) < 2e-3:  # grazing: what the samples miss between them decides
+            continue
+        col, row = (x + 0.8) / 0.1, (y + 1.2) / 0.1
+        to = (lamp[0] - x) / 0.1, (lamp[1] - y) / 0.1, lamp[2] - start[2]
+        wrong += shadows._blocked(floor.height_m, tops, rises, col, row, start[2], *to) != (margin > 0)
+        total += 1
+    assert total > 60 and wrong == 0
+
+
+def test_the_lattice_fills_in_what_looking_at_every_pixel_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    lamp = geometry.transform(geometry.inverse(pose), np.array([[-1.0, 0.3, 2.0]]))
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
+    casting = Shadows(wall(0.5), RIG, [lamp, lamp])
+    got = casting.lit(depth, pose, 0)[0]
+    view = *casting._grid, depth, RIG.focal_px, pose, geometry.transform(pose, lamp)[0]
+    whole = np.empty_like(got)
+    shadows._look_between(*view, np.indices((61, 81)).sum(0).astype(np.uint8) % 2, whole)
+    # a wedge of shadow thinner than the lattice may slip through at its tip: none here
+    assert np.mean(got != whole) < 1e-3
+
+
+def test_no_floor_in_view_is_no_shadow() -> None:
+    depth = np.full((RIG.height_px, RIG.width_px), np.inf, np.float32)
+    assert Shadows(wall(1.0), RIG, [lamps_in(0), lamps_in(1)]).lit(depth, POSES[0], 0).all()
+
+
+def test_the_shadow_of_a_lamp_takes_its_light_and_leaves_the_others() -> None:
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
+    white, moment = np.full((*depth.shape, 3), 255, np.uint8), Moment(pose, 0.0)
+    high = types.SimpleNamespace(height_m=wall(1.0).height_m.T.copy(), spacing_m=0.05, west_m=-5.0, south_m=-5.0)
+
+    def light_of(lamps: list[dict], casts: bool) -> np.ndarray:
+        changes = {
+            "lamps": tuple(Lamp(**lamp) for lamp in lamps),
+            "imaging": SCENARIO.imaging.model_copy(update={"shadows": casts}),
+        }
+        return Light(SCENARIO.model_copy(update=changes), high, np.random.default_rng(0)).radiance(
+            white, depth, 0, moment
+        )
+
+    both, port, starboard = (light_of(lamps, True) for lamps in (LAMPS, LAMPS[:1], LAMPS[1:]))
+    np.testing.assert_allclose(both, port + starboard, rtol=1e-5)
+    free = light_of(LAMPS[:1], False)
+    dark = port[..., 1] == 0
+    assert 0.2 < dark.mean() < 0.8
+    np.testing.assert_array_equal(port[~dark], free[~dark])
