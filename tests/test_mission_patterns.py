@@ -23,7 +23,7 @@ SMALL = [
     "control.hold_s=0.4",
     "navigation.aiding=[]",
 ]
-LOOPS = [*SMALL, "plan.pattern=loops", "plan.area_m=[2.4, 2.4]", "plan.speed_mps=0.25", "plan.tracks=2"]
+LOOPS = [*SMALL, "plan.pattern=loops", "plan.area_m=[2.0, 2.0]", "plan.speed_mps=0.25", "plan.tracks=2"]
 FLAT = [*SMALL, "vehicle.dynamics=kinematic", "plan.area_m=[0.8, 0.5]"]
 
 
