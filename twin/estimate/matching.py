@@ -1,8 +1,6 @@
-"""Finding a patch again: local normalisation, corners, and Lucas-Kanade with one window for stereo and flow alike.
+"""Even images, points worth matching, and following them from frame to frame by Lucas-Kanade.
 
-Stereo and flow must average the relief over the same support: with different windows the flow sees less parallax than
-the depth promises, and the least squares trades translation for pitch until the path bends. So every match of the
-method goes through `track`, with the same patch.
+Stereo and the links between key points need more than Lucas-Kanade gives: `patches.register`.
 """
 
 from __future__ import annotations
@@ -94,11 +92,6 @@ def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: floa
     """Which points (n, 2) keep this distance from the image border."""
     x, y = points[:, 0], points[:, 1]
     return (x >= margin_px) & (y >= margin_px) & (x < shape[1] - margin_px) & (y < shape[0] - margin_px)
-
-
-def robust_sigma(values: NDArray[np.floating]) -> float:
-    """Standard deviation by the median absolute deviation from zero; infinite for fewer than 8 values."""
-    return float(1.4826 * np.median(np.abs(values))) if len(values) >= 8 else float("inf")
 
 
 def correlation(points: NDArray[np.floating], patch_px: int) -> float:
