@@ -233,3 +233,15 @@ def test_an_alignment_that_fails_is_told_and_the_rest_is_kept(tmp_path, monkeypa
         "global alignment failed: Indeterminate linear system",
     )
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05
+
+
+def test_a_full_disk_behind_the_survey_is_told_and_the_rest_is_kept(tmp_path, monkeypatch):
+    """Links are measured while the survey goes on: their fault comes to light when they are taken over."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("twin.estimate.network.share_noise", full)
+    result = fly(tmp_path / "run", "plan.area_m=[0.3, 0.5]", "estimate.use_ga=false")
+    assert (result.status, result.metrics["reason"]) == ("aborted", "[Errno 28] No space left on device")
+    assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05

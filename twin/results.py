@@ -43,7 +43,7 @@ def conclude(
     """Aligns, maps, judges and writes what was flown; `reason` tells why it ended early ("" if it did not)."""
     try:
         result = navigator.finish()
-    except SurveyAborted as error:
+    except (SurveyAborted, OSError) as error:
         result, reason = navigator.finish(), reason or str(error)
     for link in navigator.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)

@@ -15,6 +15,7 @@ import numpy as np
 from twin import geometry
 from twin.estimate import pose_filter
 from twin.estimate.key_points import KeyPoint
+from twin.estimate.pose_graph import gaussian
 from twin.estimate.velocity_log import Displacement, body_displacement
 from twin.geometry import Array
 from twin.records import SensorNoise, StereoRig
@@ -39,11 +40,6 @@ def add_readings(
         _add_fix(graph, node, noise)
     _add_beacons(graph, start, nodes, rig, noise)
     _add_displacements(graph, start, nodes, rig, noise)
-
-
-def gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
-    """Noise of this covariance, made symmetric to the last bit."""
-    return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
 
 
 def _add_height(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, noise: SensorNoise) -> None:

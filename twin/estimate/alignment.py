@@ -102,7 +102,7 @@ def _without_links(nodes, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGra
         pose = gtsam.Pose3(node.world_from_camera)
         start.insert(node.number, pose)
         if node.number in anchors:
-            graph.add(gtsam.PriorFactorPose3(node.number, pose, aiding.gaussian(anchors[node.number])))
+            graph.add(gtsam.PriorFactorPose3(node.number, pose, pose_graph.gaussian(anchors[node.number])))
     aiding.add_readings(graph, start, nodes, rig, noise)
     return graph, start
 

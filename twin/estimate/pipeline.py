@@ -115,7 +115,7 @@ class Navigator:
         """The truly global alignment over all tracks, and the trajectories.
 
         Raises:
-            SurveyAborted: the alignment failed; called again, it goes without.
+            SurveyAborted, OSError: the alignment or the measuring of links failed; called again, it goes without.
         """
         self._forget_unfinished()
         cov = np.tile(self.filter.cov, (len(self.keys), 1, 1))
@@ -245,9 +245,19 @@ class Navigator:
         return network.share_noise([*measured, chain] if chain else measured) + ([bridge] if bridge else [])
 
     def _take_links(self, all_but: int = 0) -> None:
-        """Takes over the links that were measured while the survey went on; only the alignment needs them."""
+        """Takes over the links that were measured while the survey went on; only the alignment needs them.
+
+        Raises:
+            OSError: images could not be read or written; what is left then is no network to align.
+        """
         while len(self.measuring) > all_but:
-            self.links += self.measuring.popleft().result()
+            try:
+                self.links += self.measuring[0].result()
+            except OSError:
+                self.measuring.clear()
+                self.alignable = False
+                raise
+            self.measuring.popleft()
 
     def _measure(self, node: KeyPoint, others: list[tuple[KeyPoint, float]]) -> list[Link]:
         """The links from earlier nodes (with the share of the node that they see) that could be measured."""

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from twin.estimate.aiding import gaussian
 from twin.geometry import Array
 from twin.records import Link
 
@@ -61,6 +60,11 @@ def between_factors(links: Sequence[Link], huber: float | None = None) -> list[g
     return [
         gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), _noise(link.cov, kernel)) for link in links
     ]
+
+
+def gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
+    """Noise of this covariance, made symmetric to the last bit."""
+    return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
 
 
 def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
