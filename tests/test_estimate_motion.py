@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twin import geometry
-from twin.estimate import motion
+from twin.estimate import motion, observation
 
 BASELINE_M = 0.15
 
@@ -24,7 +24,7 @@ def seen(points, a_from_b):
 def test_image_motion_is_the_derivative_of_the_projection():
     points = floor_points(np.random.default_rng(0), 20)
     x, y = (points[:, :2] / points[:, 2:]).T
-    rows = motion.image_motion(x, y, points[:, 2])
+    rows = observation.image_motion(x, y, points[:, 2])
     step = 1e-6
     for k in range(6):
         moved = [geometry.transform(geometry.inverse(geometry.exp(np.eye(6)[k] * s)), points) for s in (step, -step)]
@@ -36,7 +36,7 @@ def test_closed_form_returns_the_twist_that_made_the_flow():
     points = floor_points(np.random.default_rng(1))
     x, y = (points[:, :2] / points[:, 2:]).T
     twist = np.array([0.01, -0.02, 0.005, 0.03, 0.02, -0.01])
-    flow = motion.image_motion(x, y, points[:, 2]) @ twist
+    flow = observation.image_motion(x, y, points[:, 2]) @ twist
     solved, _ = motion.closed_form_motion(x, y, points[:, 2], flow, np.ones(len(x)))
     np.testing.assert_allclose(solved, twist, atol=1e-12)
 
@@ -82,13 +82,15 @@ def test_transfer_derivatives_agree_with_finite_differences():
     rng = np.random.default_rng(4)
     a_from_b = geometry.exp(rng.normal(size=6) * 0.1)
     b = seen(floor_points(rng, 5), a_from_b)[1]
-    _, by_point, by_motion = motion.transfer(b, a_from_b, BASELINE_M)
+    _, by_point, by_motion = observation.transfer(b, a_from_b, BASELINE_M)
     step = 1e-6
     for k in range(3):
-        up, down = (motion.transfer(b + s * np.eye(3)[k], a_from_b, BASELINE_M)[0] for s in (step, -step))
+        up, down = (observation.transfer(b + s * np.eye(3)[k], a_from_b, BASELINE_M)[0] for s in (step, -step))
         np.testing.assert_allclose(by_point[:, :, k], (up - down) / (2 * step), atol=1e-7)
     for k in range(6):
-        up, down = (motion.transfer(b, a_from_b @ geometry.exp(s * np.eye(6)[k]), BASELINE_M)[0] for s in (step, -step))
+        up, down = (
+            observation.transfer(b, a_from_b @ geometry.exp(s * np.eye(6)[k]), BASELINE_M)[0] for s in (step, -step)
+        )
         np.testing.assert_allclose(by_motion[:, :, k], (up - down) / (2 * step), atol=1e-7)
 
 

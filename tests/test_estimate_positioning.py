@@ -142,7 +142,7 @@ def test_pair_motion_is_right_to_millimetres_though_matching_starts_a_centimetre
     start = diver.rng.normal(size=6) * [0.003, 0.003, 0.003, 0.01, 0.01, 0.01]
     node, _, _ = diver.key_point(pose @ true, believed=pose @ true @ geometry.exp(start))
     matcher = network.PairMatch(RIG, diver.spool, PATCH_PX)
-    matched = matcher.flow(node, earlier)
+    matched = matcher.flows(node, [earlier])[0]
     assert matched is not None
     found = matcher.motion(node, earlier, matched)
     assert found is not None

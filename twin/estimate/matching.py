@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
@@ -32,9 +33,20 @@ def normalise(rgb: Image) -> Image:
     gray = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), _SMOOTH_PX)
     size = (gray.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
-    variance = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT) - mean * mean
-    deviation = np.sqrt(np.maximum(variance, 0.0)) + _FLAT_GRAY
-    return np.asarray(np.clip((gray - mean) / deviation * _GRAY_PER_SIGMA + 128.5, 0, 255), np.uint8)
+    square = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
+    even = np.empty(gray.shape, np.uint8)
+    _even(gray.ravel(), mean.ravel(), square.ravel(), even.ravel())
+    return even
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def _even(gray, mean, square, even):
+    """Fills `even` (n,) uint8 from grey levels, their local mean and local mean square."""
+    low, high, middle = np.float32(0), np.float32(255), np.float32(128.5)
+    for k in range(gray.size):
+        deviation = np.sqrt(max(square[k] - mean[k] * mean[k], low)) + np.float32(_FLAT_GRAY)
+        level = (gray[k] - mean[k]) / deviation * np.float32(_GRAY_PER_SIGMA) + middle
+        even[k] = np.uint8(min(max(level, low), high))
 
 
 def corners(image: Image, count: int, patch_px: int) -> Points:
@@ -101,5 +113,17 @@ def correlation(points: NDArray[np.floating], patch_px: int) -> float:
     """
     if len(points) == 0:
         return 1.0
-    gap = np.abs(points[:, None] - points[None]) / patch_px
-    return float(np.mean(np.prod(np.maximum(1 - gap, 0), axis=2).sum(axis=1)))
+    return _shared(np.ascontiguousarray(points, np.float64), float(patch_px)) / len(points)
+
+
+@njit(cache=True, nogil=True)
+def _shared(points, patch):
+    """Sum over all pairs of square patches, each with itself too, of the share of a patch that both have."""
+    total = float(len(points))
+    for i in range(len(points)):
+        for j in range(i):
+            wide = 1 - abs(points[i, 0] - points[j, 0]) / patch
+            high = 1 - abs(points[i, 1] - points[j, 1]) / patch
+            if wide > 0 and high > 0:
+                total += 2 * wide * high
+    return total

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin import geometry
-from twin.estimate import matching, motion, patches, stereo
+from twin.estimate import matching, motion, observation, patches, stereo
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.geometry import Array
 from twin.records import Link, StereoRig
@@ -107,30 +107,34 @@ class PairMatch:
         self._workers = ThreadPoolExecutor(2)
 
     def flows(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Matched | None]:
-        """`flow` to each of the others, two at a time."""
-        return list(self._workers.map(lambda other: self.flow(node, other), others))
+        """The node's points found in both images of each other pair, two pairs at a time; None where it has none."""
+        points = node.points
+        if points is None:
+            return [None for _ in others]
+        left, _ = self.spool.normalised(node.row)
+        cut = patches.cut(patches.pyramid(left, _LEVELS), points.pixels, self.patch_px)
+        return list(self._workers.map(lambda other: self._flow(node, points, cut, other), others))
 
-    def flow(self, node: KeyPoint, other: KeyPoint) -> Matched | None:
-        """The node's points found in both images of the other pair; None if there are none.
+    def _flow(
+        self, node: KeyPoint, points: stereo.StereoPoints, cut: Sequence[patches.Patches], other: KeyPoint
+    ) -> Matched:
+        """The points found in both images of one other pair.
 
         Matching starts from the flow that positions and depth predict (P11), and from how the plane under each patch
         looks from there.
         """
-        if node.points is None:
-            return None
-        rig, points = self.rig, node.points
+        rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        expected, by_point, _ = motion.transfer(points.measured, other_from_node, rig.baseline_m)
+        expected, by_point, _ = observation.transfer(points.measured, other_from_node, rig.baseline_m)
         warp = by_point[:, :, :2] + by_point[:, :, 2:] * points.slope[:, None, :]
         left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
         left_px = expected[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
         shift_px = np.column_stack([expected[:, 2] * rig.focal_px, np.zeros(len(expected))])
-        source = patches.pyramid(self.spool.normalised(node.row)[0], _LEVELS)
         left, right = self.spool.normalised(other.row)
         left_target = patches.splines(patches.pyramid(left, _LEVELS))
-        in_left = patches.register(source, left_target, points.pixels, left_px, left_warp, self.patch_px)
+        in_left = patches.register(cut, left_target, left_px, left_warp)
         right_px, right_target = in_left.points - shift_px, patches.splines([right])
-        in_right = patches.register(source, right_target, points.pixels, right_px, right_warp, self.patch_px)
+        in_right = patches.register(cut, right_target, right_px, right_warp)
         ok = in_left.ok & in_right.ok & stereo.on_one_row(in_left.points, in_right.points)
         in_node_px = (in_left.cov[ok] + in_right.cov[ok]) / 2
         cov = left_warp[ok] @ in_node_px @ left_warp[ok].transpose(0, 2, 1)

@@ -86,7 +86,7 @@ def points_of_pair(
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope
     guess = pixels - np.column_stack([disparity_px, np.zeros(len(pixels))])
-    match = patches.register([left], patches.splines([right]), pixels, guess, warp, patch_px)
+    match = patches.register(patches.cut([left], pixels, patch_px), patches.splines([right]), guess, warp)
     ok = match.ok & on_one_row(pixels, match.points)
     measured, cov = fuse(pixels[ok].astype(np.float64), match.points[ok], match.cov[ok], rig)
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
