@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twin.errors import SurveyAborted
-from twin.estimate.map_builder import KeyPointImages, build_map
 from twin.estimate.pipeline import Navigator
 from twin.geometry import Array
 from twin.judge.metrics import evaluate
@@ -64,15 +63,7 @@ def _map(
     n_keys = len(result.key_frames)
     if n_keys == 0:
         return None
-    return build_map(
-        (KeyPointImages(*navigator.spool.pair(int(row))) for row in result.key_frames),
-        result.final.world_from_camera[result.key_frames],
-        result.node_cov,
-        mission.rig,
-        mission.grid,
-        progress=lambda done: say(done / n_keys),
-        step_cov=_step_cov(result),
-    )
+    return navigator.vision.map(result, mission.grid, _step_cov(result), lambda done: say(done / n_keys))
 
 
 def _step_cov(result: SurveyResult) -> Array:
@@ -80,7 +71,7 @@ def _step_cov(result: SurveyResult) -> Array:
     cov = np.zeros((len(result.key_frames), 6, 6))
     for link in result.links:
         if link.j == link.i + 1:
-            cov[link.j] = link.cov
+            cov[link.j] = link.own_cov
     return cov
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from twin.config import Scenario
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
+from twin.estimate.vision import StereoVision
 from twin.mission import Mission, Step, prepare
 from twin.pilot import make_pilot
 from twin.records import Estimate
@@ -81,15 +82,8 @@ def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigato
     """The estimators with all they may know: calibration, data sheets, settings, the planned start."""
     scenario, rig = mission.scenario, mission.rig
     pixel_m = scenario.plan.altitude_m / rig.focal_px
-    return Navigator(
-        rig,
-        scenario.believed_noise(),
-        scenario.estimate,
-        mission.start,
-        pixel_m,
-        folder / "keypoints",
-        watch,
-    )
+    vision = StereoVision(rig, scenario.estimate, pixel_m, folder / "keypoints", watch)
+    return Navigator(vision, rig, scenario.believed_noise(), scenario.estimate, mission.start, watch)
 
 
 class _Watcher:

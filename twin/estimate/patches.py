@@ -8,8 +8,8 @@ What made matches err together, found against the twin's truth, and what is done
 - The lamps move with the vehicle, and a change of light across the patch shifts a match by about the texture's
   correlation length squared times its gradient (0.01 px on a lamp-lit reef, always backwards). So a ramp of
   brightness and a ramp of contrast are projected out.
-- Interpolation favours some sub-pixel places, by 0.014 px with cubic convolution on a rendered reef. Cubic splines leave
-  0.0055 px on waves of 2.5 px and longer, on slightly smoothed images (`matching.normalise`) 0.004 px.
+- Interpolation favours some sub-pixel places, by 0.014 px with cubic convolution on a rendered reef. Cubic splines
+  leave 0.0055 px on waves of 2.5 px and longer, on slightly smoothed images (`matching.normalise`) 0.004 px.
 
 Inverse compositional Gauss-Newton with nuisances projected out (Baker & Matthews 2004), coarse to fine; cubic B-spline
 interpolation (Unser 1999).

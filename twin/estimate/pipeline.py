@@ -8,22 +8,19 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin import geometry
 from twin.config import Estimation
 from twin.errors import SurveyAborted
-from twin.estimate import disparity, matching, network, stereo
+from twin.estimate import network
 from twin.estimate.alignment import Aligned, align
-from twin.estimate.f2f import FrameToFrame
-from twin.estimate.key_points import ImageSpool, KeyPoint
-from twin.estimate.mosaic import Mosaic
+from twin.estimate.key_points import KeyPoint
 from twin.estimate.pose_filter import PoseFilter
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
+from twin.estimate.vision import Vision
 from twin.geometry import Array
 from twin.records import Alignment, Estimate, Frame, Link, SensorNoise, StereoRig, SurveyResult, Trajectory
 
@@ -38,42 +35,34 @@ class Navigator:
     """Positions the vehicle from frames alone.
 
     Args:
+        vision: what answers for the stereo camera.
         rig, noise: calibration as believed.
         settings: the scenario's [estimate].
         start: (4, 4) world_from_camera of the reference position, where the survey begins by plan.
-        cell_m: cell of the mosaic, about a pixel's footprint.
-        folder: where the key points' images are spooled.
         watch: context manager per stage name.
     """
 
     def __init__(
         self,
+        vision: Vision,
         rig: StereoRig,
         noise: SensorNoise,
         settings: Estimation,
         start: Array,
-        cell_m: float,
-        folder: Path,
         watch: Callable[[str], AbstractContextManager[None]],
     ):
-        self.rig, self.noise, self.settings, self.watch = rig, noise, settings, watch
-        self.spool = ImageSpool(folder)
-        self.f2f = FrameToFrame(rig, settings.patch_px)
+        self.vision, self.rig, self.noise, self.settings, self.watch = vision, rig, noise, settings, watch
         self.velocity_log = VelocityLog(rig, noise)
         self.filter = PoseFilter(start.copy(), rig, noise)
-        self.mosaic = Mosaic(cell_m, folder / "mosaic")
-        self.matcher = network.PairMatch(rig, self.spool, settings.patch_px)
         self.f2f_pose = start.copy()
         self.since_node = (np.eye(4), np.zeros((6, 6)))
         self.cov_at_node = np.zeros((6, 6))
         self.alignable = True
-        self.reach = disparity.Reach(rig)
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
         self.links: list[Link] = []
         self.measuring: deque[Future[list[Link]]] = deque()
         self.behind = ThreadPoolExecutor(1)
-        self.depth_of_key: dict[int, NDArray[np.float16]] = {}
         self.times_s: list[float] = []
         self.f2f_poses: list[Array] = []
         self.online_poses: list[Array] = []
@@ -84,9 +73,7 @@ class Navigator:
 
     def update(self, frame: Frame, track: int) -> Estimate:
         """Takes one frame; a frame with a right image is a key point of the track (from 1)."""
-        with self.watch("f2f"):
-            image = matching.normalise(frame.left)
-            seen, status = self.f2f.step(image)
+        seen, status = self.vision.step(frame)
         self.f2f_pose = self.f2f_pose @ seen.a_from_b
         motion = self.velocity_log.aid(seen, frame.readings.dvl_mps)
         self.filter.predict(motion.a_from_b, motion.cov)
@@ -95,7 +82,7 @@ class Navigator:
         self.since_node = (relative @ motion.a_from_b, carry @ cov @ carry.T + motion.cov)
         self.filter.aid(frame.readings)
         if frame.right is not None:
-            status = self._visit_key_point(frame, image, track, status)
+            status = self._visit_key_point(frame, track, status)
         return self._record(frame, geometry.log(motion.a_from_b) * self.rig.frame_rate_hz, status)
 
     def align_track(self, track: int) -> None:
@@ -108,7 +95,7 @@ class Navigator:
         with self.watch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
         self._rebase(aligned)
-        self._relay_mosaic(track)
+        self.vision.relay([k for k in self.keys if k.track >= track])  # older ones are forgotten
         self.after_ga.append(self._key_poses())
 
     def finish(self) -> SurveyResult:
@@ -149,48 +136,32 @@ class Navigator:
         self.nodes = [k for k in self.nodes if k.row < n_frames]
         self.links = [link for link in self.links if link.j < len(self.keys)]
 
-    def _visit_key_point(self, frame: Frame, image: matching.Image, track: int, status: str) -> str:
+    def _visit_key_point(self, frame: Frame, track: int, status: str) -> str:
         """Stereo, F2M, mosaic and network at a key point; fresh points for F2F."""
-        assert frame.right is not None
-        with self.watch("stereo"):
-            right = matching.normalise(frame.right)
-            dense_px = disparity.search(image, right, self.reach.max_disparity_px)
-            self.reach.see(dense_px)
-            points = stereo.points_of_pair(
-                image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
-            )
-        if len(points.xyz) < 12:
+        points = self.vision.look(frame, len(self.times_s))
+        if points is None:
             self.filter.fix(frame.readings)
             return "too few points in stereo"
-        depth_m = self._depth(dense_px)
         key = KeyPoint(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
-        self.spool.put(key.row, frame.left, frame.right, (image, right))
         self.keys.append(key)
         is_node = key.number % self.settings.node_stride == 0
         chain = self._follow_chain(key) if is_node else None
         self.filter.fix(frame.readings)  # after the chain, so that it corrects what the chain leaves
         with self.watch("f2m"):
-            self._register_with_mosaic(image, points)
+            self._register_with_mosaic()
             key.world_from_camera = self.filter.world_from_camera
-            self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
-        self.depth_of_key[key.number] = depth_m.astype(np.float16)
+            self.vision.lay(key.number, key.world_from_camera)
         if is_node:
             self._connect(key, chain)
-        self.f2f.restart(image, points)
+        self.vision.restart()
         key.points = None  # links start from the new node's points: memory need not hold the old ones
         return status
 
-    def _depth(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth (height, width) [m], NaN where the disparity is unknown or below one pixel."""
-        usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
-        return (self.rig.focal_px * self.rig.baseline_m / usable).astype(np.float32)
-
-    def _register_with_mosaic(self, image: matching.Image, points: stereo.StereoPoints) -> None:
+    def _register_with_mosaic(self) -> None:
         """Corrects the position by the mosaic (F2M)."""
         if not self.settings.use_f2m:
             return
-        half_m = 0.6 * float(points.xyz[:, 2].max()) * self.rig.width_px / self.rig.focal_px
-        correction = self.mosaic.register(image, self.filter.world_from_camera, half_m, self.rig)
+        correction = self.vision.register(self.filter.world_from_camera)
         if correction is not None:
             cov = correction.cov + np.diag(_F2M_SIGMA**2)
             self.filter.correct_pose(self.filter.world_from_camera @ correction.a_from_b, cov)
@@ -261,14 +232,12 @@ class Navigator:
 
     def _measure(self, node: KeyPoint, others: list[tuple[KeyPoint, float]]) -> list[Link]:
         """The links from earlier nodes (with the share of the node that they see) that could be measured."""
-        with self.watch("flow"):
-            matches = self.matcher.flows(node, [other for other, _ in others])
-        links = []
-        for (other, share), matched in zip(others, matches, strict=True):
-            with self.watch("network"):
-                result = None if matched is None else self.matcher.motion(node, other, matched)
-            if result is not None:
-                links.append(network.to_link(node, other, share, result))
+        motions = self.vision.measure(node, [other for other, _ in others])
+        links = [
+            network.to_link(node, other, share, motion)
+            for (other, share), motion in zip(others, motions, strict=True)
+            if motion is not None
+        ]
         return links
 
     def _align(self, nodes: list[KeyPoint], track: int, marginals: list[int] | None) -> Aligned:
@@ -307,14 +276,6 @@ class Navigator:
         carry = geometry.adjoint(geometry.inverse(last_from_now))
         self.filter.reset(last.world_from_camera @ last_from_now, carry @ aligned.covs[-1] @ carry.T)
         self.cov_at_node = aligned.covs[-1]
-
-    def _relay_mosaic(self, track: int) -> None:
-        """Lays the mosaic anew with the aligned key points of the last track; older ones are forgotten."""
-        self.mosaic.clear()
-        self.depth_of_key = {n: d for n, d in self.depth_of_key.items() if self.keys[n].track >= track}
-        for number, depth in self.depth_of_key.items():
-            image = self.spool.normalised(self.keys[number].row)[0]
-            self.mosaic.add(image, depth.astype(np.float32), self.keys[number].world_from_camera, self.rig)
 
     def _key_poses(self) -> Array:
         return np.array([k.world_from_camera for k in self.keys]).reshape(-1, 4, 4)

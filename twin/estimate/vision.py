@@ -1,0 +1,167 @@
+"""What the method asks of the stereo camera: motion, points, corrections, links and a map; and how images answer.
+
+`pipeline.Navigator` knows the questions only, so whoever else answers them (a model of the errors, say) flies the same
+survey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.config import Estimation
+from twin.estimate import disparity, matching, stereo
+from twin.estimate.f2f import FrameToFrame
+from twin.estimate.key_points import ImageSpool, KeyPoint
+from twin.estimate.map_builder import KeyPointImages, build_map
+from twin.estimate.mosaic import Mosaic
+from twin.estimate.motion import Motion
+from twin.estimate.network import PairMatch
+from twin.estimate.stereo import StereoPoints
+from twin.geometry import Array
+from twin.records import ElevationMap, Frame, MapGrid, StereoRig, SurveyResult
+
+_LEAST_POINTS = 12  # of a key point
+
+
+class Vision(Protocol):
+    """The stereo camera as the method uses it. Poses are (4, 4) of the left camera, motions as of `Motion`."""
+
+    def step(self, frame: Frame) -> tuple[Motion, str]:
+        """F2F: the motion since the last frame, and "ok" or why it failed."""
+        ...
+
+    def look(self, frame: Frame, row: int) -> StereoPoints | None:
+        """Stereo at a key point, which is row `row` of the trajectory; None where too few points are found."""
+        ...
+
+    def restart(self) -> None:
+        """F2F goes on from the key point just looked at."""
+        ...
+
+    def register(self, world_from_camera: Array) -> Motion | None:
+        """F2M: correction of the predicted pose of the key point; None where the mosaic does not tell."""
+        ...
+
+    def lay(self, number: int, world_from_camera: Array) -> None:
+        """Lays the key point into the mosaic."""
+        ...
+
+    def relay(self, keys: Sequence[KeyPoint]) -> None:
+        """Lays the mosaic anew with these key points alone, the last ones of the path."""
+        ...
+
+    def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
+        """Motion from each of other nodes to this one; None where images do not tell. Safe to call from a thread."""
+        ...
+
+    def map(
+        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
+    ) -> ElevationMap:
+        """The elevation map along the final trajectory."""
+        ...
+
+
+class StereoVision:
+    """Vision by the images themselves.
+
+    Args:
+        rig: calibration as believed.
+        settings: the scenario's [estimate].
+        cell_m: cell of the mosaic, about a pixel's footprint.
+        folder: where the key points' images and the mosaic's tiles are spooled.
+        watch: context manager per stage name.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        settings: Estimation,
+        cell_m: float,
+        folder: Path,
+        watch: Callable[[str], AbstractContextManager[None]],
+    ):
+        self.rig, self.settings, self.watch = rig, settings, watch
+        self.spool = ImageSpool(folder)
+        self.f2f = FrameToFrame(rig, settings.patch_px)
+        self.mosaic = Mosaic(cell_m, folder / "mosaic")
+        self.matcher = PairMatch(rig, self.spool, settings.patch_px)
+        self.reach = disparity.Reach(rig)
+        self._depth_of_key: dict[int, NDArray[np.float16]] = {}
+        self._image = np.zeros((rig.height_px, rig.width_px), np.uint8)
+        self._depth_m = np.zeros((rig.height_px, rig.width_px), np.float32)
+        self._points: StereoPoints | None = None
+
+    def step(self, frame: Frame) -> tuple[Motion, str]:
+        with self.watch("f2f"):
+            self._image = matching.normalise(frame.left)
+            return self.f2f.step(self._image)
+
+    def look(self, frame: Frame, row: int) -> StereoPoints | None:
+        assert frame.right is not None
+        with self.watch("stereo"):
+            right = matching.normalise(frame.right)
+            dense_px = disparity.search(self._image, right, self.reach.max_disparity_px)
+            self.reach.see(dense_px)
+            points = stereo.points_of_pair(
+                self._image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
+            )
+        if len(points.xyz) < _LEAST_POINTS:
+            return None
+        self._points, self._depth_m = points, _depth(dense_px, self.rig)
+        self.spool.put(row, frame.left, frame.right, (self._image, right))
+        return points
+
+    def restart(self) -> None:
+        if self._points is not None:
+            self.f2f.restart(self._image, self._points)
+
+    def register(self, world_from_camera: Array) -> Motion | None:
+        assert self._points is not None
+        half_m = 0.6 * float(self._points.xyz[:, 2].max()) * self.rig.width_px / self.rig.focal_px
+        return self.mosaic.register(self._image, world_from_camera, half_m, self.rig)
+
+    def lay(self, number: int, world_from_camera: Array) -> None:
+        self.mosaic.add(self._image, self._depth_m, world_from_camera, self.rig)
+        self._depth_of_key[number] = self._depth_m.astype(np.float16)
+
+    def relay(self, keys: Sequence[KeyPoint]) -> None:
+        self.mosaic.clear()
+        self._depth_of_key = {k.number: self._depth_of_key[k.number] for k in keys}
+        for key in keys:
+            image = self.spool.normalised(key.row)[0]
+            depth_m = self._depth_of_key[key.number].astype(np.float32)
+            self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
+
+    def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
+        with self.watch("flow"):
+            matches = self.matcher.flows(node, others)
+        motions: list[Motion | None] = []
+        for other, matched in zip(others, matches, strict=True):
+            with self.watch("network"):
+                motions.append(None if matched is None else self.matcher.motion(node, other, matched))
+        return motions
+
+    def map(
+        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
+    ) -> ElevationMap:
+        return build_map(
+            (KeyPointImages(*self.spool.pair(int(row))) for row in result.key_frames),
+            result.final.world_from_camera[result.key_frames],
+            result.node_cov,
+            self.rig,
+            grid,
+            progress=progress,
+            step_cov=step_cov,
+        )
+
+
+def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
+    """Depth (height, width) [m], NaN where the disparity is unknown or below one pixel."""
+    usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
+    return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)
