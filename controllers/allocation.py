@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -34,11 +35,16 @@ class Allocation(NamedTuple):
 
         A wrench beyond reach is scaled down as a whole: its direction is kept.
         """
-        thrusts = self.thrusts_from_wrench @ wrench
-        astern, ahead = self.range_n
-        load = float(np.max(np.where(thrusts > 0, thrusts / ahead, thrusts / astern)))
-        share = 1.0 / max(1.0, load)
-        return np.interp(share * thrusts, self.thrust_table_n, self.command_table), share
+        return _commands(self.thrusts_from_wrench, self.thrust_table_n, self.command_table, wrench)
+
+
+@njit(cache=True, nogil=True)
+def _commands(thrusts_from_wrench, thrust_table, command_table, wrench):
+    thrusts = thrusts_from_wrench @ wrench
+    load = 1.0
+    for thrust in thrusts:
+        load = max(load, thrust / (thrust_table[-1] if thrust > 0 else thrust_table[0]))
+    return np.interp(thrusts / load, thrust_table, command_table), 1 / load
 
 
 def allocation(effects: Array, thrust_of_command: Callable[[Array], Array], weights: Array | None = None) -> Allocation:

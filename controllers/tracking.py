@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from controllers.allocation import Allocation
@@ -32,14 +33,17 @@ class HullModel(NamedTuple):
     linear_drag: Array
     quadratic_drag: Array
 
-    def cruise_wrench(self, velocity: Array) -> Array:
-        """The wrench that keeps up a velocity (3,) in still water: drag, and v x M_A v against the Munk moment.
 
-        The Munk moment turns a hull broadside. At survey speed it outweighs this vehicle's righting moment in pitch.
-        """
-        drag = (self.linear_drag[3:] + self.quadratic_drag[3:] * np.abs(velocity)) * velocity
-        (u, v, w), (m_x, m_y, m_z) = velocity, self.added_mass
-        return np.array([(m_z - m_y) * v * w, (m_x - m_z) * w * u, (m_y - m_x) * u * v, *drag])
+@njit(cache=True, nogil=True)
+def cruise_wrench(hull: HullModel, velocity: Array) -> Array:
+    """The wrench (6,) that keeps up a velocity (3,) in still water: drag, and v x M_A v against the Munk moment.
+
+    The Munk moment turns a hull broadside. At survey speed it outweighs this vehicle's righting moment in pitch.
+    """
+    u, v, w = velocity
+    x, y, z = hull.added_mass
+    drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
+    return np.array([(z - y) * v * w, (x - z) * w * u, (y - x) * u * v, drag[0], drag[1], drag[2]])
 
 
 class Gains(NamedTuple):
@@ -95,31 +99,60 @@ class Pilot:
             twist_body: (6,) estimated [angular, linear] velocity in the body [rad/s, m/s].
             reference: of the body, in the world.
         """
-        rotation = world_from_body[:3, :3]
-        error = _pose_error(world_from_body, reference)
-        velocity = reference.velocity @ rotation
-        rate_error = np.concatenate([np.zeros(3), velocity]) - twist_body
-        acceleration = self._gains.error * error + self._gains.rate * rate_error
-        acceleration += np.concatenate([self._integral[:3], (self._integral[3:] + reference.acceleration) @ rotation])
-        wrench = self._hull.inertia * acceleration + self._hull.cruise_wrench(velocity)
+        wrench, error = _wrench(
+            world_from_body, twist_body, reference.position, reference.velocity, reference.acceleration,
+            float(reference.yaw), self._hull, self._gains, self._integral,
+        )  # fmt: skip
         commands, share = self._allocation.commands(wrench)
-        self._integrate(np.concatenate([error[:3], rotation @ error[3:]]), saturated=share < 1)
+        self._integral = _integrated(self._integral, self._gains.integral * self._period_s, error, share < 1)
         return commands
 
-    def _integrate(self, error: Array, saturated: bool) -> None:
-        """Grows the integral within its limits; while the thrusters saturate it may only shrink (anti-windup)."""
-        grown = self._integral + self._gains.integral * error * self._period_s
-        grown = np.clip(grown, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
-        held = saturated & (np.abs(grown) > np.abs(self._integral))
-        self._integral = np.where(held, self._integral, grown)
+
+@njit(cache=True, nogil=True)
+def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, integral):
+    """Wrench [moment, force] in the body (6,), and the error behind it, [rotation in the body, way in the world]."""
+    error = _pose_error(pose, position, yaw)
+    ahead = _into_body(pose, velocity)
+    push = _into_body(pose, integral[3:] + acceleration)
+    wanted = gains.error * error - gains.rate * twist
+    for k in range(3):
+        wanted[k] += integral[k]
+        wanted[3 + k] += gains.rate[3 + k] * ahead[k] + push[k]
+    wrench = hull.inertia * wanted + cruise_wrench(hull, ahead)
+    in_world = error.copy()
+    for i in range(3):
+        in_world[3 + i] = position[i] - pose[i, 3]
+    return wrench, in_world
 
 
-def _pose_error(world_from_body: Array, reference: Reference) -> Array:
+@njit(cache=True, nogil=True)
+def _integrated(integral, gain, error, saturated):
+    """The integral grown within its limits; while the thrusters saturate it may only shrink (anti-windup)."""
+    result = integral.copy()
+    for k in range(6):
+        grown = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
+        if not (saturated and abs(grown) > abs(integral[k])):
+            result[k] = grown
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _into_body(pose, vector):
+    """A vector (3,) of the world in the axes of a body."""
+    result = np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            result[i] += pose[k, i] * vector[k]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _pose_error(pose, position, yaw):
     """What is missing from the pose to a level reference, [rotation, translation] in the body [rad, m]. -> (6,)."""
-    c, s = np.cos(reference.yaw), np.sin(reference.yaw)
-    wanted = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    rotation = world_from_body[:3, :3]
-    turn = rotation.T @ wanted
+    c, s = np.cos(yaw), np.sin(yaw)
+    # of body_from_wanted, column by column: the body's axes seen from the level reference
+    x, y = _into_body(pose, np.array([c, s, 0.0])), _into_body(pose, np.array([-s, c, 0.0]))
+    z = _into_body(pose, np.array([0.0, 0.0, 1.0]))
+    way = _into_body(pose, position - pose[:3, 3])
     # half the antisymmetric part: the rotation vector for small angles, bounded for large ones
-    angles = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    return np.concatenate([angles, (reference.position - world_from_body[:3, 3]) @ rotation])
+    return np.array([0.5 * (y[2] - z[1]), 0.5 * (z[0] - x[2]), 0.5 * (x[1] - y[0]), way[0], way[1], way[2]])

@@ -1,12 +1,15 @@
 """Rigid motions: laws, also near identity and near half a turn, and MuJoCo and scipy as oracles."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from scenes.gl import mujoco
 from twin import geometry as g
+
+settings.register_profile("compiling", deadline=None)  # the first call of a kernel compiles it
+settings.load_profile("compiling")
 
 ANGLES = st.one_of(
     st.floats(0, 1e-9), st.floats(1e-9, 1e-3), st.floats(1e-3, 3.0), st.floats(np.pi - 1e-3, np.pi - 1e-6)

@@ -8,6 +8,7 @@ from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin import geometry
 from twin.config import Vehicle as Section
 from twin.errors import SurveyAborted
+from twin.simulate.free_body import FreeBody
 from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
 from twin.simulate.vehicle import Vehicle, hull_of, physics_timestep_s
 
@@ -181,3 +182,19 @@ def test_a_whole_number_of_physics_steps_makes_a_frame(rate_hz):
 def test_a_fraction_of_a_physics_step_is_refused():
     with pytest.raises(ValueError, match="no whole number of steps"):
         vehicle().step(IDLE, 0.3 * STEP_S)
+
+
+def test_the_body_without_a_world_moves_as_mujoco_moves_it():
+    """A minute of erratic commands in a current: what remains is rounding, amplified by the turns."""
+    rng = np.random.default_rng(5)
+    start = geometry.exp(np.array([0.1, -0.05, 0.8, 1.0, 2.0, -3.0]))
+    current = np.array([0.1, -0.05, 0.02])
+    ours = FreeBody(Section(drag_factor=1.3), current, start, 1 / 120)
+    theirs = vehicle(start, current, buoyancy_n=1.0, drag_factor=1.3)
+    for _ in range(600):
+        command = rng.uniform(-0.4, 0.4, 8)
+        for body in (ours, theirs):
+            body.step(command, 0.1)
+    assert np.linalg.norm(theirs.world_from_body[:3, 3] - start[:3, 3]) > 1.0
+    np.testing.assert_allclose(ours.world_from_body, theirs.world_from_body, atol=1e-8)
+    np.testing.assert_allclose(ours.twist_body, theirs.twist_body, atol=1e-8)

@@ -10,6 +10,7 @@ centre of the top-left pixel.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -19,23 +20,32 @@ Array = NDArray[np.float64]
 BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
+@njit(cache=True, nogil=True)
 def skew(v: Array) -> Array:
     """The matrix whose product with x is the cross product v x x. (3,) -> (3, 3)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
+@njit(cache=True, nogil=True)
 def pose(rotation: Array, position: Array) -> Array:
     """A pose from a (3, 3) rotation and a (3,) position [m]."""
-    result = np.eye(4)
+    result = np.zeros((4, 4))
     result[:3, :3] = rotation
     result[:3, 3] = position
+    result[3, 3] = 1.0
     return result
 
 
+@njit(cache=True, nogil=True)
 def inverse(a_from_b: Array) -> Array:
     """b_from_a, exactly rigid. (4, 4) -> (4, 4)."""
-    rotation = a_from_b[:3, :3].T
-    return pose(rotation, -rotation @ a_from_b[:3, 3])
+    result = np.zeros((4, 4))
+    for i in range(3):
+        for k in range(3):
+            result[i, k] = a_from_b[k, i]
+            result[i, 3] -= a_from_b[k, i] * a_from_b[k, 3]
+    result[3, 3] = 1.0
+    return result
 
 
 def rigid(almost: Array) -> Array:
@@ -44,58 +54,92 @@ def rigid(almost: Array) -> Array:
     return pose(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, almost[:3, 3])
 
 
+@njit(cache=True, nogil=True)
 def so3_exp(w: Array) -> Array:
     """Rotation matrix of a rotation vector [rad], by the formula of Rodrigues, exact near identity. (3,) -> (3, 3)."""
-    angle2 = float(w @ w)
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-4:
         a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    k = skew(w)
-    return np.eye(3) + a * k + b * (k @ k)
+    return _of_powers(w, a, b)
 
 
-def so3_log(rotation: Array) -> Array:
-    """Rotation vector [rad] of a rotation matrix, angle in [0, pi]. (3, 3) -> (3,)."""
-    twice = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine, cosine = 0.5 * np.sqrt(twice @ twice), 0.5 * (rotation[0, 0] + rotation[1, 1] + rotation[2, 2] - 1.0)
-    if cosine < -0.9:  # near half a turn the difference above says nothing
-        return Rotation.from_matrix(rotation).as_rotvec()
-    scale = 0.5 if sine < 1e-8 else 0.5 * np.arctan2(sine, cosine) / sine
-    return scale * twice
-
-
+@njit(cache=True, nogil=True)
 def _left_jacobian(w: Array) -> Array:
-    angle2 = float(w @ w)
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-3:
         a, b = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
     else:
         a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
-    k = skew(w)
-    return np.eye(3) + a * k + b * (k @ k)
+    return _of_powers(w, a, b)
 
 
+@njit(cache=True, nogil=True)
+def _of_powers(w: Array, a: float, b: float) -> Array:
+    """I + a K + b K^2 with K the cross product by w; K^2 = w w' - |w|^2 I."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    result = a * skew(w)
+    for i in range(3):
+        for k in range(3):
+            result[i, k] += b * w[i] * w[k]
+        result[i, i] += 1.0 - b * angle2
+    return result
+
+
+@njit(cache=True, nogil=True)
+def so3_log(rotation: Array) -> Array:
+    """Rotation vector [rad] of a rotation matrix, angle in [0, pi]. (3, 3) -> (3,)."""
+    w = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    sine = 0.5 * np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    cosine = 0.5 * (rotation[0, 0] + rotation[1, 1] + rotation[2, 2] - 1.0)
+    if cosine < -0.9:  # near half a turn the difference above says little: the axis is in the diagonal
+        i = 0
+        for k in range(1, 3):
+            if rotation[k, k] > rotation[i, i]:
+                i = k
+        axis = np.zeros(3)
+        for k in range(3):
+            axis[k] = 0.5 * (rotation[i, k] + rotation[k, i]) - (cosine if k == i else 0.0)
+        length = np.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
+        forth = axis[0] * w[0] + axis[1] * w[1] + axis[2] * w[2] >= 0
+        return axis * ((1.0 if forth else -1.0) * np.arctan2(sine, cosine) / length)
+    return w * (0.5 if sine < 1e-8 else 0.5 * np.arctan2(sine, cosine) / sine)
+
+
+@njit(cache=True, nogil=True)
 def exp(motion: Array) -> Array:
     """Pose reached by a twist [rotation, translation] (rad, m) held for unit time. (6,) -> (4, 4)."""
-    return pose(so3_exp(motion[:3]), _left_jacobian(motion[:3]) @ motion[3:])
+    w = motion[:3]
+    jacobian, way = _left_jacobian(w), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            way[i] += jacobian[i, k] * motion[3 + k]
+    return pose(so3_exp(w), way)
 
 
+@njit(cache=True, nogil=True)
 def log(a_from_b: Array) -> Array:
     """Twist [rotation, translation] of a pose: the inverse of `exp`. (4, 4) -> (6,)."""
-    w = so3_log(a_from_b[:3, :3])
-    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), a_from_b[:3, 3])], dtype=np.float64)
+    result = np.empty(6)
+    result[:3] = so3_log(a_from_b[:3, :3])
+    result[3:] = np.linalg.solve(_left_jacobian(result[:3]), a_from_b[:3, 3].copy())
+    return result
 
 
+@njit(cache=True, nogil=True)
 def adjoint(a_from_b: Array) -> Array:
     """The 6x6 matrix that carries a motion in b into a: a_from_b exp(m) = exp(Ad m) a_from_b."""
-    rotation = a_from_b[:3, :3]
     result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = rotation
-    result[3:, :3] = skew(a_from_b[:3, 3]) @ rotation
+    x, y, z = a_from_b[0, 3], a_from_b[1, 3], a_from_b[2, 3]
+    for k in range(3):
+        r0, r1, r2 = a_from_b[0, k], a_from_b[1, k], a_from_b[2, k]
+        result[0, k] = result[3, 3 + k] = r0
+        result[1, k] = result[4, 3 + k] = r1
+        result[2, k] = result[5, 3 + k] = r2
+        result[3, k], result[4, k], result[5, k] = y * r2 - z * r1, z * r0 - x * r2, x * r1 - y * r0
     return result
 
 

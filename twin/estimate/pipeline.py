@@ -17,7 +17,7 @@ from twin.errors import SurveyAborted
 from twin.estimate import network
 from twin.estimate.alignment import Aligned, align
 from twin.estimate.key_points import KeyPoint
-from twin.estimate.pose_filter import PoseFilter
+from twin.estimate.pose_filter import PoseFilter, carried
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.estimate.vision import Vision
@@ -77,9 +77,8 @@ class Navigator:
         self.f2f_pose = self.f2f_pose @ seen.a_from_b
         motion = self.velocity_log.aid(seen, frame.readings.dvl_mps)
         self.filter.predict(motion.a_from_b, motion.cov)
-        carry = geometry.adjoint(geometry.inverse(motion.a_from_b))
         relative, cov = self.since_node
-        self.since_node = (relative @ motion.a_from_b, carry @ cov @ carry.T + motion.cov)
+        self.since_node = (relative @ motion.a_from_b, carried(cov, motion.a_from_b) + motion.cov)
         self.filter.aid(frame.readings)
         if frame.right is not None:
             status = self._visit_key_point(frame, track, status)
@@ -180,8 +179,8 @@ class Navigator:
             return None
         link = links[0]
         aided = geometry.inverse(last.world_from_camera @ walked) @ self.filter.world_from_camera
-        carry = geometry.adjoint(geometry.inverse(link.i_from_j))
-        self.filter.reset(last.world_from_camera @ link.i_from_j @ aided, carry @ self.cov_at_node @ carry.T + link.cov)
+        cov = carried(self.cov_at_node, link.i_from_j) + link.cov
+        self.filter.reset(last.world_from_camera @ link.i_from_j @ aided, cov)
         node.world_from_camera = self.filter.world_from_camera
         return link
 
@@ -273,8 +272,7 @@ class Navigator:
         """Moves the online position along with the last key point."""
         last = self.keys[-1]
         last_from_now = geometry.inverse(self.online_poses[last.row]) @ self.filter.world_from_camera
-        carry = geometry.adjoint(geometry.inverse(last_from_now))
-        self.filter.reset(last.world_from_camera @ last_from_now, carry @ aligned.covs[-1] @ carry.T)
+        self.filter.reset(last.world_from_camera @ last_from_now, carried(aligned.covs[-1], last_from_now))
         self.cov_at_node = aligned.covs[-1]
 
     def _key_poses(self) -> Array:

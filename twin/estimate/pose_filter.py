@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from twin import geometry
 from twin.geometry import Array
@@ -22,9 +23,8 @@ class PoseFilter:
 
     def predict(self, a_from_b: Array, cov: Array) -> None:
         """Composes a relative motion with its covariance, eqs. (3) to (5)."""
-        carry = geometry.adjoint(geometry.inverse(a_from_b))
         self.world_from_camera = self.world_from_camera @ a_from_b
-        self.cov = carry @ self.cov @ carry.T + cov
+        self.cov = carried(self.cov, a_from_b) + cov
 
     def correct_pose(self, measured: Array, cov: Array) -> bool:
         """Fuses a measured pose; refused (False) where it contradicts the prediction beyond both uncertainties."""
@@ -69,10 +69,22 @@ class PoseFilter:
         self.world_from_camera, self.cov = geometry.rigid(world_from_camera), cov
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
-        gain = np.linalg.solve(jacobian @ self.cov @ jacobian.T + cov, jacobian @ self.cov).T
-        self.world_from_camera = self.world_from_camera @ geometry.exp(gain @ residual)
-        keep = np.eye(6) - gain @ jacobian
-        self.cov = keep @ self.cov @ keep.T + gain @ cov @ gain.T
+        self.world_from_camera, self.cov = _updated(self.world_from_camera, self.cov, residual, jacobian, cov)
+
+
+@njit(cache=True, nogil=True)
+def carried(cov: Array, a_from_b: Array) -> Array:
+    """The covariance (6, 6) of pose a, in the axes of b that it is carried to."""
+    carry = geometry.adjoint(geometry.inverse(a_from_b))
+    return carry @ cov @ carry.T
+
+
+@njit(cache=True, nogil=True)
+def _updated(world_from_camera, prior, residual, jacobian, cov):
+    """Pose and covariance after an observation (k,) with its derivative (k, 6) and covariance (k, k); Joseph's form."""
+    gain = np.linalg.solve(jacobian @ prior @ jacobian.T + cov, jacobian @ prior).T.copy()
+    keep = np.eye(6) - gain @ jacobian
+    return world_from_camera @ geometry.exp(gain @ residual), keep @ prior @ keep.T + gain @ cov @ gain.T
 
 
 def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,11 +25,18 @@ class NavigationSensors:
         settings: which sensors aid, and how often an acoustic fix is taken.
         noise: as their data sheets give it; the beacons stand where they were surveyed.
         rng: a stream for each of "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
+        project: the true left camera: frame's pixels (n, 2) of points (n, 3) in it; the believed one where None.
     """
 
     def __init__(
-        self, settings: Navigation, noise: SensorNoise, rig: StereoRig, rng: Mapping[str, np.random.Generator]
+        self,
+        settings: Navigation,
+        noise: SensorNoise,
+        rig: StereoRig,
+        rng: Mapping[str, np.random.Generator],
+        project: Callable[[Array], Array] | None = None,
     ):
+        self._project = rig.project if project is None else project
         self._aiding, self._noise, self._rig, self._rng = settings.aiding, noise, rig, rng
         self._dvl = DopplerLog(noise, rng["dvl"])
         self._usbl = AcousticFix(noise, settings.usbl_interval_s, rng["usbl"])
@@ -50,7 +57,7 @@ class NavigationSensors:
         fix = sightings = None
         if depth_m is not None:
             fix = self._usbl.read(time_s, world_from_camera[:3, 3])
-            sightings = sight_beacons(world_from_camera, depth_m, self._rig, self._noise, self._rng["beacons"])
+            sightings = sight_beacons(world_from_camera, depth_m, self._project, self._noise, self._rng["beacons"])
         return replace(
             readings,
             dvl_mps=velocity if "dvl" in self._aiding else None,
@@ -113,16 +120,24 @@ class AcousticFix:
 
 
 def sight_beacons(
-    world_from_camera: Array, depth_m: Depth, rig: StereoRig, noise: SensorNoise, rng: np.random.Generator
+    world_from_camera: Array,
+    depth_m: Depth,
+    project: Callable[[Array], Array],
+    noise: SensorNoise,
+    rng: np.random.Generator,
 ) -> tuple[Sighting, ...]:
     """What a detector says of the beacons in the left image; the floor hides what lies behind it.
 
     Noise is drawn for every beacon, so that no draw depends on which of them are in view.
+
+    Args:
+        depth_m: (height, width) of the left image.
+        project: pixels (n, 2) of points (n, 3) in the left camera.
     """
     beacons = np.array(noise.beacons_m).reshape(-1, 3)
     errors_px = noise.beacon_px * rng.standard_normal((len(beacons), 2))
     points = geometry.transform(geometry.inverse(world_from_camera), beacons)
-    pixels = rig.project(points)
+    pixels = project(points)
     visible = (k for k in range(len(beacons)) if _in_view(pixels[k], points[k, 2], depth_m))
     return tuple(Sighting(k, (float(u), float(v))) for k in visible for u, v in [pixels[k] + errors_px[k]])
 

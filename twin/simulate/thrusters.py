@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
@@ -50,9 +51,24 @@ class LaggedThrusters:
         """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
         self._steady_n = steady_thrust_n(np.clip(command, -1, 1), self._coefficients)
 
+    def wrenches(self, n_steps: int) -> Array:
+        """Their wrench at the beginning of each of the next steps (n_steps, 6), which are then over."""
+        thrusts, self._state = _thrusts(self._a, self._b, self._c, self._state, self._steady_n, n_steps)
+        return thrusts @ self._effects.T
+
     def step(self) -> None:
         """One step under the last commands."""
         self._state = self._a @ self._state + self._b * self._steady_n
+
+
+@njit(cache=True, nogil=True)
+def _thrusts(a, b, c, state, steady, n_steps):
+    """Thrusts (n_steps, n) at the beginning of each step, and the state after them."""
+    thrusts = np.empty((n_steps, state.shape[1]))
+    for k in range(n_steps):
+        thrusts[k] = c @ state
+        state = a @ state + b * steady
+    return thrusts, state
 
 
 def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
@@ -65,4 +81,4 @@ def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
     rates[0, :n], rates[0, n] = -denominator[1:], 1.0
     rates[1:n, : n - 1] = np.eye(n - 1)
     step = np.asarray(expm(rates * timestep_s), dtype=np.float64)
-    return step[:n, :n], step[:n, n:]
+    return step[:n, :n].copy(), step[:n, n:].copy()
