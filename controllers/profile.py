@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 
-class SpeedProfile(NamedTuple):
+@dataclass(frozen=True)
+class SpeedProfile:
     """Speeds up at a constant rate, cruises, slows down at the same rate; a triangle where the segment is too short.
 
     Args:
@@ -19,12 +21,12 @@ class SpeedProfile(NamedTuple):
     cruise_mps: float
     acceleration_mps2: float
 
-    @property
+    @cached_property
     def peak_mps(self) -> float:
         """The speed that is reached."""
         return min(self.cruise_mps, math.sqrt(self.length_m * self.acceleration_mps2))
 
-    @property
+    @cached_property
     def duration_s(self) -> float:
         return self.length_m / self.peak_mps + self.peak_mps / self.acceleration_mps2
 

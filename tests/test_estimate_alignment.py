@@ -118,3 +118,29 @@ def test_pressure_and_attitude_bound_what_links_alone_cannot():
     held = align(key_points(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
     assert abs(free[2, 3] - 2.0) > 0.3
     assert abs(held[2, 3] - 2.0) < 0.01
+
+
+def test_a_link_of_the_path_itself_always_stands():
+    """A wrong one contradicts its neighbours, but without it the path may fall apart."""
+    poses, links = small_network(np.random.default_rng(3))
+    links[2] = links[2]._replace(i_from_j=links[2].i_from_j @ geometry.exp(np.array([0, 0, 0, 0.3, 0, 0])))
+    aligned = align(key_points(poses), links, ANCHOR, RIG, NOISE)
+    assert all(link.j - link.i > 1 for link in aligned.dropped)
+
+
+def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_noise():
+    """The attitude's covariance by finite differences of the angles; east and north stay free."""
+    body = np.array([0.1, -0.2, 0.7])
+
+    def camera(rpy):
+        return geometry.rotation_from_rpy(*rpy) @ RIG.body_from_camera[:3, :3]
+
+    pose, wide = geometry.pose(camera(body), np.array([1.0, 2.0, 3.0])), {0: np.eye(6) * 1e2}
+    cov = align(key_points([pose], [Readings(3.0, body)]), [], wide, RIG, NOISE).covs[0]
+    np.testing.assert_allclose(pose[2, :3] @ cov[3:, 3:] @ pose[2, :3], NOISE.pressure_m**2, rtol=1e-3)
+    turned = [geometry.so3_exp(step) for step in np.eye(3) * 1e-6]  # about the body's axes, as the data sheet has it
+    in_camera = [geometry.so3_log(camera(body).T @ geometry.rotation_from_rpy(*body) @ r @ RIG.body_from_camera[:3, :3])
+                 / 1e-6 for r in turned]  # fmt: skip
+    by_body = np.column_stack(in_camera)
+    sigma = np.diag([NOISE.attitude_rad, NOISE.attitude_rad, NOISE.heading_rad])
+    np.testing.assert_allclose(cov[:3, :3], by_body @ sigma**2 @ by_body.T, rtol=1e-3, atol=1e-9)

@@ -112,6 +112,20 @@ def test_pair_motion_has_a_true_covariance_and_no_bias():
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * standard_error)
 
 
+def test_a_bias_that_all_points_share_does_not_average_out():
+    """Its covariance is J J' sigma^2, with J by finite differences: what the motion becomes when all points move."""
+    true = geometry.exp(np.array([0.01, -0.02, 0.03, 0.4, -0.2, 0.05]))
+    a, b = seen(floor_points(np.random.default_rng(8), 400), true)
+    cov, common_sigma, step = np.tile(np.eye(3) * 1e-10, (len(a), 1, 1)), 2e-4, 1e-6
+    found = motion.pair_motion(a, b, cov, cov, BASELINE_M, true, common_sigma)
+    assert found is not None
+    moved = [motion.pair_motion(a + bias, b, cov, cov, BASELINE_M, true) for bias in np.eye(3) * step]
+    by_bias = np.column_stack([geometry.log(geometry.inverse(true) @ m.a_from_b) / step for m in moved])
+    # the points' own noise of 1e-5 leaves 1e-6 in the mean of 400: a ten thousandth of the variance
+    expected = by_bias @ by_bias.T * common_sigma**2
+    np.testing.assert_allclose(found.cov, expected, atol=0.02 * np.abs(expected).max())
+
+
 def test_depth_taken_as_exact_is_biased_where_structure_and_motion_together_are_not():
     """Errors in variables: with 3 px of disparity noise the closed form of eq. (2) shrinks the translation."""
     rng = np.random.default_rng(6)

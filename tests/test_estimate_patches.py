@@ -73,6 +73,17 @@ def test_a_quarter_of_the_image_finds_patches_eight_pixels_off():
     assert np.median(np.abs(found.points - true)[found.ok]) < 0.02  # long waves are shallow: rounding shows
 
 
+def test_a_coarse_level_places_the_point_itself_not_the_coarse_pixel_nearest_to_it():
+    """The finer levels switched off: the coarsest is good to tenths of its 4 px; its pixels lie up to 2 px off."""
+    images, points, true = pair(WARPS["turn"], np.array([2.0, 1.0]), longest_px=100)
+    source, target = (patches.pyramid(i, 2) for i in images)
+    cut = patches.cut(source, points, PATCH_PX)
+    cut[:2] = [level._replace(energy=np.zeros(len(points))) for level in cut[:2]]
+    warp = np.tile(WARPS["turn"], (len(points), 1, 1))
+    error = patches.register(cut, patches.splines(target), true, warp).points - true
+    assert np.sqrt(np.mean(error**2)) < 0.5
+
+
 def test_light_that_changes_across_the_patch_does_not_move_the_match():
     """The lamps move with the vehicle: brightness changes by one per cent a pixel between the two images."""
     images, points, true = pair(np.eye(2), np.array([0.3, 0.2]), light=lambda p: 0.8 + 0.01 * (p[..., 1] - 60))
@@ -135,3 +146,10 @@ def test_fused_matches_are_the_least_squares_estimate_given_equal_rows():
     expected[:2] -= [RIG.cx_px, RIG.cy_px]
     np.testing.assert_allclose(measured[0] * RIG.focal_px, expected, atol=1e-9)
     np.testing.assert_allclose(joint[0] * RIG.focal_px**2, expected_cov, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("right", "possible"), [((70.0, 50.9), True), ((70.0, 51.1), False), ((70.0, 48.9), False), ((89.7, 50.0), False)]
+)
+def test_a_match_on_another_row_or_beyond_infinity_is_none(right, possible):
+    assert stereo.on_one_row(np.array([[90.0, 50.0]]), np.array([right])).item() == possible

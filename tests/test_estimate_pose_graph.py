@@ -102,6 +102,20 @@ def test_the_chordal_start_needs_no_poses():
     assert by_chords.cost == pytest.approx(by_truth.cost, abs=1e-3)
 
 
+def test_the_chordal_start_is_not_led_astray_by_odometry():
+    """Each step of the ring turns 0.3 rad wrong, other links are exact: poses put end to end lose their way."""
+    rng = np.random.default_rng(6)
+    poses, exact = ring(rng, n=24, share_of_sigma=0.0)
+    jumps = [(i, (i + d) % 24) for d in (5, 7, 11) for i in range(24)]
+    cov = np.eye(6) * 1e-4
+    links = [Link(i, j, geometry.inverse(poses[i]) @ poses[j], cov, 1.0, 9) for i, j in map(sorted, jumps)]
+    turned = geometry.exp(np.array([0, 0, 0.3, 0, 0, 0]))
+    links += [link._replace(i_from_j=link.i_from_j @ turned, cov=np.eye(6)) for link in exact if link.j == link.i + 1]
+    start, zero = pose_graph.chordal_start(links), geometry.inverse(poses[0])
+    off = [np.linalg.norm(start.atPose3(k).matrix() - zero @ pose) for k, pose in enumerate(poses)]
+    assert max(off) < 0.05
+
+
 def test_the_lowest_number_stays_where_it_starts():
     poses, links = ring(np.random.default_rng(2))
     moved = geometry.exp(np.array([0.3, -0.2, 1.0, 4.0, 5.0, 6.0]))

@@ -148,14 +148,31 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
+@njit(cache=True, nogil=True)
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """world_from_body rotation: yaw about z, then pitch about y, then roll about x (rad, intrinsic z-y'-x'')."""
-    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    cy, sy = np.cos(yaw), np.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
 
 
+@njit(cache=True, nogil=True)
 def rpy_from_rotation(rotation: Array) -> Array:
-    """[roll, pitch, yaw] (rad) of world_from_body: the inverse of `rotation_from_rpy`. (3, 3) -> (3,)."""
-    return Rotation.from_matrix(rotation).as_euler("ZYX")[::-1].copy()
+    """[roll, pitch, yaw] (rad) of world_from_body: the inverse of `rotation_from_rpy`. (3, 3) -> (3,).
+
+    Straight up or down, where only their difference is known, roll is zero.
+    """
+    level = np.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = np.arctan2(-rotation[2, 0], level)
+    if level < 1e-12:
+        return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
+    return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
 def wrap_angle(angle: Array | float) -> Array:
@@ -165,7 +182,7 @@ def wrap_angle(angle: Array | float) -> Array:
 
 def quaternion_wxyz(rotation: Array) -> Array:
     """MuJoCo's quaternion [w, x, y, z] of a rotation matrix, w >= 0."""
-    return Rotation.from_matrix(rotation).as_quat(canonical=True)[[3, 0, 1, 2]]
+    return quaternion_xyzw(rotation)[[3, 0, 1, 2]]
 
 
 def rotation_from_wxyz(quaternion: Array) -> Array:
@@ -175,7 +192,27 @@ def rotation_from_wxyz(quaternion: Array) -> Array:
 
 def quaternion_xyzw(rotation: Array) -> Array:
     """Rerun's and TUM's quaternion [x, y, z, w] of a rotation matrix, w >= 0."""
-    return Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return quaternions_xyzw(np.asarray(rotation, np.float64)[None])[0]
+
+
+@njit(cache=True, nogil=True)
+def quaternions_xyzw(rotations: Array) -> Array:
+    """The same of many: (n, 3, 3) -> (n, 4), from the largest of the four for precision (Shepperd 1978)."""
+    out = np.empty((len(rotations), 4))
+    for k in range(len(rotations)):
+        r = rotations[k]
+        four = np.array([r[0, 0], r[1, 1], r[2, 2], r[0, 0] + r[1, 1] + r[2, 2]])
+        q, i = out[k], int(np.argmax(four))
+        if i == 3:
+            q[0], q[1], q[2] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+            q[3] = 1 + four[3]
+        else:
+            j, m = (i + 1) % 3, (i + 2) % 3
+            q[i] = 1 - four[3] + 2 * four[i]
+            q[j], q[m] = r[j, i] + r[i, j], r[m, i] + r[i, m]
+            q[3] = r[m, j] - r[j, m]
+        q *= (-1.0 if q[3] < 0 else 1.0) / np.sqrt(np.sum(q * q))
+    return out
 
 
 def heading_of_camera(world_from_camera: Array) -> Array:

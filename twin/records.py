@@ -152,11 +152,10 @@ class Trajectory:
 
     def save(self, path: Path) -> None:
         """Writes TUM: time x y z qx qy qz qw, a line a pose."""
-        rows = [
-            " ".join(f"{v:.9g}" for v in [*pose[:3, 3], *geometry.quaternion_xyzw(pose[:3, :3])])
-            for pose in self.world_from_camera
-        ]
-        path.write_text("".join(f"{t:.6f} {row}\n" for t, row in zip(self.times_s, rows, strict=True)))
+        poses = self.world_from_camera
+        rows = np.column_stack([self.times_s, self.positions, geometry.quaternions_xyzw(poses[:, :3, :3])])
+        line = "%.6f" + " %.9g" * 7 + "\n"
+        path.write_text(line * len(rows) % tuple(rows.ravel().tolist()))
 
     @staticmethod
     def load(path: Path) -> Trajectory:

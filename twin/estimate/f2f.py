@@ -9,7 +9,7 @@ from twin.estimate import matching, motion
 from twin.estimate.stereo import StereoPoints, normalised
 from twin.records import StereoRig
 
-_MOST_POINTS = 150  # the best ones: key points correct what the frames between them drift
+MOST_POINTS = 150  # the best ones: key points correct what the frames between them drift
 
 
 class FrameToFrame:
@@ -27,7 +27,7 @@ class FrameToFrame:
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
         """Takes the points of a new key point."""
-        self.image, self.pixels, self.xyz = image, points.pixels[:_MOST_POINTS], points.xyz[:_MOST_POINTS]
+        self.image, self.pixels, self.xyz = image, points.pixels[:MOST_POINTS], points.xyz[:MOST_POINTS]
 
     def step(self, image: matching.Image) -> tuple[motion.Motion, str]:
         """Motion from the last frame to this one, and "ok" or why it failed."""

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from twin import geometry
 from twin.estimate import matching, motion, observation, patches, stereo
@@ -16,34 +17,44 @@ from twin.records import Link, StereoRig
 
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
 _LEAST_SHARE = 0.3  # of matched points that agree on one motion
-_COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
+COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
+_NEAREST_M = 1e-3  # of a point before a camera
 _LEVELS = 2  # a quarter of the image: matches are found though positions err by 8 pixels
 
 
-def overlap(node: KeyPoint, other: KeyPoint, rig: StereoRig, patch_px: int) -> float:
-    """Share of the node's points that the other's left image shows: overlap of the true 3-D footprints.
+def overlaps(node: KeyPoint, poses: Array, rig: StereoRig, patch_px: int) -> Array:
+    """Shares (n,) of the node's points that the left images at poses (n, 4, 4) show: overlap of true 3-D footprints.
 
     Predicted from poses and depth (P11), not from a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
-        return 0.0
-    other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-    pixels = rig.project(geometry.transform(other_from_node, node.points.xyz))
-    return float(np.mean(matching.inside(pixels, (rig.height_px, rig.width_px), patch_px // 2)))
+        return np.zeros(len(poses))
+    world = np.ascontiguousarray(geometry.transform(node.world_from_camera, node.points.xyz))
+    camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
+    return _overlaps(
+        world, node.world_from_camera[:3, 3].copy(), np.ascontiguousarray(poses), _reach_m(node, rig), *camera
+    )
 
 
 def choose_links(
-    node: KeyPoint, earlier: Sequence[KeyPoint], rig: StereoRig, min_overlap: float, max_links: int, patch_px: int
+    node: KeyPoint,
+    earlier: Sequence[KeyPoint],
+    poses: Array,
+    rig: StereoRig,
+    min_overlap: float,
+    max_links: int,
+    patch_px: int,
 ) -> list[tuple[KeyPoint, float]]:
     """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
 
     The last link of a run of overlapping nodes carries the longest base; links to other swaths tie the legs together,
     and the oldest of them ties loops to where they all began.
+
+    Args:
+        poses: (n, 4, 4) of the earlier ones.
     """
-    reach_m = _reach(node, rig)
-    near = [k for k in earlier if np.linalg.norm(k.world_from_camera[:3, 3] - node.world_from_camera[:3, 3]) < reach_m]
-    shares = [(k, overlap(node, k, rig, patch_px)) for k in near]
-    linked = sorted((s for s in shares if s[1] >= min_overlap), key=lambda s: -s[0].number)
+    shares = overlaps(node, poses, rig, patch_px)
+    linked = [(earlier[k], float(shares[k])) for k in np.flatnonzero(shares >= min_overlap)[::-1]]
     previous = [s for s in linked if s[0] in earlier[-_SAME_SWATH:]]
     rest = [s for s in linked if s[0] not in earlier[-_SAME_SWATH:]]
     same = _unbroken(rest, earlier)
@@ -83,11 +94,29 @@ def _spread(others: list[tuple[KeyPoint, float]], count: int) -> list[tuple[KeyP
     return (chosen + [o for o in others if o not in chosen])[:count]
 
 
-def _reach(node: KeyPoint, rig: StereoRig) -> float:
+def _reach_m(node: KeyPoint, rig: StereoRig) -> float:
     """No camera farther away sees the same floor: the image's diagonal at the node's largest depth."""
-    if node.points is None or len(node.points.xyz) == 0:
-        return 0.0
     return float(node.points.xyz[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
+
+
+@njit(cache=True, nogil=True)
+def _overlaps(world, here, poses, reach, focal, cx, cy, width, height, margin):
+    """As `overlaps`, of points (m, 3) in the world; cameras out of reach of the node's (3,) share nothing."""
+    shares = np.zeros(len(poses))
+    for k in range(len(poses)):
+        pose, count = poses[k], 0
+        if np.sum((here - pose[:3, 3]) ** 2) >= reach * reach:
+            continue
+        for x, y, z in world:
+            dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+            depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+            if depth < _NEAREST_M:
+                continue
+            u = focal * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + cx
+            v = focal * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + cy
+            count += margin <= u < width - margin and margin <= v < height - margin
+        shares[k] = count / len(world)
+    return shares
 
 
 class Matched(NamedTuple):
@@ -155,7 +184,7 @@ class PairMatch:
             matched.node_cov,
             self.rig.baseline_m,
             predicted if closed_form is None else closed_form,
-            common_sigma=_COMMON_PX / self.rig.focal_px,
+            common_sigma=COMMON_PX / self.rig.focal_px,
             correlation=matching.correlation(matched.node[:, :2] * self.rig.focal_px, self.patch_px),
         )
         if result is None or result.n_points < _LEAST_SHARE * len(matched.node):

@@ -60,19 +60,19 @@ def normal_equations(rows, weight, value):
 
 def transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:
     """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
-    return _transfer(z_b, a_from_b, baseline_m)
+    return transfer_of(z_b, a_from_b, baseline_m)
 
 
 def linearise(
     a: Array, b: Array, structure: Array, cov_a: Array, cov_b: Array, a_from_b: Array, baseline_m: float
 ) -> Observations:
     """Rows of points measured as `a` and `b` (n, 3) with these covariances (n, 3, 3), at a structure in b (n, 3)."""
-    return Observations(*_linearise(a, b, structure, cov_a, cov_b, a_from_b, baseline_m))
+    return Observations(*linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline_m))
 
 
 def weighted_normal_equations(seen: Observations, weight: Array) -> tuple[Array, Array, Array]:
     """The structure eliminated: normal matrix (6, 6), right side (6,), effect of an error that all share (6, 3)."""
-    return _weighted_normal_equations(seen.error, seen.by_motion, seen.information, weight)
+    return reduced(seen.error, seen.by_motion, seen.information, weight)
 
 
 def adjust_structure(seen: Observations, b: Array, cov_b: Array, twist: Array) -> Array:
@@ -81,7 +81,7 @@ def adjust_structure(seen: Observations, b: Array, cov_b: Array, twist: Array) -
 
 
 @njit(cache=True, nogil=True)
-def _transfer(z_b, a_from_b, baseline):
+def transfer_of(z_b, a_from_b, baseline):
     n = len(z_b)
     z_a, by_point, by_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
     rotation, lever = np.empty((3, 3)), np.empty(3)
@@ -112,8 +112,8 @@ def _transfer(z_b, a_from_b, baseline):
 
 
 @njit(cache=True, nogil=True)
-def _linearise(a, b, structure, cov_a, cov_b, a_from_b, baseline):
-    predicted, by_point, by_motion = _transfer(structure, a_from_b, baseline)
+def linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline):
+    predicted, by_point, by_motion = transfer_of(structure, a_from_b, baseline)
     n = len(a)
     error, information, size = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
     cov = np.empty((3, 3))
@@ -149,7 +149,7 @@ def _invert(m, out):
 
 
 @njit(cache=True, nogil=True)
-def _weighted_normal_equations(error, by_motion, information, weight):
+def reduced(error, by_motion, information, weight):
     normal, right, by_common = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))
     projected = np.empty((6, 3))
     for i in range(len(error)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -60,6 +61,7 @@ class Navigator:
         self.alignable = True
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
+        self.node_poses = np.empty((64, 4, 4))  # theirs, and room for more
         self.links: list[Link] = []
         self.measuring: deque[Future[list[Link]]] = deque()
         self.behind = ThreadPoolExecutor(1)
@@ -174,7 +176,9 @@ class Navigator:
         if not self.nodes:
             return None
         last, (walked, _) = self.nodes[-1], self.since_node
-        links = self._measure(node, [(last, network.overlap(node, last, self.rig, self.settings.patch_px))])
+        pose = last.world_from_camera[None]
+        share = float(network.overlaps(node, pose, self.rig, self.settings.patch_px)[0])
+        links = self._measure(node, [(last, share)])
         if not links:
             return None
         link = links[0]
@@ -188,10 +192,10 @@ class Navigator:
         """Links a new node to earlier ones by measured motions; to the last one by F2F where that failed."""
         s = self.settings
         with self.watch("network"):
-            window = [
-                k for n, k in enumerate(self.nodes) if n < _START_NODES or k.track >= node.track - s.window_tracks
-            ]
-            chosen = network.choose_links(node, window, self.rig, s.min_overlap, s.max_links, s.patch_px)
+            first = bisect_left(self.nodes, node.track - s.window_tracks, key=lambda k: k.track)
+            inside = np.r_[0 : min(_START_NODES, first), first : len(self.nodes)]
+            window, poses = [self.nodes[k] for k in inside], self.node_poses[inside]
+            chosen = network.choose_links(node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px)
         others = [(replace(k), share) for k, share in chosen if k is not self.nodes[-1]]
         bridge = self._bridge(node) if self.nodes and chain is None else None
         self.measuring.append(self.behind.submit(self._links_of, replace(node), others, chain, bridge))
@@ -199,6 +203,9 @@ class Navigator:
         walked = self.velocity_log.at_node(node.number)
         node.walked = walked if chain else None  # without a chain, the F2F motion has it in
         self.nodes.append(node)
+        if len(self.nodes) > len(self.node_poses):
+            self.node_poses = np.concatenate([self.node_poses, np.empty_like(self.node_poses)])
+        self.node_poses[len(self.nodes) - 1] = node.world_from_camera
         self.cov_at_node = self.filter.cov
         self.since_node = (np.eye(4), np.zeros((6, 6)))
 
@@ -267,6 +274,8 @@ class Navigator:
             if key.number in poses:
                 shift = poses[key.number] @ geometry.inverse(key.world_from_camera)
             key.world_from_camera = shift @ key.world_from_camera
+        for k, node in enumerate(self.nodes):
+            self.node_poses[k] = node.world_from_camera
 
     def _rebase(self, aligned: Aligned) -> None:
         """Moves the online position along with the last key point."""

@@ -89,6 +89,12 @@ def _updated(world_from_camera, prior, residual, jacobian, cov):
 
 def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
     """Rotation of the camera in the world by an AHRS reading, with its covariance (3, 3) in the camera."""
-    rotation = geometry.rotation_from_rpy(*rpy_rad) @ camera_from_body[:3, :3].T
-    body_cov = np.diag([noise.attitude_rad**2, noise.attitude_rad**2, noise.heading_rad**2])
-    return rotation, camera_from_body[:3, :3] @ body_cov @ camera_from_body[:3, :3].T
+    sigmas = np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
+    return _attitude(rpy_rad, camera_from_body[:3, :3], sigmas)
+
+
+@njit(cache=True, nogil=True)
+def _attitude(rpy, camera_from_body, sigmas):
+    to_camera = np.ascontiguousarray(camera_from_body)
+    spread = to_camera * sigmas
+    return geometry.rotation_from_rpy(rpy[0], rpy[1], rpy[2]) @ to_camera.T, spread @ spread.T

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from twin.estimate import marginals as selected
 from twin.geometry import Array
 from twin.records import Link
 
@@ -93,8 +94,8 @@ def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, numbers: 
     """
     shared = [key for key in values.keys() if gtsam.symbolChr(key)]
     order = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*numbers, *shared])
-    tree = graph.linearize(values).eliminateMultifrontal(order)
-    return np.array([tree.marginalCovariance(number) for number in numbers]).reshape(-1, 6, 6)
+    covs = selected.marginals(graph.linearize(values), order, frozenset(numbers))
+    return np.array([covs[number] for number in numbers]).reshape(-1, 6, 6)
 
 
 def _values(poses: dict[int, Array]) -> gtsam.Values:

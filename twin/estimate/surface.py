@@ -176,14 +176,14 @@ def _triangle(va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, h
             p, q = i - row, j - col
             height[p, q] = h
             spread[p, q] = lift * lift * ((1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc])
-            common[p, q] = _pose_part(px, py, pz, sx, sy, view.cov)
+            common[p, q] = pose_part(px, py, pz, sx, sy, view.cov)
             common[p, q] += (LATERAL_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
             pixel[p, q, 0] = ua + s * (ub - ua) + t * (uc - ua)
             pixel[p, q, 1] = va + s * (vb - va) + t * (vc - va)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _pose_part(px, py, pz, sx, sy, cov):
+def pose_part(px, py, pz, sx, sy, cov):
     """Variance of height at a point (from the eye) of a surface by the pose's covariance, both in world axes."""
     row = (-sx, -sy, 1.0)
     full = (py * row[2] - pz * row[1], pz * row[0] - px * row[2], px * row[1] - py * row[0], row[0], row[1], row[2])

@@ -31,12 +31,15 @@ class PoseGraph(NamedTuple):
 def write(path: Path, result: SurveyResult) -> None:
     """Writes VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines: quaternions xyzw, upper triangle of the information matrix."""
     poses = result.final.world_from_camera[result.key_frames]
-    lines = [f"VERTEX_SE3:QUAT {k} {_pose(pose)}" for k, pose in enumerate(poses)]
-    for link in result.links:
-        information = np.linalg.inv(link.cov)[np.ix_(_ROTATION_LAST, _ROTATION_LAST)]
-        upper = " ".join(f"{v:.9g}" for v in information[np.triu_indices(6)])
-        lines.append(f"EDGE_SE3:QUAT {link.i} {link.j} {_pose(link.i_from_j)} {upper}")
-    path.write_text("\n".join(lines) + "\n")
+    vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_texts(poses)))
+    motions = np.array([link.i_from_j for link in result.links]).reshape(-1, 4, 4)
+    information = np.linalg.inv(np.array([link.cov for link in result.links]).reshape(-1, 6, 6))
+    upper = information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]
+    edges = "".join(
+        f"EDGE_SE3:QUAT {link.i} {link.j} {motion} {known}\n"
+        for link, motion, known in zip(result.links, _texts(motions), _lines(upper, "%.9g"), strict=True)
+    )
+    path.write_text(vertices + edges)
 
 
 def read(path: Path) -> PoseGraph:
@@ -110,5 +113,12 @@ _READERS = {
 }
 
 
-def _pose(pose: Array) -> str:
-    return " ".join(f"{v:.12g}" for v in [*pose[:3, 3], *geometry.quaternion_xyzw(pose[:3, :3])])
+def _texts(poses: Array) -> list[str]:
+    """x y z qx qy qz qw of each pose (n, 4, 4)."""
+    return _lines(np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])]), "%.12g")
+
+
+def _lines(rows: Array, number: str) -> list[str]:
+    """The numbers of each row (n, k) as a line."""
+    line = " ".join([number] * rows.shape[1]) + "\n"
+    return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()

@@ -13,10 +13,13 @@ from twin.simulate.hydrodynamics import angular_first
 Array = NDArray[np.float64]
 
 
+@njit(cache=True, nogil=True)
 def steady_thrust_n(command: Array, coefficients: Array) -> Array:
     """Thrust [N] at rest of commands in [-1, 1]: an odd polynomial, coefficients from the highest power down to u."""
-    square = command * command
-    return command * np.polyval(coefficients, square)
+    thrust = np.zeros_like(command)
+    for coefficient in coefficients:  # Horner's scheme in the square
+        thrust = thrust * command * command + coefficient
+    return thrust * command
 
 
 class LaggedThrusters:
@@ -49,7 +52,7 @@ class LaggedThrusters:
 
     def command(self, command: Array) -> None:
         """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
-        self._steady_n = steady_thrust_n(np.clip(command, -1, 1), self._coefficients)
+        self._steady_n = steady_thrust_n(np.minimum(np.maximum(command, -1.0), 1.0), self._coefficients)
 
     def wrenches(self, n_steps: int) -> Array:
         """Their wrench at the beginning of each of the next steps (n_steps, 6), which are then over."""
