@@ -78,8 +78,8 @@ def look(
         rig.width_px,
         rig.height_px,
     )
-    image = _cast(*args, samples)[0]
-    return image, _cast(*args, 1)[1]
+    image, depth = _cast(*args, samples)
+    return image, depth if samples == 1 else _cast(*args, 1)[1]
 
 
 def stereo_pair(

@@ -12,8 +12,12 @@ from twin.scenario_file import dump_toml, load_scenario
 
 PLAN_KEYS = "pattern, area_m, altitude_m, speed_mps, overlap_along, overlap_across, tracks, clearance_m"
 TOP_KEYS = (
-    "name, seed, terrain, vehicle, rig, imaging, water, lamps, sun, snow, current, navigation, plan, control, "
-    "estimate, map, beacons, require"
+    "name, seed, terrain, vehicle, rig, imaging, sensor, lens, port, calibration, water, lamps, sun, snow, current, "
+    "navigation, plan, control, estimate, map, beacons, require"
+)
+SENSOR_KEYS = (
+    "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
+    "full_well_e, read_noise_e, bits, bayer, vignetting_power, motion_blur, readout_ms"
 )
 
 BAD_FILES = [
@@ -41,6 +45,17 @@ BAD_FILES = [
     ("[snow]\nalbedo = 1.2", ["2: snow.albedo: 1.2: not allowed (allowed: less than or equal to 1)"]),
     ("[snow]\ndensity_per_m3 = -1", ["2: snow.density_per_m3: -1: not allowed (allowed: greater than or equal to 0)"]),
     ("[snow]\ndiameter_m = 0", ["2: snow.diameter_m: 0: not allowed (allowed: greater than or equal to 0.0001)"]),
+    ("sensor = 3", ["1: sensor: 3: not allowed (allowed: a section)"]),
+    (
+        "[sensor]\nexposure_min_ms = 0\nquantum_efficiency = [0.4, 1.5, 0.3]\nfull_well_e = 0\nbits = 10\niso = 100",
+        [
+            "2: sensor.exposure_min_ms: 0: not allowed (allowed: greater than 0)",
+            "3: sensor.quantum_efficiency.1: 1.5: not allowed (allowed: less than or equal to 1)",
+            "4: sensor.full_well_e: 0: not allowed (allowed: greater than or equal to 100)",
+            "5: sensor.bits: 10: not allowed (allowed: 8 or 12)",
+            f"6: sensor.iso: unknown key (allowed: {SENSOR_KEYS})",
+        ],
+    ),
     ("[rig]\nimage_width_px = 320.5", ["2: rig.image_width_px: 320.5: not allowed (allowed: a whole number)"]),
     ("[rig]\nframe_rate_hz = 3", ["2: rig.frame_rate_hz: 3: not allowed (allowed: greater than or equal to 5)"]),
     ('[rig]\nbaseline_m = "wide"', ["2: rig.baseline_m: 'wide': not allowed (allowed: a number)"]),
@@ -187,6 +202,13 @@ def test_any_scenario_survives_a_round_trip_through_toml(
     )
     file = written(tmp_path_factory.mktemp("round"), dump_toml(scenario))
     assert load_scenario(file).model_dump() == scenario.model_dump()
+
+
+def test_a_sensor_is_there_where_its_section_is_and_survives_a_round_trip(tmp_path):
+    assert load_scenario("quickstart").sensor is None
+    scenario = load_scenario(written(tmp_path, "[sensor]\nbits = 8\nreadout_ms = 12.5"))
+    assert scenario.sensor.bits == 8 and scenario.sensor.bayer
+    assert load_scenario(written(tmp_path, dump_toml(scenario))).sensor == scenario.sensor
 
 
 def test_a_scenario_extends_another_key_by_key(tmp_path):

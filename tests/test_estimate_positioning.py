@@ -12,7 +12,7 @@ import seafloor_scene as scene
 
 from twin import geometry
 from twin.config import Estimation
-from twin.estimate import matching, network, stereo
+from twin.estimate import matching, network, stereo, vision
 from twin.estimate.f2f import FrameToFrame
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.mosaic import Mosaic
@@ -393,3 +393,12 @@ def test_however_well_the_mosaic_agrees_its_sampling_bounds_the_position():
     navigator = navigated(Script(line(np.zeros(3)), correction=sure), [1, 1, 1], use_ga=False)
     sigma = np.sqrt(np.diag(navigator.filter.cov))
     np.testing.assert_allclose(sigma, [5e-4] * 3 + [1e-3] * 3, rtol=0.05)
+
+
+def test_a_mismatch_far_away_does_not_widen_the_window_of_the_mosaic(diver):
+    node, _, _ = diver.key_point(scene.down_camera(-1, 0, ALTITUDE_M))
+    wild = node.points.xyz.copy()
+    wild[0] *= 100
+    window_m = vision.half_window_m(node.points._replace(xyz=wild), RIG)
+    assert window_m == pytest.approx(vision.half_window_m(node.points, RIG), rel=0.05)
+    assert window_m > ALTITUDE_M * RIG.width_px / RIG.focal_px / 2

@@ -1,15 +1,20 @@
-"""The sensor: noise by its line, exposure with its lag, streams that do not mix."""
+"""The sensor: noise by its line, exposure with its lag, streams that do not mix; plain or physical in a camera."""
 
 import types
 
 import numpy as np
 import pytest
 
+from twin import geometry
 from twin.config import Imaging, Scenario
-from twin.imaging.camera import StereoCamera
-from twin.imaging.light import Light
-from twin.imaging.sensor import Exposure, expose
+from twin.imaging import bands
+from twin.imaging.camera import AT_REST, StereoCamera
+from twin.imaging.light import Light, Moment
+from twin.imaging.photo_sensor import sensor_of
+from twin.imaging.sensor import Exposure, Setting, expose
 from twin.timing import Stopwatch
+
+PHYSICAL = {"bits": 12, "bayer": True, "readout_ms": 10.0}
 
 
 def test_variance_of_noise_grows_in_a_line_with_the_signal():
@@ -44,6 +49,23 @@ def test_the_same_stream_gives_the_same_image():
     assert (a == b).all() and (a != c).any()
 
 
+@pytest.mark.parametrize("sensor", [None, PHYSICAL])
+def test_noise_does_not_depend_on_the_number_of_threads(monkeypatch, sensor):
+    scenario = small(sensor, {"image_width_px": 90, "image_height_px": 130})
+    light = np.random.default_rng(0).uniform(0, 60, (130, 90, 3)).astype(np.float32)
+    seen = []
+    for processors in (1, 2):
+        monkeypatch.setattr(bands, "_processors", lambda n=processors: n)
+        seen.append(sensor_of(scenario).image(light, Setting(0.01, 0.01, 2.0), np.random.default_rng(1)))
+    np.testing.assert_array_equal(*seen)
+
+
+def test_two_streams_make_independent_noise():
+    imaging, light = Imaging(noise_sd=0.1, shot_noise=0.0), np.full((300, 400, 3), 0.5, np.float32)
+    one, two = (expose(light, 1.0, imaging, rng) / 255 - 0.5 for rng in np.random.default_rng(5).spawn(2))
+    assert abs(np.mean(one * two)) < 5 * one.std() * two.std() / np.sqrt(one.size)
+
+
 def test_exposure_meters_the_first_frame_then_follows_by_its_lag():
     exposure = Exposure(0.45, frame_rate_hz=30.0)
     dim, bright = (np.full((4, 4, 3), x, np.float32) for x in (10.0, 40.0))
@@ -72,27 +94,74 @@ class FlatFloor:
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
 
 
-def shots(stereo):
-    scenario = Scenario.model_validate(
+MOVING = np.array([0.1, -0.2, 0.3, 0.5, -0.3, 0.1])  # of the body [rad/s, m/s]
+
+
+def small(sensor=None, size=None):
+    return Scenario.model_validate(
         {
-            "rig": {"image_width_px": 64, "image_height_px": 48},
+            "rig": size or {"image_width_px": 64, "image_height_px": 48},
             "lamps": [{"position_m": (0.2, 0.3, 0.0)}],
+            "sensor": sensor,
         }
     )
+
+
+def camera_of(scenario):
     left, right = np.random.default_rng(7).spawn(2)
-    camera = StereoCamera(FlatFloor(), Light(scenario, FLAT, left), scenario, left, right, Stopwatch())
+    return StereoCamera(FlatFloor(), Light(scenario, FLAT, left), scenario, left, right, Stopwatch())
+
+
+def shots(stereo, sensor=None, twist=AT_REST):
+    camera = camera_of(small(sensor))
     poses = [np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3) for k in range(5)]
-    return [camera.shoot(pose, flag) for pose, flag in zip(poses, stereo, strict=True)]
+    return [camera.shoot(pose, flag, twist) for pose, flag in zip(poses, stereo, strict=True)]
 
 
-def test_left_images_do_not_depend_on_when_the_right_eye_is_used():
-    alone, both, some = shots([False] * 5), shots([True] * 5), shots([True, False, False, True, False])
+@pytest.mark.parametrize("sensor", [None, PHYSICAL])
+def test_left_images_do_not_depend_on_when_the_right_eye_is_used(sensor):
+    flags = [False] * 5, [True] * 5, [True, False, False, True, False]
+    alone, both, some = (shots(stereo, sensor, MOVING) for stereo in flags)
     for a, b, c in zip(alone, both, some, strict=True):
         assert a.right is None and a.depth_right is None and b.right is not None
         np.testing.assert_array_equal(a.left, b.left)
         np.testing.assert_array_equal(a.left, c.left)
 
 
-def test_the_right_eye_has_noise_and_place_of_its_own():
-    shot = shots([True] * 5)[0]
+def test_without_a_physical_sensor_an_image_is_the_exposed_light_whatever_moves():
+    scenario = small()
+    renderer, light, exposure = FlatFloor(), Light(scenario, FLAT, None), Exposure(0.45, 30.0)
+    rng = np.random.default_rng(7).spawn(2)[0]
+    for k, shot in enumerate(shots([False] * 5, None, MOVING)):
+        moment = Moment(np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3), k / 30)
+        seen = light.radiance(*renderer.render(moment.world_from_left), 0, moment)
+        np.testing.assert_array_equal(shot.left, expose(seen, exposure.gain(seen), scenario.imaging, rng))
+
+
+def test_what_moves_shows_only_where_the_shutter_takes_time():
+    still = PHYSICAL | {"motion_blur": False, "readout_ms": 0.0}
+    for sensor, same in ((still, True), (PHYSICAL, False), (still | {"motion_blur": True}, False)):
+        rest, moving = (shots([True] * 5, sensor, twist)[1] for twist in (AT_REST, 3 * MOVING))
+        assert (rest.left == moving.left).all() == (rest.right == moving.right).all() == same
+
+
+def test_each_eye_moves_as_the_body_moves_it():
+    camera, rig, step_s = camera_of(small()), small().believed_rig(), 1e-6
+    for eye, body_from_eye in enumerate((rig.body_from_camera, rig.body_from_camera @ rig.left_from_right)):
+        moved = geometry.inverse(body_from_eye) @ geometry.exp(MOVING * step_s) @ body_from_eye
+        np.testing.assert_allclose(camera.twist_of_eye(eye, MOVING), geometry.log(moved) / step_s, atol=1e-6)
+
+
+def test_both_eyes_are_exposed_alike():
+    camera = camera_of(small(PHYSICAL))
+    seen, expose_image = [], camera._sensor.image
+    camera._sensor.image = lambda light, setting, rng: seen.append(setting) or expose_image(light, setting, rng)
+    for _ in range(3):
+        camera.shoot(np.eye(4), True)
+    assert seen[0::2] == seen[1::2] and all(setting.exposure_s > 0 for setting in seen)
+
+
+@pytest.mark.parametrize("sensor", [None, PHYSICAL])
+def test_the_right_eye_has_noise_and_place_of_its_own(sensor):
+    shot = shots([True] * 5, sensor)[0]
     assert shot.right.shape == shot.left.shape and (shot.right != shot.left).mean() > 0.5

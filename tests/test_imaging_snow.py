@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from twin import geometry
-from twin.config import Lamp, Scenario, Snow, Sun, Water
+from twin.config import Lamp, Scenario, Snow, Water
 from twin.imaging import snow as module
-from twin.imaging.optics import lights_of_eye
+from twin.imaging.lamps import Daylight, lights_of_eye
 from twin.imaging.snow import BOX_M, PUPIL_M
 from twin.imaging.water import medium
 
@@ -20,7 +20,7 @@ POSE = geometry.pose(
 
 def falling(density=40.0, diameter_m=0.002, current=(0.0, 0.0, 0.0), water="II", seed=0):
     sea = Water(jerlov=water)
-    lights = [lights_of_eye(RIG, LAMPS, Sun(), eye) for eye in (0, 1)]
+    lights = [lights_of_eye(RIG, LAMPS, Daylight(np.zeros(3), np.zeros(3)), eye) for eye in (0, 1)]
     keys = Snow(density_per_m3=density, diameter_m=diameter_m)
     return module.Snow(keys, np.array(current), RIG, medium(sea), lights, np.random.default_rng(seed))
 
@@ -86,7 +86,7 @@ def single(depth_m, **kwargs):
 
 @pytest.mark.parametrize("eye", [0, 1])
 def test_light_obeys_the_inverse_square_law_and_both_ways_of_water(eye):
-    lights = lights_of_eye(RIG, LAMPS, Sun(), eye)
+    lights = lights_of_eye(RIG, LAMPS, Daylight(np.zeros(3), np.zeros(3)), eye)
     water = medium(Water(jerlov="II"))
     point = np.array([-eye * RIG.baseline_m, 0.0, 1.2])
     way = point - lights.position_m[0]

@@ -10,6 +10,8 @@ import pytest
 from twin import cli, look_sheet
 from twin.errors import TwinError
 from twin.imaging.optics import range_of
+from twin.imaging.photo_sensor import PhotoSensor
+from twin.imaging.photons import electrons_per_cd
 from twin.imaging.water import medium
 from twin.look import figures, look, noise_of, parse_place, table
 from twin.mission import prepare
@@ -93,11 +95,27 @@ def test_a_place_where_nobody_can_look_from_is_told(at_m, fault):
 
 
 def test_a_lamp_in_the_floor_is_told_with_the_height_that_frees_it():
-    deep = mission("lamps.0.position_m=[0.25, 0.35, -2.05]")
+    deep = mission("lamps.0.position_m=[0.25, 0.35, -1.4]")  # clear of the floor where the survey flies
     with pytest.raises(TwinError, match=r"lamps\.0\.position_m: lamp 0 at z .* lies in the floor") as told:
-        look(deep)
+        look(deep, (0.0, 0.0, 1.2))
     height_m = float(told.value.allowed.split(",")[1].split()[0])
     assert look(deep, (0.0, 0.0, height_m + 0.01)).shot.right is not None
+
+
+PHYSICAL = ["sensor.vignetting_power=0.0", "sensor.motion_blur=true"]
+
+
+def test_the_noise_of_a_physical_sensor_is_that_of_its_electrons():
+    here = mission("water.jerlov=clear", "terrain.kind=flat", "terrain.relief_m=0.0", "sensor.bayer=false", *PHYSICAL)
+    seen = look(here)
+    a, told = seen.anatomy, figures(seen)
+    assert (told["exposure_ms"], told["analogue_gain"]) == (1000 * a.setting.exposure_s, a.setting.analogue_gain)
+    sensor = PhotoSensor(here.scenario, here.scenario.sensor)
+    np.testing.assert_array_equal(sensor.develop(a.raw), seen.shot.left)  # the numbers are those of the image
+    electrons = a.layers.total[..., 1] * electrons_per_cd(here.scenario.sensor, 1.339)[1] * a.setting.exposure_s
+    per_e = a.setting.analogue_gain * 255 / here.scenario.sensor.full_well_e
+    expected = per_e * np.sqrt(electrons.mean() + here.scenario.sensor.read_noise_e**2)
+    assert noise_of(seen)[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
 
 
 EFFECTS = ["imaging.shadows=true", "imaging.forward_scatter=true", "snow.density_per_m3=200.0"]
@@ -109,7 +127,7 @@ def test_with_every_effect_the_light_is_still_the_sum_of_its_layers():
     np.testing.assert_allclose(layers.total, layers.direct + layers.forward + layers.veil + layers.snow, rtol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], EFFECTS])
+@pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], EFFECTS, PHYSICAL])
 def test_the_sheet_is_a_picture(tmp_path, settings):
     here = mission(*settings)
     file = look_sheet.draw(here.scenario, look(here), tmp_path / "below" / "sheet.png")

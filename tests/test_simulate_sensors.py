@@ -34,7 +34,7 @@ def test_a_step_of_command_gives_the_step_response_of_the_published_lag():
 
 @pytest.mark.parametrize(("command", "thrust"), [(0.25, 4.6), (0.5, 16.6), (0.75, 26.5), (1.0, 30.4), (-0.5, -16.6)])
 def test_steady_thrust_meets_the_published_points(command, thrust):
-    assert steady_thrust_n(np.array(command), ROV.thrust_coefficients) == pytest.approx(thrust, abs=0.06)
+    assert steady_thrust_n(np.array([command]), ROV.thrust_coefficients) == pytest.approx(thrust, abs=0.06)
 
 
 def test_readings_scatter_about_the_truth_as_the_data_sheet_says():
@@ -110,7 +110,7 @@ def test_beacons_are_seen_where_opencv_projects_them_but_for_their_noise():
     camera_from_world = geometry.inverse(world_from_camera)
     rotation = cv2.Rodrigues(camera_from_world[:3, :3])[0]
     expected = cv2.projectPoints(np.array(SURVEYED), rotation, camera_from_world[:3, 3], RIG.matrix, None)[0][:2, 0]
-    sightings = [sight_beacons(world_from_camera, CLEAR, RIG, BEACONS, rng) for _ in range(n)]
+    sightings = [sight_beacons(world_from_camera, CLEAR, RIG.project, BEACONS, rng) for _ in range(n)]
     assert {tuple(s.beacon for s in sighting) for sighting in sightings} == {(0, 1)}
     errors = np.array([[s.pixel for s in sighting] for sighting in sightings]) - expected
     assert np.all(np.abs(errors.mean(axis=0)) < 4 * 0.3 / np.sqrt(n))
@@ -121,9 +121,9 @@ def test_what_stands_before_a_beacon_hides_it():
     rng = np.random.default_rng(0)
     half = CLEAR.copy()
     half[:, :160] = 2.0  # the cameras fly at 2.85 m, beacon 0 lies at 2.35 m depth on this side of the image
-    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG, BEACONS, rng)] == [1]
+    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG.project, BEACONS, rng)] == [1]
     half[:, :160] = 2.35  # the floor that it stands on does not
-    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG, BEACONS, rng)] == [0, 1]
+    assert [s.beacon for s in sight_beacons(POSE_ABOVE, half, RIG.project, BEACONS, rng)] == [0, 1]
 
 
 def readings_of(aiding, n=40):
@@ -132,7 +132,7 @@ def readings_of(aiding, n=40):
     rng = {name: np.random.default_rng(seed) for name, seed in streams}
     sensors = NavigationSensors(Navigation(aiding=tuple(aiding)), BEACONS, RIG, rng)
     twist = np.array([0, 0, 0, 0.3, 0.0, 0.0])
-    return [sensors.read(k / 30, LEVEL, twist, CLEAR if k % 5 == 0 else None) for k in range(n)]
+    return [sensors.read(k / 30, LEVEL, twist, (lambda: CLEAR) if k % 5 == 0 else None) for k in range(n)]
 
 
 SENSORS = {

@@ -27,6 +27,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+reproductions = typer.Typer(help="Run the paper's experiments again.", no_args_is_help=True)
+app.add_typer(reproductions, name="reproduce")
+
 SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="A name in scenes/ or the path of a TOML file.")]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")]
 SetOption = Annotated[
@@ -36,10 +39,31 @@ SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/NAME-SEED where not given.")]
 PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-plan.png where not given.")]
 SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-look.png where not given.")]
+LadderOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None, typer.Option("--at", metavar="X,Y,Z", help="Place of the left camera [m]; mid-survey where not given.")
 ]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
+CalibrationArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="FILE", help="Studies of rendered surveys; the project's own if none.")
+]
+ModelOption = Annotated[Path, typer.Option("--out", help="TOML to write, for `imaging.calibration`.")]
+RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of what was flown for it.")]
+StudyArgument = Annotated[
+    str, typer.Argument(metavar="FILE", help="A study's TOML file, or a name in scenes/studies/.")
+]
+StudyOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/study-NAME if not given.")]
+TuneOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/tune-NAME if not given.")]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Surveys at a time, each a process (or a SLURM job); one a core.")
+]
+SchedulerOption = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Fly on this Dask cluster, as tcp://host:8786.")
+]
+SlurmOption = Annotated[bool, typer.Option("--slurm", help="Fly as jobs of a SLURM cluster (by dask-jobqueue).")]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Fly only what is missing in the folder, or failed.")]
+LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each survey that ends.")]
+SummaryOption = Annotated[bool, typer.Option("--json", help="Print a summary as JSON and nothing else.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as JSON and nothing else.")]
 
 
@@ -122,6 +146,70 @@ def look(
         print(f"Sheet: {sheet}")
 
 
+@reproductions.command()
+def turbidity(out: LadderOption = Path("runs/turbidity"), as_json: SummaryOption = False) -> None:
+    """One object at five turbidity levels with histograms (the paper's Fig. 8), and contrast against range."""
+    from twin.reproduce import turbidity as ladder
+
+    _need_graphics()
+    told = ladder.write(ladder.climb(), out)
+    if as_json:
+        print(json.dumps(told, indent=1))
+    else:
+        console.table(f"The block at {told['range_m']:.2f} m in green light", ladder.table(told))
+        print(f"Sheet: {out / 'turbidity.png'}")
+
+
+@app.command()
+def calibrate(
+    files: CalibrationArgument = None,
+    out: ModelOption = Path("calibration.toml"),
+    runs: RunsOption = Path("runs/calibration"),
+) -> None:
+    """Fit the surrogate's error model to rendered surveys; what was flown before is not flown again."""
+    from twin.surrogate import command
+
+    raise typer.Exit(command.run(files or [], out, runs))
+
+
+@app.command()
+def study(
+    file: StudyArgument,
+    out: StudyOutOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    slurm: SlurmOption = False,
+    resume: ResumeOption = False,
+    live: LinesOption = False,
+    as_json: SummaryOption = False,
+) -> None:
+    """Fly many surveys that differ in what the study varies, and tell how probable it is that one passes."""
+    from twin.study import command
+
+    if not (scheduler or slurm):
+        _need_graphics()
+    raise typer.Exit(command.run(file, command.Options(out, jobs, scheduler, slurm, resume, live, as_json)))
+
+
+@app.command()
+def tune(
+    file: StudyArgument,
+    out: TuneOutOption = None,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
+    slurm: SlurmOption = False,
+    resume: ResumeOption = False,
+    live: LinesOption = False,
+    as_json: SummaryOption = False,
+) -> None:
+    """Search the plan that a study's [tune] asks for, and write the one recommended as a scenario."""
+    from twin.study import command
+
+    if not (scheduler or slurm):
+        _need_graphics()
+    raise typer.Exit(command.tune(file, command.Options(out, jobs, scheduler, slurm, resume, live, as_json)))
+
+
 @app.command()
 def report(folder: RunArgument) -> None:
     """Write the report of a run again from its folder."""
@@ -166,19 +254,25 @@ def exit_status(result: RunResult) -> int:
 
 
 def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
-    from twin.doctor import graphics
     from twin.scenario_file import load_scenario
 
     scenario = load_scenario(scene, overrides)
     folder = _new_folder(scenario, out)
-    drawing = graphics()
-    if not drawing.ok:
-        console.fault(str(drawing))
-        raise typer.Exit(2)
+    _need_graphics()
     from twin import survey  # only now: it needs OpenGL
 
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live)
+
+
+def _need_graphics() -> None:
+    """Ends the command where nothing can be drawn."""
+    from twin.doctor import graphics
+
+    drawing = graphics()
+    if not drawing.ok:
+        console.fault(str(drawing))
+        raise typer.Exit(2)
 
 
 def _new_folder(scenario: Scenario, out: Path | None) -> Path:

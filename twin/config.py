@@ -16,8 +16,13 @@ from twin.records import SensorNoise, StereoRig
 
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
+Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Metres = Annotated[float, Field(gt=0)]
+Efficiency = Annotated[float, Field(gt=0, le=1)]
+PerMetre = Annotated[float, Field(ge=0, le=100)]
+OffAxis = Annotated[float, Field(ge=0, le=90)]
+Share = Annotated[float, Field(ge=0, le=100)]
 
 
 class Section(BaseModel):
@@ -95,13 +100,24 @@ class Rig(Section):
 class Imaging(Section):
     """How light becomes numbers."""
 
-    fidelity: Literal["rendered"] = Field(default="rendered", description="images are rendered")
+    fidelity: Literal["rendered", "surrogate"] = Field(
+        default="rendered",
+        description="images are rendered, or their measurements drawn from calibrated errors a hundred times faster",
+    )
+    calibration: str | None = Field(
+        default=None, description="of the surrogate: a file that `twin calibrate` wrote; the shipped one if none"
+    )
     gray_level: float = Field(
         default=0.45, gt=0.01, lt=1, description="mean image level that auto-exposure aims at (0 to 1)"
     )
-    noise_sd: float = Field(default=0.008, ge=0, le=0.5, description="read noise, as a share of full scale")
+    noise_sd: float = Field(
+        default=0.008, ge=0, le=0.5, description="read noise, as a share of full scale; without [sensor]"
+    )
     shot_noise: float = Field(
-        default=0.006, ge=0, le=0.5, description="shot noise at full scale, grows with the root of signal"
+        default=0.006,
+        ge=0,
+        le=0.5,
+        description="shot noise at full scale, grows with the root of signal; without [sensor]",
     )
     shadows: bool = Field(default=False, description="the floor throws shadows in the light of each lamp")
     forward_scatter: bool = Field(
@@ -110,11 +126,137 @@ class Imaging(Section):
     )
 
 
+class Sensor(Section):
+    """A physical camera, in the terms of an EMVA 1288 data sheet; it takes the place of the noise in `imaging`.
+
+    The defaults are typical of a colour machine-vision camera with a global shutter and pixels of 3.45 um.
+    """
+
+    exposure_min_ms: float = Field(default=0.05, gt=0, le=1000, description="shortest exposure [ms]")
+    exposure_max_ms: float = Field(
+        default=15.0, gt=0, le=1000, description="longest exposure, no longer than a frame; then gain makes up [ms]"
+    )
+    exposure_lag_s: float = Field(
+        default=0.5, ge=0, le=60, description="time in which auto-exposure makes up for all but 1/e of a change [s]"
+    )
+    gain_max_db: float = Field(
+        default=24.0, ge=0, le=60, description="largest analogue gain, 20 dB = 10 times; beyond it stays dark [dB]"
+    )
+    f_number: float = Field(default=2.8, ge=0.7, le=64, description="focal length by aperture of the lens")
+    pixel_um: float = Field(default=3.45, ge=0.5, le=100, description="side of a square pixel [um]")
+    quantum_efficiency: tuple[Efficiency, Efficiency, Efficiency] = Field(
+        default=(0.4, 0.55, 0.45), description="electrons by photons for R, G, B, filters and lens included"
+    )
+    full_well_e: float = Field(
+        default=10000.0, ge=100, le=1e7, description="electrons a pixel holds; they fill the scale at gain 1"
+    )
+    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="noise of reading a pixel, in the dark [e-]")
+    bits: Literal[8, 12] = Field(default=12, description="of a raw digital number; frames leave with 8 in any case")
+    bayer: bool = Field(default=True, description="one band a pixel (RGGB), the others interpolated; else all three")
+    vignetting_power: float = Field(
+        default=4.0, ge=0, le=8, description="light falls with this power of the cosine of the view; 4 by nature, 0 off"
+    )
+    motion_blur: bool = Field(default=True, description="what moves during the exposure is smeared")
+    readout_ms: float = Field(
+        default=0.0, ge=0, le=1000, description="rolling shutter: from the first row to the last; 0 = all at once [ms]"
+    )
+
+
+class Lens(Section):
+    """True distortion of both lenses (Brown-Conrady as in OpenCV); frames are rectified by what is believed of it.
+
+    The coefficients are of tangents in the air behind a port, in water where there is none.
+    """
+
+    k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, of r^2")
+    k2: float = Field(default=0.0, ge=-5, le=5, description="radial distortion, of r^4")
+    k3: float = Field(default=0.0, ge=-10, le=10, description="radial distortion, of r^6")
+    p1: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion, along the columns")
+    p2: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion, along the rows")
+
+
+class Port(Section):
+    """The window in front of each lens, which bends every ray twice.
+
+    The rig's field of view is that of the pinhole in water which agrees with the image near the middle of a straight
+    port, at every distance; the position of a camera is that pinhole's.
+    """
+
+    kind: Literal["none", "flat", "dome"] = Field(
+        default="none", description="none: pinhole in water; flat pane; dome of concentric spheres"
+    )
+    thickness_m: float = Field(default=0.01, gt=0, le=0.2, description="of the glass [m]")
+    distance_m: float = Field(
+        default=0.02, gt=0, le=1, description="flat: from the entrance pupil of the lens to the glass [m]"
+    )
+    tilt_deg: float = Field(
+        default=0.0, ge=-30, le=30, description="flat: turn about the image's rows, lower side away from the lens [deg]"
+    )
+    radius_m: float = Field(default=0.05, gt=0, le=1, description="dome: inner radius [m]")
+    offset_m: Vector3 = Field(
+        default=(0.0, 0.0, 0.0), description="dome: its centre from the entrance pupil: right, down, forward [m]"
+    )
+    glass_index: float = Field(default=1.49, ge=1, le=3, description="refractive index: acrylic 1.49, glass 1.52")
+    water_index: float = Field(default=1.339, ge=1, le=2, description="refractive index of sea water")
+    calibrated_at_m: float = Field(
+        default=0.0, ge=0, le=100,
+        description="frames are rectified for what lies at this depth, as by a calibration in water; 0 = the port is "
+        "believed to be a change of focal length [m]",
+    )  # fmt: skip
+
+
+class Calibration(Section):
+    """Errors of calibration: by what the true cameras differ from those that the estimators believe in."""
+
+    focal_error: float = Field(default=0.0, ge=-0.2, le=0.2, description="of both focal lengths, a share of it")
+    left_principal_point_error_px: Vector2 = Field(
+        default=(0.0, 0.0), description="of the left image: to the right, down [px]"
+    )
+    right_principal_point_error_px: Vector2 = Field(
+        default=(0.0, 0.0), description="of the right image: to the right, down [px]"
+    )
+    baseline_error: float = Field(default=0.0, ge=-0.5, le=0.5, description="of the baseline, a share of it")
+    right_roll_deg: float = Field(
+        default=0.0, ge=-5, le=5, description="turn of the right camera about its axis, clockwise from behind [deg]"
+    )
+    right_pitch_deg: float = Field(default=0.0, ge=-5, le=5, description="turn of the right camera, upwards [deg]")
+    right_yaw_deg: float = Field(
+        default=0.0, ge=-5, le=5, description="turn of the right camera, away from the left one [deg]"
+    )
+    k1_error: float = Field(default=0.0, ge=-2, le=2, description="of the believed lens.k1: the true one less it")
+    k2_error: float = Field(default=0.0, ge=-5, le=5, description="of the believed lens.k2: the true one less it")
+
+
 class Water(Section):
-    """Inherent optical properties of the water."""
+    """Inherent optical properties of the water, for R, G, B: of a Jerlov type, or of your own."""
 
     jerlov: JERLOV = Field(default="IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
     turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies scattering")
+    absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
+        default=None, description="absorption for R, G, B in place of the type's, with scattering_per_m [1/m]"
+    )
+    scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
+        default=None, description="scattering for R, G, B in place of the type's, with absorption_per_m [1/m]"
+    )
+    spectrum_file: str | None = Field(
+        default=None,
+        description="CSV of wavelength [nm], absorption and scattering [1/m] in place of the type's; ${TWIN_DATA} is "
+        "expanded",
+    )
+    mean_cosine: float = Field(
+        default=0.924, ge=0, le=0.99, description="of the angle of scattering (Henyey-Greenstein's g); 0 = even"
+    )
+    kept_share: float = Field(
+        default=0.0, ge=0, le=1,
+        description="share k of scattered light that stays in the light on its way (multiple scattering): attenuation "
+        "is a + (1 - k) b, from the beam's c (0) to absorption alone (1); 0.74 keeps what turns by less than 15 deg",
+    )  # fmt: skip
+
+    @property
+    def label(self) -> str:
+        """What the water is called."""
+        own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
+        return f"{own or self.jerlov}, turbidity {self.turbidity:g}"
 
 
 class Lamp(Section):
@@ -126,12 +268,29 @@ class Lamp(Section):
     )
     pan_deg: float = Field(default=0.0, ge=-90, le=90, description="beam axis from straight down towards port [deg]")
     intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the axis [cd]")
+    beam: tuple[tuple[OffAxis, Share], ...] = Field(
+        default=(),
+        description="pairs of angle off the axis [deg], from 0, and intensity as a share of that on it, straight "
+        "between and dark beyond; empty = a measured LED",
+    )
+    colour_temperature_k: float = Field(
+        default=6500.0, ge=1000, le=40000, description="of a black body; 6500 is white, intensity stays [K]"
+    )
 
 
 class Sun(Section):
-    """Even daylight on the floor."""
+    """Daylight from straight above."""
 
-    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="white daylight on the floor [lx]")
+    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="white daylight [lx]")
+    depth_m: float = Field(
+        default=0.0, ge=0, le=500,
+        description="of the reference plane z = 0 below the surface, where the daylight is told: the water takes from "
+        "it on its way down; 0 = it is told on the floor, and even [m]",
+    )  # fmt: skip
+    caustics: float = Field(
+        default=0.0, ge=0, le=1,
+        description="share of the daylight that comes from the sun itself and is focused by waves; needs depth_m",
+    )  # fmt: skip
 
 
 class Snow(Section):
@@ -260,6 +419,12 @@ class Scenario(Section):
     vehicle: Vehicle = Vehicle()
     rig: Rig = Rig()
     imaging: Imaging = Imaging()
+    sensor: Sensor | None = Field(
+        default=None, description="a physical camera instead of noise by shares of full scale"
+    )
+    lens: Lens = Lens()
+    port: Port = Port()
+    calibration: Calibration = Calibration()
     water: Water = Water()
     lamps: tuple[Lamp, ...] = ()
     sun: Sun = Sun()

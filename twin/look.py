@@ -14,7 +14,7 @@ from twin.imaging.camera import Anatomy, Shot
 from twin.imaging.renderer import NEAR_M
 from twin.judge.wording import DASH, percent
 from twin.mission import Mission
-from twin.sea import Sea
+from twin.sea import RenderedSea
 from twin.timing import Stopwatch
 
 #: Side of the window in which contrast is told, as a share of the image's width.
@@ -52,7 +52,7 @@ def look(mission: Mission, at_m: tuple[float, float, float] | None = None) -> Lo
     place = (0.0, 0.0, mission.scenario.plan.altitude_m) if at_m is None else at_m
     world_from_left = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(place))
     _check_place(mission, world_from_left)
-    with Sea(mission, Stopwatch()) as sea:
+    with RenderedSea(mission, Stopwatch()) as sea:
         anatomy = sea.camera.dissect(world_from_left)
         return Look(world_from_left, sea.camera.shoot(world_from_left, stereo=True), anatomy)
 
@@ -121,7 +121,14 @@ def figures(seen: Look) -> dict[str, Any]:
         }
     range_m = float(np.median(seen.shot.depth_left))
     place = {"at_m": seen.world_from_left[:3, 3].tolist(), "depth_median_m": _number(range_m)}
-    return place | {name: [_number(v) for v in values] for name, values in table.items()}
+    return place | _exposure(a) | {name: [_number(v) for v in values] for name, values in table.items()}
+
+
+def _exposure(anatomy: Anatomy) -> dict[str, float]:
+    """Time and gain of a physical sensor."""
+    if anatomy.raw is None:
+        return {}
+    return {"exposure_ms": 1000 * anatomy.setting.exposure_s, "analogue_gain": anatomy.setting.analogue_gain}
 
 
 def table(told: dict[str, Any]) -> list[tuple[str, ...]]:

@@ -72,7 +72,9 @@ def _headline(scenario: Scenario, seen: Look) -> str:
     if scenario.sun.illuminance_lx:
         light += f" and {scenario.sun.illuminance_lx:g} lx of daylight"
     at = f"left camera at ({x:g}, {y:g}, {z:g}) m"
-    return f"{scenario.name}: {at}; water {water.jerlov}, turbidity {water.turbidity:g}; {light}"
+    if scenario.sensor is not None:
+        light += f"; {1000 * seen.anatomy.setting.exposure_s:.3g} ms at gain {seen.anatomy.setting.analogue_gain:.3g}"
+    return f"{scenario.name}: {at}; water {water.label}; {light}"
 
 
 def _panels(scenario: Scenario, seen: Look) -> list[Panel]:

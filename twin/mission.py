@@ -13,12 +13,18 @@ from controllers import lawnmower, loops, segments
 from controllers.forecast import least_clearance
 from controllers.survey_plan import PlanFault, SurveyPlan, SurveyRequest
 from twin import geometry
-from twin.config import Beacon, Scenario, Source
+from twin.config import Beacon, Calibration, Scenario, Sensor, Source
 from twin.errors import ScenarioError, TwinError
 from twin.geometry import Array
+from twin.imaging.lamps import daylight_at, lights_of_eye
+from twin.imaging.view import View, make_view
+from twin.imaging.water import medium
 from twin.judge.metrics import check_require
 from twin.records import MapGrid, StereoRig
 from twin.simulate.autopilot import top_speed_mps
+
+#: Between places along the path at which a lamp is looked for in the floor.
+LAMP_STEP_M = 0.02
 
 
 class Step(NamedTuple):
@@ -38,11 +44,17 @@ class Mission:
     plan: SurveyPlan
     rig: StereoRig
     grid: MapGrid
+    view: View
 
     @property
     def start(self) -> Array:
         """(4, 4) reference position: world_from_camera where the survey begins, level, bow to the east."""
         return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
+
+    @property
+    def start_of_body(self) -> Array:
+        """(4, 4) world_from_body there."""
+        return self.start @ geometry.inverse(self.rig.body_from_camera)
 
     def fly(self, track: int) -> Iterator[Step]:
         """The frames of a track (from 1); every N-th is a key point, and the last one."""
@@ -52,13 +64,17 @@ class Mission:
     def hold(self, track: int) -> Iterator[Step]:
         """The frames of half the station keeping after a track."""
         end = self.plan.reference(track, self.plan.track_duration_s(track))
-        for _ in range(max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))):
+        for _ in range(self._n_holding):
             yield Step(end, False, True)
+
+    @property
+    def _n_holding(self) -> int:
+        return max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))
 
     @property
     def n_frames(self) -> int:
         """Frames of the whole survey."""
-        return sum(sum(1 for _ in self.fly(t)) + 2 * sum(1 for _ in self.hold(t)) for t in self.tracks)
+        return sum(len(self.plan.frames_of_track(t)) + 2 * self._n_holding for t in self.tracks)
 
     @property
     def tracks(self) -> range:
@@ -78,6 +94,13 @@ def prepare(scenario: Scenario) -> Mission:
     plan = _attempt(lambda: make_plan(scenario), source, faults)
     _attempt(lambda: _check_speed(scenario), source, faults)
     _attempt(lambda: _check_current(scenario), source, faults)
+    if (sensor := scenario.sensor) is not None:
+        _attempt(lambda: _check_exposure(sensor), source, faults)
+        for key, time_ms in (("exposure_max_ms", sensor.exposure_max_ms), ("readout_ms", sensor.readout_ms)):
+            _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, faults)
+    view = _attempt(lambda: make_view(scenario), source, faults)
+    _attempt(lambda: _check_light(scenario), source, faults)
+    _attempt(lambda: _check_surrogate(scenario), source, faults)
     _attempt(lambda: check_require(scenario.require), source, faults)
     _attempt(lambda: _check_beacons_listed(scenario), source, faults)
     if terrain is not None:
@@ -85,9 +108,11 @@ def prepare(scenario: Scenario) -> Mission:
             _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, faults)
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
-    if faults or terrain is None or plan is None:
+        for k in range(len(scenario.lamps)):
+            _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, faults)
+    if faults or terrain is None or plan is None or view is None:
         raise ScenarioError(faults)
-    return Mission(scenario, terrain, plan, scenario.believed_rig(), _grid(scenario, plan))
+    return Mission(scenario, terrain, plan, scenario.believed_rig(), _grid(scenario, plan), view)
 
 
 def _attempt(build, source: Source, faults: list[str]):
@@ -108,7 +133,8 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
         if t.height_file or t.texture_file:
             key = "height_file" if t.height_file else "texture_file"
             raise TwinError(f"terrain.{key}", f"is not read by a generated floor ({t.kind})", 'terrain.kind = "file"')
-        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, t.texture_px_m, scenario.seed)
+        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # nobody looks at it
+        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
     return terrains.load(
@@ -142,6 +168,17 @@ def _check_speed(scenario: Scenario) -> None:
         )
 
 
+def _check_surrogate(scenario: Scenario) -> None:
+    """The surrogate knows noise, light and geometry; what else befalls images it would silently leave out."""
+    if scenario.imaging.fidelity == "rendered":
+        return
+    plain = scenario.port.kind == "none" and scenario.calibration == Calibration()
+    absent = {"port, calibration": not plain, "snow": scenario.snow.density_per_m3 > 0}
+    for section, given in absent.items():
+        if given:
+            raise TwinError("imaging.fidelity", f"'surrogate' knows nothing of [{section}]", '"rendered"')
+
+
 def _check_beacons_listed(scenario: Scenario) -> None:
     """Where beacons aid, there are some."""
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
@@ -166,6 +203,45 @@ def _check_current(scenario: Scenario) -> None:
     """A current moves a hull, not a carrier."""
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
         raise TwinError("current.velocity_mps", "moves no kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
+
+
+def _check_light(scenario: Scenario) -> None:
+    """Water, daylight and beams are what they should be."""
+    daylight = daylight_at(scenario.sun, medium(scenario.water), scenario.plan.altitude_m)
+    lights_of_eye(scenario.believed_rig(), scenario.lamps, daylight, 0)
+
+
+def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+    """The lamp stays above the floor, bow to the east, all along the path."""
+    corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
+    offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along = np.append(np.arange(0.0, lengths[-1], LAMP_STEP_M), lengths[-1])
+    x, y, z = (np.interp(along, lengths, corners[:, k]) + offset[k] for k in range(3))
+    above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
+    if (least := above.min()) < 0:
+        raise TwinError(
+            f"lamps.{number}.position_m", f"lies {-least:.2f} m in the floor at x {x[above.argmin()]:.1f},"
+            f" y {y[above.argmin()]:.1f}", f"{scenario.lamps[number].position_m[2] - least:.2f} up or more",
+        )  # fmt: skip
+
+
+def _check_exposure(sensor: Sensor) -> None:
+    """The limits of exposure are in order."""
+    if sensor.exposure_min_ms > sensor.exposure_max_ms:
+        raise TwinError(
+            "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
+            f"up to sensor.exposure_max_ms = {sensor.exposure_max_ms:g}",
+        )  # fmt: skip
+
+
+def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
+    """What the sensor does for a frame is done before the next."""
+    if time_ms > 1000 / frame_rate_hz:
+        raise TwinError(
+            f"sensor.{key}", f"{time_ms:g}: longer than a frame",
+            f"up to {np.floor(1e5 / frame_rate_hz) / 100:g} at rig.frame_rate_hz = {frame_rate_hz:g}",
+        )  # fmt: skip
 
 
 def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:

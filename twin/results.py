@@ -49,7 +49,7 @@ def conclude(
     for alignment in result.alignments:
         folder.log("aligned", **alignment._asdict())
     with watch("map"):
-        elevation = _map(mission, navigator, result, lambda share: say("map", share))
+        elevation = make_map(mission, navigator, result, lambda share: say("map", share))
     wall_s = time.perf_counter() - begun
     metrics = _judge(mission, result, elevation, truth, watch, wall_s, reason)
     say("report", 0.0)
@@ -57,9 +57,10 @@ def conclude(
     return RunResult(metrics["status"], metrics, folder.path)
 
 
-def _map(
+def make_map(
     mission: Mission, navigator: Navigator, result: SurveyResult, say: Callable[[float], None]
 ) -> ElevationMap | None:
+    """The map along the final trajectory; None where no key point was reached. `say` is told the share done."""
     n_keys = len(result.key_frames)
     if n_keys == 0:
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+from collections.abc import Collection
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,18 +20,22 @@ from twin.mission import Mission
 from twin.records import ElevationMap, SurveyResult, Trajectory, Truth
 from twin.timing import Stopwatch
 
+PICTURES = ("report", "recording")
 _RESERVE_BYTES = 4 * 2**20  # set aside so that a full disk leaves room for trajectories and metrics
 
 
 class RunFolder:
     """A run's folder and its log (log.jsonl, a JSON object a line). Use as a context manager.
 
+    Args:
+        shows: which of `PICTURES` are drawn when all is over; in a study, drawing takes longer than a short flight.
+
     Raises:
         TwinError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, mission: Mission):
-        self.path, self._reserve = folder, folder / ".reserve"
+    def __init__(self, folder: Path, mission: Mission, shows: Collection[str] = PICTURES):
+        self.path, self._reserve, self._shows = folder, folder / ".reserve", shows
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
@@ -78,8 +83,10 @@ class RunFolder:
         try:
             self._write_paths(mission, result, truth, watch)
             self._write_maps(elevation, truth, mission)
-            write_report(self.path, metrics)
-            view.write_recording(self.path, metrics)
+            if "report" in self._shows:
+                write_report(self.path, metrics)
+            if "recording" in self._shows:
+                view.write_recording(self.path, metrics)
         except OSError as error:
             metrics = metrics | {"status": "aborted", "reason": metrics["reason"] or str(error)}
             self._write(waiting, json.dumps(metrics, indent=1))
@@ -104,6 +111,7 @@ class RunFolder:
             "n_per_key": mission.plan.n_frames_per_key,
             "timing_ms": {stage: watch.durations_ms(stage) for stage in ("f2f", "stereo")},
         }
+        (self.path / "keypoints").mkdir(exist_ok=True)
         self._write("keypoints/index.json", json.dumps(index))
 
     def _write_maps(self, elevation: ElevationMap | None, truth: Truth, mission: Mission) -> None:

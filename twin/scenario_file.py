@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from twin.config import Scenario, Source
 from twin.errors import ScenarioError, TwinError
+
+Model = TypeVar("Model", bound=BaseModel)
+_PATH_KEYS = ("imaging.calibration", "terrain.height_file", "terrain.texture_file", "water.spectrum_file")
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
@@ -27,13 +31,44 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     source = Source(path=file, lines=lines, overrides=tuple(overrides))
     for override in overrides:
         _apply(tree, override)
-    try:
-        scenario = Scenario.model_validate(tree)
-    except ValidationError as error:
-        faults = [_explain(item) for item in error.errors()]
-        raise ScenarioError([source.fault(f) for f in faults]) from None
+    scenario = validated(tree, Scenario, source)
     scenario._source = source
     return scenario
+
+
+def read_tree(path: str | Path) -> dict[str, Any]:
+    """The keys and values of a scenario file (or a name in scenes/) with what it extends, unchecked."""
+    return _read(find_scene(path), seen=())[0]
+
+
+def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
+    """The scenario of a tree with the values of these dotted keys in place of its own.
+
+    Args:
+        source: tells where a fault is; paths among the values are relative to its file.
+
+    Raises:
+        ScenarioError: every fault of the outcome.
+    """
+    changed = copy.deepcopy(dict(tree))
+    for key, value in values.items():
+        is_path = key in _PATH_KEYS and isinstance(value, str)
+        try:
+            _assign(changed, key, str(_expand(value, source.path.parent)) if is_path else value, key)
+        except ScenarioError as error:
+            fault = TwinError(key, error.lines[0].removeprefix(f"{key}: "))
+            raise ScenarioError([source.fault(fault)]) from None
+    scenario = validated(changed, Scenario, source)
+    scenario._source = source
+    return scenario
+
+
+def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
+    """The tree as a model of the house. Raises ScenarioError with every fault."""
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        raise ScenarioError([source.fault(_explain(item, model)) for item in error.errors()]) from None
 
 
 def find_scene(path: str | Path) -> Path:
@@ -82,17 +117,7 @@ def _read(file: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     """One TOML file merged over what it extends, its file paths made absolute, with the line of each key."""
     if file.resolve() in seen:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
-    try:
-        tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        line = re.search(r"line (\d+)", str(error))
-        number = line[1] if line else len(text.splitlines())
-        raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    lines = _key_lines(text)
+    tree, lines = read_toml(file)
     _resolve_paths(tree, file.parent)
     base = tree.pop("extends", None)
     if base is None:
@@ -104,14 +129,30 @@ def _read(file: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     return _merge(base_tree, tree), lines
 
 
+def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """A TOML file as it stands, with the line of each key.
+
+    Raises:
+        ScenarioError: it cannot be read, or is no TOML.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        line = re.search(r"line (\d+)", str(error))
+        number = line[1] if line else len(text.splitlines())
+        raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
+    return tree, _key_lines(text)
+
+
 def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
-    terrain = tree.get("terrain", {})
-    if not isinstance(terrain, dict):
-        return
-    for key in ("height_file", "texture_file"):
-        value = terrain.get(key)
-        if isinstance(value, str):
-            terrain[key] = str(_expand(value, folder))
+    for section, key in (name.split(".") for name in _PATH_KEYS):
+        keys = tree.get(section)
+        if isinstance(keys, dict) and isinstance(keys.get(key), str):
+            keys[key] = str(_expand(keys[key], folder))
 
 
 def _expand(value: str, folder: Path) -> Path:
@@ -159,35 +200,39 @@ def _apply(tree: dict[str, Any], override: str) -> None:
         value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         value = text
-    *parents, leaf = key.strip().split(".")
+    key = key.strip()
+    _assign(tree, key, str(_expand(str(value), Path.cwd())) if key in _PATH_KEYS else value, f"--set {override}")
+
+
+def _assign(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
+    """Sets the dotted key in the tree; a fault begins with what was `said`."""
+    *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
         parents, leaf = ["require"], ".".join([*parents[1:], leaf]).strip('"')
     node: Any = tree
     for part in parents:
-        node = _enter(node, part, override)
+        node = _enter(node, part, said)
         if not isinstance(node, dict | list):
-            raise ScenarioError([f"--set {override}: {part} is a value, not a section"])
+            raise ScenarioError([f"{said}: {part} is a value, not a section"])
     if isinstance(node, list):
-        raise ScenarioError([f"--set {override}: name one of the list, as in {'.'.join(parents)}.0.{leaf}=..."])
+        raise ScenarioError([f"{said}: name one of the list, as in {'.'.join(parents)}.0.{leaf}=..."])
     node[leaf] = value
-    if key.strip() in ("terrain.height_file", "terrain.texture_file"):
-        node[leaf] = str(_expand(str(value), Path.cwd()))
 
 
-def _enter(node: Any, part: str, override: str) -> Any:
+def _enter(node: Any, part: str, said: str) -> Any:
     """The section or list item of this name."""
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdigit() or int(part) >= len(node):
-        raise ScenarioError([f"--set {override}: no item {part} (allowed: 0 to {len(node) - 1})"])
+        raise ScenarioError([f"{said}: no item {part} (allowed: 0 to {len(node) - 1})"])
     return node[int(part)]
 
 
-def _explain(item: Any) -> TwinError:
+def _explain(item: Any, model: type[BaseModel]) -> TwinError:
     """One pydantic error in the words of the house."""
     where = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
-        allowed = _fields(item["loc"][:-1])
+        allowed = _fields(item["loc"][:-1], model)
         return TwinError(where, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
     value = item.get("input")
     shown = "" if isinstance(value, dict) else f"{value!r}: "
@@ -214,11 +259,10 @@ _ALLOWED = {
 }
 
 
-def _fields(location: Iterable[Any]) -> list[str]:
-    """Names of the keys allowed in the section at this place."""
-    model: Any = Scenario
+def _fields(location: Iterable[Any], model: Any) -> list[str]:
+    """Names of the keys allowed in the section at this place of the model."""
     for part in location:
-        if isinstance(part, int):
+        if part not in model.model_fields:  # an item of a list, a key of a table
             continue
         annotation = model.model_fields[part].annotation
         arguments = getattr(annotation, "__args__", (annotation,))

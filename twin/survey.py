@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from twin.config import Scenario
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
-from twin.estimate.vision import StereoVision
+from twin.estimate.vision import StereoVision, Vision
 from twin.mission import Mission, Step, prepare
 from twin.pilot import make_pilot
 from twin.records import Estimate
 from twin.results import RunResult, conclude
-from twin.run_writer import RunFolder
-from twin.sea import Sea
+from twin.run_writer import PICTURES, RunFolder
+from twin.sea import RenderedSea, Sea, Watch
 from twin.timing import Stopwatch
 
 _PATIENCE_S = 2.0  # without vision for longer, the vehicle is lost
@@ -37,8 +37,12 @@ def run(
     out: Path,
     progress: Callable[[Progress], None] = lambda _: None,
     live: bool = False,
+    shows: Collection[str] = PICTURES,
 ) -> RunResult:
     """Flies a scenario and leaves a run folder; an aborted survey keeps what it has.
+
+    Args:
+        shows: what is drawn of it in the end, "report" and "recording".
 
     Raises:
         ScenarioError: the survey cannot be flown as asked; nothing was written.
@@ -49,8 +53,10 @@ def run(
     def say(stage: str, share: float) -> None:
         progress(Progress(0.0, time.perf_counter() - begun, share, 0.0, stage))
 
-    with Sea(mission, watch) as sea, RunFolder(out, mission) as folder:
-        navigator = make_navigator(mission, out, watch)
+    with open_sea(mission, watch) as sea, RunFolder(out, mission, shows) as folder:
+        for warning in sea.warnings:
+            folder.log("warning", text=warning)
+        navigator = make_navigator(mission, vision_in(sea, out), watch)
         try:
             fly(mission, sea, navigator, _Watcher(mission, folder, progress, begun, live))
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
@@ -78,12 +84,31 @@ def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Ste
             steer(step, track)
 
 
-def make_navigator(mission: Mission, folder: Path, watch: Stopwatch) -> Navigator:
+def open_sea(mission: Mission, watch: Stopwatch) -> Sea:
+    """The world of a mission, as real as its scenario asks."""
+    if mission.scenario.imaging.fidelity == "rendered":
+        return RenderedSea(mission, watch)
+    from twin.surrogate import calibration
+    from twin.surrogate.sea import SurrogateSea
+
+    return SurrogateSea(mission, watch, calibration.load(mission.scenario.imaging.calibration))
+
+
+def vision_in(sea: Sea, folder: Path) -> Vision:
+    """What answers for the stereo camera: the images, or the sea in their place where nothing is rendered."""
+    return sea.vision or image_vision(sea.mission, folder, sea.watch)
+
+
+def image_vision(mission: Mission, folder: Path, watch: Watch) -> StereoVision:
+    """Vision by images, with all it may know."""
+    pixel_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
+    return StereoVision(mission.rig, mission.scenario.estimate, pixel_m, folder / "keypoints", watch)
+
+
+def make_navigator(mission: Mission, vision: Vision, watch: Stopwatch) -> Navigator:
     """The estimators with all they may know: calibration, data sheets, settings, the planned start."""
-    scenario, rig = mission.scenario, mission.rig
-    pixel_m = scenario.plan.altitude_m / rig.focal_px
-    vision = StereoVision(rig, scenario.estimate, pixel_m, folder / "keypoints", watch)
-    return Navigator(vision, rig, scenario.believed_noise(), scenario.estimate, mission.start, watch)
+    scenario = mission.scenario
+    return Navigator(vision, mission.rig, scenario.believed_noise(), scenario.estimate, mission.start, watch)
 
 
 class _Watcher:
@@ -91,6 +116,7 @@ class _Watcher:
 
     def __init__(self, mission: Mission, folder: RunFolder, progress, begun: float, live: bool):
         self.n_frames, self.rate_hz = mission.n_frames, mission.rig.frame_rate_hz
+        self.water = mission.scenario.water.label
         self.folder, self.progress, self.begun = folder, progress, begun
         self.live = None
         if live:
@@ -110,4 +136,4 @@ class _Watcher:
         wall_s = time.perf_counter() - self.begun
         self.progress(Progress(estimate.time_s, wall_s, self.count / self.n_frames, estimate.sigma_m, "survey"))
         if self.blind > _PATIENCE_S * self.rate_hz:
-            raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s: {estimate.status}")
+            raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")

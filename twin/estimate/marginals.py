@@ -77,7 +77,8 @@ def marginals(graph: gtsam.GaussianFactorGraph, order: gtsam.Ordering, wanted: C
             break
         row = rows[k]
         if owner[k] == k:
-            blocks[k] = _Block() if start[k] is None else blocks[start[k]].part(row.parents)
+            from_block = start[k]
+            blocks[k] = _Block() if from_block is None else blocks[from_block].part(row.parents)
         cov = _take_in(row, blocks[owner[k]])
         if row.key in wanted:
             found[row.key] = cov
@@ -112,7 +113,8 @@ def _owners(rows: list[_Row]) -> tuple[list[int], list[int | None]]:
     One variable may go on in the block of its first parent: one whose parents are all that is in it.
     """
     turn = {row.key: k for k, row in enumerate(rows)}
-    owner, start = list(range(len(rows))), [None] * len(rows)
+    owner = list(range(len(rows)))
+    start: list[int | None] = [None] * len(rows)
     taken: set[int] = set()
     for k in reversed(range(len(rows))):
         parents = [turn[key] for key in rows[k].parents]

@@ -31,9 +31,8 @@ def overlaps(node: KeyPoint, poses: Array, rig: StereoRig, patch_px: int) -> Arr
         return np.zeros(len(poses))
     world = np.ascontiguousarray(geometry.transform(node.world_from_camera, node.points.xyz))
     camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
-    return _overlaps(
-        world, node.world_from_camera[:3, 3].copy(), np.ascontiguousarray(poses), _reach_m(node, rig), *camera
-    )
+    here, reach_m = node.world_from_camera[:3, 3].copy(), _reach_m(node.points.xyz, rig)
+    return _overlaps(world, here, np.ascontiguousarray(poses), reach_m, *camera)
 
 
 def choose_links(
@@ -94,9 +93,9 @@ def _spread(others: list[tuple[KeyPoint, float]], count: int) -> list[tuple[KeyP
     return (chosen + [o for o in others if o not in chosen])[:count]
 
 
-def _reach_m(node: KeyPoint, rig: StereoRig) -> float:
-    """No camera farther away sees the same floor: the image's diagonal at the node's largest depth."""
-    return float(node.points.xyz[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
+def _reach_m(points: Array, rig: StereoRig) -> float:
+    """No camera farther away sees the same floor: the image's diagonal at the largest depth of the points (n, 3)."""
+    return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
 
 
 @njit(cache=True, nogil=True)

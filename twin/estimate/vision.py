@@ -123,7 +123,7 @@ class StereoVision:
 
     def register(self, world_from_camera: Array) -> Motion | None:
         assert self._points is not None
-        half_m = 0.6 * float(self._points.xyz[:, 2].max()) * self.rig.width_px / self.rig.focal_px
+        half_m = half_window_m(self._points, self.rig)
         return self.mosaic.register(self._image, world_from_camera, half_m, self.rig)
 
     def lay(self, number: int, world_from_camera: Array) -> None:
@@ -159,6 +159,14 @@ class StereoVision:
             progress=progress,
             step_cov=step_cov,
         )
+
+
+def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
+    """Half the side of the mosaic to register with: the view, and a fifth, at a depth that nine of ten points keep to.
+
+    A mismatch may lie at any depth: by the farthest point one of 0.5 px asked for 20 GB of mosaic.
+    """
+    return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 
 
 def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:

@@ -34,7 +34,7 @@ def write(path: Path, result: SurveyResult) -> None:
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_texts(poses)))
     motions = np.array([link.i_from_j for link in result.links]).reshape(-1, 4, 4)
     information = np.linalg.inv(np.array([link.cov for link in result.links]).reshape(-1, 6, 6))
-    upper = information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]
+    upper = np.asarray(information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER], np.float64)
     edges = "".join(
         f"EDGE_SE3:QUAT {link.i} {link.j} {motion} {known}\n"
         for link, motion, known in zip(result.links, _texts(motions), _lines(upper, "%.9g"), strict=True)

@@ -1,18 +1,25 @@
-"""From radiance to numbers: exposure, shot noise, read noise, saturation, 8 bits."""
+"""From radiance to numbers: exposure, shot noise, read noise, saturation, 8 bits.
+
+The sensor of a scenario without a [sensor]: a gain without limits, noise by shares of full scale, no time of exposure.
+"""
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from twin.config import Imaging
+from twin.config import Imaging, Scenario
+from twin.imaging.bands import in_bands
+from twin.imaging.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.records import Image
 
+Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
+Depth = NDArray[np.float32]
 
 EXPOSURE_LAG_S = 0.5  # time in which auto-exposure makes up for all but 1/e of a change of light
 
@@ -26,18 +33,67 @@ class Exposure:
     follows from the frames before it, as in a real camera; the first frame is metered.
     """
 
-    def __init__(self, gray_level: float, frame_rate_hz: float):
+    def __init__(
+        self,
+        gray_level: float,
+        frame_rate_hz: float,
+        lag_s: float = EXPOSURE_LAG_S,
+        reach: tuple[float, float] = (0.0, math.inf),
+    ):
         self._gray_level = gray_level
-        self._share = 1 - np.exp(-1 / (frame_rate_hz * EXPOSURE_LAG_S))
+        self._share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
+        self._reach = reach
         self._log_gain: float | None = None
 
     def gain(self, radiance: Radiance) -> float:
         """Gain of this frame [1 / (cd/m2)]; the light of this frame counts for the next ones."""
-        brightest = float(radiance.mean(axis=0, dtype=np.float64).mean(axis=0).max())
-        metered = float(np.log(self._gray_level / max(brightest, DARK_CD_M2)))
+        return self.gain_for(float(radiance.mean(axis=0, dtype=np.float64).mean(axis=0).max()))
+
+    def gain_for(self, brightest: float) -> float:
+        """The same for a mean of the brightest channel [cd/m2]; what is out of reach is not waited for."""
+        least, most = self._reach
+        wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
+        metered = float(np.log(wanted))
         log_gain = metered if self._log_gain is None else self._log_gain
         self._log_gain = log_gain + self._share * (metered - log_gain)
         return float(np.exp(log_gain))
+
+
+class Setting(NamedTuple):
+    """How a frame is exposed.
+
+    Args:
+        gain: signal of 1 cd/m2 on the axis; a signal of 1 saturates.
+        exposure_s: time that the shutter is open; 0 takes none.
+        analogue_gain: factor before digitising.
+    """
+
+    gain: float
+    exposure_s: float = 0.0
+    analogue_gain: float = 1.0
+
+
+class PlainSensor:
+    """Sensor of both eyes: exposes at once, to any gain, with the noise of `[imaging]`."""
+
+    def __init__(self, scenario: Scenario):
+        self._imaging = scenario.imaging
+        self._exposure = Exposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
+
+    def meter(self, light: Radiance) -> Setting:
+        """Setting of a frame, by the light of those before."""
+        return Setting(self._exposure.gain(light))
+
+    def gather(self, light: Radiance, depth: Depth, twist: Array, setting: Setting) -> Radiance:
+        """The light while the shutter is open, for no time."""
+        return light
+
+    def image(self, light: Radiance, setting: Setting, rng: np.random.Generator | None) -> Image:
+        """An image, without noise where `rng` is None."""
+        if rng is not None:
+            return expose(light, setting.gain, self._imaging, rng)
+        noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
+        return expose(light, setting.gain, noiseless, np.random.default_rng(0))
 
 
 def expose(radiance: Radiance, gain: float, imaging: Imaging, rng: np.random.Generator) -> Image:
@@ -47,27 +103,31 @@ def expose(radiance: Radiance, gain: float, imaging: Imaging, rng: np.random.Gen
         radiance: (H, W, 3) [cd/m2].
         gain: signal per radiance; a signal of 1 saturates.
         imaging: noise.
-        rng: stream of this camera.
+        rng: stream of this camera; gives one number an image.
     """
-    chances = np.frombuffer(rng.bytes(2 * radiance.size), np.uint16)
     image = np.empty(radiance.shape, np.uint8)
-    variances = np.float32(imaging.noise_sd**2), np.float32(imaging.shot_noise**2)
-    _digitise(radiance.reshape(-1), chances, _normal_quantiles(), np.float32(gain), *variances, image.reshape(-1))
+    rows = len(radiance)
+    light, filled = np.ascontiguousarray(radiance).reshape(rows, -1), image.reshape(rows, -1)
+    numbers = np.float32(gain), np.float32(imaging.noise_sd**2), np.float32(imaging.shot_noise**2)
+    seed, normal = seed_of(rng), normal_numbers()
+    in_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
     return image
 
 
-@cache
-def _normal_quantiles() -> NDArray[np.float32]:
-    """Standard normal numbers that 16 random bits choose from, evenly: several times faster than drawing them."""
-    quantiles = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16))
-    return (quantiles / quantiles.std()).astype(np.float32)
-
-
 @njit(cache=True, nogil=True)
-def _digitise(radiance, chances, normal, gain, read_variance, shot_variance, image):
-    """Fills `image` (n,) uint8."""
-    full = np.float32(255.0)
-    for k in range(radiance.size):
-        signal = gain * radiance[k]
-        level = signal + normal[chances[k]] * np.sqrt(read_variance + shot_variance * signal)
-        image[k] = np.uint8(min(max(level * full + np.float32(0.5), np.float32(0.0)), full))
+def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
+    """Fills rows `first` to `end` of `image` (H, 3 W); four draws come from each 64 random bits."""
+    n = light.shape[1]
+    n_words = (n + 3) // 4
+    full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)
+    drawn = np.empty(4 * n_words, np.float32)
+    for v in range(first, end):
+        for w in range(n_words):
+            bits = random_bits(seed, np.uint64(v * n_words + w))
+            for k in range(4):
+                drawn[4 * w + k] = normal[(bits >> np.uint64(16 * k)) & np.uint64(NORMAL_MASK)]
+        row, out = light[v], image[v]
+        for k in range(n):
+            signal = gain * row[k]
+            level = signal + drawn[k] * np.sqrt(read_variance + shot_variance * signal)
+            out[k] = np.uint8(min(max(level * full + half, zero), full))

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
+from twin.imaging.bands import in_bands
 from twin.imaging.optics import Depth, Lit
 from twin.records import StereoRig
 
@@ -65,15 +65,14 @@ class Shadows:
     def lit(self, depth: Depth, world_from_eye: Array, eye: int) -> Lit:
         """(lamps, H, W) uint8: 0 where the floor stands between lamp and pixel, 1 elsewhere and where no floor is."""
         lamps = geometry.transform(world_from_eye, self._lamps[eye])
-        out = np.empty((len(lamps), *depth.shape), np.uint8)
         rows, cols = (-(-n // STRIDE_PX) for n in depth.shape)
-        view = depth, self._rig.focal_px, np.ascontiguousarray(world_from_eye)
-        for k, lamp in enumerate(lamps):
-            lattice = np.empty((rows + 1, cols + 1), np.uint8)
-            _look_at_lattice(*self._grid, *view, lamp, lattice)
-            whole = cv2.resize(lattice[:-1, :-1], (cols * STRIDE_PX, rows * STRIDE_PX), interpolation=cv2.INTER_NEAREST)
-            out[k] = whole[: depth.shape[0], : depth.shape[1]]
-            _look_between(*self._grid, *view, lamp, lattice, out[k])
+        lattice = np.empty((len(lamps), rows + 1, cols + 1), np.uint8)
+        out = np.empty((len(lamps), *depth.shape), np.uint8)
+        floor, west, south, spacing = self._grid[:3], *self._grid[3:]
+        pose = np.ascontiguousarray(world_from_eye)
+        scene = *floor, west, south, spacing, depth, self._rig.focal_px, pose, lamps, lattice
+        in_bands(lambda first, end: _look_at_lattice(*scene, first, end), rows + 1)
+        in_bands(lambda first, end: _look_between(*scene, out, first, end), rows)
         return out
 
 
@@ -98,28 +97,35 @@ def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look_at_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, lattice):
-    """Fills `lattice` with what every fourth pixel, and the last, sees of a lamp."""
-    place = (lamp[0] - west) / spacing, (lamp[1] - south) / spacing, lamp[2]
-    for i in range(lattice.shape[0]):
-        v = min(i * STRIDE_PX, depth.shape[0] - 1)
-        for j in range(lattice.shape[1]):
-            u = min(j * STRIDE_PX, depth.shape[1] - 1)
-            lattice[i, j] = _sees(height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u)
+def _look_at_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, first, end):
+    """Fills rows of `lattice` (lamps, rows, cols) with what every fourth pixel, and the last, sees of each lamp."""
+    for k in range(lamps.shape[0]):
+        place = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
+        for i in range(first, end):
+            v = min(i * STRIDE_PX, depth.shape[0] - 1)
+            for j in range(lattice.shape[2]):
+                u = min(j * STRIDE_PX, depth.shape[1] - 1)
+                lattice[k, i, j] = _sees(height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, lattice, out):
-    """Looks at every pixel of `out` (H, W) that lies between four of the lattice that differ."""
-    place = (lamp[0] - west) / spacing, (lamp[1] - south) / spacing, lamp[2]
-    for i in range(lattice.shape[0] - 1):
-        for j in range(lattice.shape[1] - 1):
-            seen = lattice[i, j] + lattice[i, j + 1] + lattice[i + 1, j] + lattice[i + 1, j + 1]
-            if seen == 0 or seen == 4:
-                continue
-            for v in range(i * STRIDE_PX, min((i + 1) * STRIDE_PX, depth.shape[0])):
-                for u in range(j * STRIDE_PX, min((j + 1) * STRIDE_PX, depth.shape[1])):
-                    out[v, u] = _sees(height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u)
+def _look_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, out, first, end):
+    """Fills `out` (lamps, H, W) between rows of the lattice: where four that enclose a pixel agree, with that."""
+    for k in range(lamps.shape[0]):
+        place = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
+        for i in range(first, end):
+            for j in range(lattice.shape[2] - 1):
+                known = lattice[k, i, j]
+                seen = known + lattice[k, i, j + 1] + lattice[k, i + 1, j] + lattice[k, i + 1, j + 1]
+                agree = seen == 0 or seen == 4
+                for v in range(i * STRIDE_PX, min((i + 1) * STRIDE_PX, depth.shape[0])):
+                    for u in range(j * STRIDE_PX, min((j + 1) * STRIDE_PX, depth.shape[1])):
+                        if agree:
+                            out[k, v, u] = known
+                        else:
+                            out[k, v, u] = _sees(
+                                height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u
+                            )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -15,7 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin import config, geometry
-from twin.imaging.optics import LAMP_RADIUS_M, Depth, Lights, Radiance, beam_share
+from twin.imaging.lamps import Lights, beam_share
+from twin.imaging.optics import LAMP_RADIUS_M, Depth, Radiance
 from twin.imaging.water import Medium
 from twin.records import StereoRig
 
@@ -84,11 +85,12 @@ class Snow:
         """(n, 3) radiance of particles at (n, 3) in the eye: inverse square, both ways through the water."""
         range_m = np.linalg.norm(points, axis=1)[:, None]
         lost = self._water.attenuation_per_m
-        lux = lights.daylight_lx * np.exp(-lost * range_m)
-        for position, axis, intensity in zip(*lights[:3], strict=True):
+        day = lights.daylight
+        lux = day.eye_lx * np.exp(-day.per_m * points[:, 2:]) * np.exp(-lost * range_m)
+        for position, axis, intensity, colour, beam in zip(*lights[:5], strict=True):
             way = points - position
             distance = np.maximum(np.linalg.norm(way, axis=1), LAMP_RADIUS_M)[:, None]
-            share = beam_share((way / distance) @ axis)[:, None]
+            share = colour * beam_share((way / distance) @ axis, beam)[:, None]
             lux = lux + intensity * share / distance**2 * np.exp(-lost * (distance + range_m))
         return self._snow.albedo / np.pi * lux
 

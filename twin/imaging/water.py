@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import Water
+from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
@@ -26,37 +29,115 @@ JERLOV_PER_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, fl
     "9C": ((0.6207, 0.3480, 1.0553), (2.1720, 3.1200, 4.5610)),
 }
 
+#: Bands R, G, B [nm] over which a spectrum is averaged.
+BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
 #: Mean cosine of scattering in sea water, for the phase function of Henyey and Greenstein.
 FORWARDNESS = 0.924
 
 
 class Medium(NamedTuple):
-    """Inherent optical properties for R, G, B: absorption (3,) and scattering (3,) [1/m]."""
+    """Optical properties for R, G, B.
+
+    Args:
+        absorption_per_m, scattering_per_m: (3,) a and b, inherent [1/m].
+        mean_cosine: g of the phase function.
+        kept_share: k, of scattered light that stays in the light on its way.
+    """
 
     absorption_per_m: Array
     scattering_per_m: Array
+    mean_cosine: float = FORWARDNESS
+    kept_share: float = 0.0
 
     @property
     def attenuation_per_m(self) -> Array:
-        """Beam attenuation c = a + b (3,) [1/m].
+        """Effective attenuation (3,) [1/m]: a + (1 - k) b.
 
-        All scattered light counts as lost from the beam. In truth most of it goes on close to its old direction
-        and comes back as blur, so that the brightness of far floors is underrated in turbid water.
+        With k = 0 it is the beam's c = a + b, where all scattered light counts as lost. In truth most of it goes on
+        close to its old direction, so that the light of far floors is underrated in turbid water; with k the share of
+        scattering by small angles it is a + 0.26 b, as with the constant G = a + 0.3 b found for range-gated images.
         """
-        return self.absorption_per_m + self.scattering_per_m
+        return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
 
 def medium(water: Water) -> Medium:
-    """The water of a scenario; `turbidity` multiplies its scattering."""
-    absorption, scattering = JERLOV_PER_M[water.jerlov]
-    return Medium(np.array(absorption), np.array(scattering) * water.turbidity)
+    """The water of a scenario; `turbidity` multiplies its scattering.
+
+    Raises:
+        TwinError: a spectrum of which a part is missing, or which cannot be read.
+    """
+    absorption, scattering = _spectrum(water)
+    return Medium(absorption, scattering * water.turbidity, water.mean_cosine, water.kept_share)
 
 
-def phase_function(cos_angle: Array) -> Array:
+def _spectrum(water: Water) -> tuple[Array, Array]:
+    """Absorption and scattering (3,) [1/m]."""
+    own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
+    given = [key for key, value in own.items() if value is not None]
+    if water.spectrum_file is not None:
+        if given:
+            raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of both")
+        return read_spectrum(Path(water.spectrum_file))
+    if len(given) == 1:
+        missing = next(key for key in own if key not in given)
+        raise TwinError(f"water.{missing}", f"missing, as there is a water.{given[0]}", "both or none")
+    absorption, scattering = own.values() if given else JERLOV_PER_M[water.jerlov]
+    return np.array(absorption), np.array(scattering)
+
+
+def read_spectrum(file: Path) -> tuple[Array, Array]:
+    """Means over `BANDS_NM` of absorption and scattering (3,) [1/m], straight between the rows of a file.
+
+    Args:
+        file: lines of wavelength [nm], absorption, scattering [1/m], parted by commas; # begins a remark.
+    Raises:
+        TwinError: it cannot be read, wavelengths do not rise or do not reach over all bands, or a value is negative.
+    """
+    key = "water.spectrum_file"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty file
+            table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
+    except (OSError, ValueError) as error:
+        wanted = "lines of wavelength [nm], absorption, scattering [1/m]"
+        raise TwinError(key, f"{file} cannot be read: {error}", wanted) from None
+    if table.shape[1] != 3 or len(table) < 2:
+        raise TwinError(key, f"{file} has {table.shape[1]} columns and {len(table)} rows", "3 columns, 2 rows or more")
+    nm = table[:, 0]
+    if not (np.diff(nm) > 0).all():
+        raise TwinError(key, f"{file}: wavelengths do not rise", "each longer than the one before [nm]")
+    low, high = min(BANDS_NM)[0], max(BANDS_NM)[1]
+    if nm[0] > low or nm[-1] < high:
+        raise TwinError(key, f"{file} reaches from {nm[0]:g} to {nm[-1]:g} nm", f"from {low:g} to {high:g} or more")
+    if not (np.isfinite(table).all() and (table[:, 1:] >= 0).all()):
+        row = int(np.argmin((np.isfinite(table) & (table >= 0)).all(axis=1)))
+        raise TwinError(key, f"{file}: negative or not finite at {nm[row]:g} nm", "0 or more [1/m]")
+    absorption, scattering = (np.array([_mean(nm, value, *band) for band in BANDS_NM]) for value in table[:, 1:].T)
+    return absorption, scattering
+
+
+def _mean(at: Array, value: Array, low: float, high: float) -> float:
+    """Of a polyline between two places."""
+    nodes = np.concatenate([[low], at[(at > low) & (at < high)], [high]])
+    return float(np.trapezoid(np.interp(nodes, at, value), nodes) / (high - low))
+
+
+def downwelling_per_m(water: Medium) -> Array:
+    """Attenuation of daylight with depth, Kd (3,) [1/m], for a sun in the zenith.
+
+    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; from simulations
+    of light that is scattered many times, so that the direction-averaged loss lies between a and c.
+    """
+    a, b = water.absorption_per_m, water.scattering_per_m
+    return np.sqrt(a**2 + 0.235 * a * b)
+
+
+def phase_function(cos_angle: Array, mean_cosine: float = FORWARDNESS) -> Array:
     """Share of scattered light per solid angle [1/sr] by Henyey & Greenstein (1941); integrates to 1 over the sphere.
 
     Args:
         cos_angle: cosine of the angle between the light before and after; 1 goes straight on.
+        mean_cosine: g.
     """
-    g = FORWARDNESS
+    g = mean_cosine
     return (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cos_angle) ** 1.5)

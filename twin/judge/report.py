@@ -5,11 +5,9 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from twin.judge import wording
 from twin.judge.budget import budget
 from twin.judge.figures import draw_all
 from twin.judge.mesh_picture import surface_picture
+from twin.judge.page import render_page
 from twin.judge.pictures import jpeg_bytes, read_rgb
 from twin.judge.run_folder import Run, load_run
 from twin.judge.stages import stage_rows
@@ -44,18 +43,7 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
 def render(run: Run) -> str:
     """The page as HTML."""
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(
-        length=wording.length,
-        percent=wording.percent,
-        plain=wording.plain,
-        ms=wording.milliseconds,
-        angle=wording.angle,
-        small_angle=wording.small_angle,
-        factor=wording.factor,
-    )
-    source = files("twin.judge").joinpath("report.html.j2").read_text(encoding="utf-8")
-    return environment.from_string(source).render(**context(run))
+    return render_page("twin.judge", "report.html.j2", context(run))
 
 
 def context(run: Run) -> dict[str, Any]:

@@ -74,8 +74,11 @@ def conditions(scenario: Mapping[str, Any]) -> str:
     """Height and water of the survey."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
-    kind = "clear water" if jerlov == "clear" else f"water of Jerlov type {jerlov}"
-    thick = f" with {turbidity:g} times its scattering" if turbidity != 1 and jerlov != "clear" else ""
+    own = water.get("absorption_per_m") or water.get("spectrum_file")
+    kind = "water of its own spectrum" if own else f"water of Jerlov type {jerlov}"
+    if jerlov == "clear" and not own:
+        kind, turbidity = "clear water", 1.0
+    thick = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
     return f"{plan.get('altitude_m', 0):g} m above the reference plane in {kind}{thick}"
 
 

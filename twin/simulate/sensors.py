@@ -41,13 +41,15 @@ class NavigationSensors:
         self._dvl = DopplerLog(noise, rng["dvl"])
         self._usbl = AcousticFix(noise, settings.usbl_interval_s, rng["usbl"])
 
-    def read(self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Depth | None) -> Readings:
+    def read(
+        self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Callable[[], Depth] | None
+    ) -> Readings:
         """What they say now.
 
         Args:
             world_from_body: (4, 4) true pose.
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
-            depth_m: (height, width) true depth of the left image at a key point, else None.
+            depth_m: gives the true depth (height, width) of the left image at a key point; else None.
         """
         world_from_camera = world_from_body @ self._rig.body_from_camera
         readings = read_sensors(
@@ -57,12 +59,15 @@ class NavigationSensors:
         fix = sightings = None
         if depth_m is not None:
             fix = self._usbl.read(time_s, world_from_camera[:3, 3])
-            sightings = sight_beacons(world_from_camera, depth_m, self._project, self._noise, self._rng["beacons"])
+            if "beacons" in self._aiding:
+                sightings = sight_beacons(
+                    world_from_camera, depth_m(), self._project, self._noise, self._rng["beacons"]
+                )
         return replace(
             readings,
             dvl_mps=velocity if "dvl" in self._aiding else None,
             usbl_m=fix if "usbl" in self._aiding else None,
-            beacons=sightings if "beacons" in self._aiding else None,
+            beacons=sightings,
         )
 
 

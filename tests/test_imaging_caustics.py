@@ -1,0 +1,127 @@
+"""Caustics: no light is lost, the lines follow the waves, fade with depth and are the same in both eyes."""
+
+import types
+
+import numpy as np
+import pytest
+
+from twin import geometry
+from twin.config import Scenario, Sun, Water
+from twin.errors import TwinError
+from twin.imaging.caustics import CELLS, GRAVITY_MPS2, SLOPE_RMS, TILE_M, WATER_INDEX, Caustics
+from twin.imaging.lamps import daylight_at
+from twin.imaging.light import Light, Moment
+from twin.imaging.water import medium
+
+CLEAR = medium(Water(jerlov="clear"))
+FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
+
+
+def scenario(**sun):
+    keys = {"illuminance_lx": 1000.0, "depth_m": 4.0, "caustics": 1.0} | sun
+    rig = {"image_width_px": 160, "image_height_px": 120}
+    return Scenario.model_validate({"rig": rig, "sun": keys, "water": {"jerlov": "clear"}})
+
+
+@pytest.mark.parametrize(("depth_m", "jerlov"), [(1.0, "clear"), (4.0, "IB"), (20.0, "II")])
+def test_waves_gather_light_and_lose_none(depth_m, jerlov):
+    caustics = Caustics(depth_m, 1.0, medium(Water(jerlov=jerlov)), 3)
+    for time_s in (0.0, 1.7):
+        light = caustics.pattern(time_s)
+        assert light.mean(dtype=np.float64) == pytest.approx(1.0, abs=1e-5)
+        assert light.min() > -1e-3
+
+
+def test_in_shallow_water_the_light_is_that_of_the_surfaces_curvature():
+    """Before rays cross, I = 1 / det(1 - throw * gradient of the slope): the area that a piece of surface lights."""
+    depth_m = 0.15
+    caustics = Caustics(depth_m, 1.0, CLEAR, 1)
+    east, north = (s.astype(np.float64) for s in caustics.slopes(0.4))
+    assert np.sqrt((east**2 + north**2).mean()) == pytest.approx(SLOPE_RMS, rel=1e-5)
+    k = 2 * np.pi * np.fft.fftfreq(CELLS, TILE_M / CELLS)
+
+    def gradient(values, axis):
+        along = k[None] if axis == 1 else k[:, None]
+        return np.fft.ifft2(1j * along * np.fft.fft2(values)).real
+
+    throw_m = (1 - 1 / WATER_INDEX) * depth_m
+    det = (1 - throw_m * gradient(east, 1)) * (1 - throw_m * gradient(north, 0))
+    det -= throw_m**2 * gradient(east, 0) * gradient(north, 1)
+    assert det.min() > 0.5
+    light = caustics.pattern(0.4)
+    # told at the surface, the light lies up to 2 cm beside; that and the cells' width cost a little of its contrast
+    assert np.corrcoef(light.ravel(), (1 / det).ravel())[0, 1] > 0.97
+    assert light.std() == pytest.approx((1 / det).std(), rel=0.1)
+
+
+def test_waves_run_as_they_do_on_deep_water():
+    """Each wave turns by omega t with omega^2 = g k, downwind."""
+    caustics = Caustics(1.0, 1.0, CLEAR, 1)
+    before, after = (np.fft.fft2(caustics.slopes(t)[0]) for t in (0.0, 0.05))
+    column = 4  # waves of a quarter of the square, 1 m, that run east
+    turned = np.angle(after[0, column] / before[0, column])
+    assert turned == pytest.approx(-0.05 * np.sqrt(GRAVITY_MPS2 * 2 * np.pi * column / TILE_M), rel=1e-3)
+
+
+def test_the_pattern_fades_with_depth_turbidity_and_the_share_of_the_sky():
+    contrast = [Caustics(d, 1.0, medium(Water(jerlov="IB")), 1).pattern(0.0).std() for d in (5.0, 15.0, 40.0)]
+    assert contrast[0] > 2 * contrast[1] > 4 * contrast[2] > 0
+    murky = Caustics(5.0, 1.0, medium(Water(jerlov="II")), 1).pattern(0.0).std()
+    assert murky < 0.5 * contrast[0]
+    half = Caustics(5.0, 0.5, medium(Water(jerlov="IB")), 1).pattern(0.0)
+    np.testing.assert_allclose(half.std(), contrast[0] / 2, rtol=1e-4)
+
+
+def test_the_pattern_is_the_seeds_and_moves():
+    one, same, other = (Caustics(4.0, 1.0, CLEAR, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.pattern(0.3), same.pattern(0.3))
+    assert np.corrcoef(one.pattern(0.0).ravel(), other.pattern(0.0).ravel())[0, 1] < 0.3
+    moved = [np.corrcoef(one.pattern(0.0).ravel(), one.pattern(t).ravel())[0, 1] for t in (1 / 30, 2.0)]
+    assert moved[0] > 0.6 and moved[1] < 0.3
+
+
+def test_both_eyes_see_the_same_lines_on_the_floor_wherever_the_vehicle_is():
+    """Of a level floor 2 m below: the right image is the left one moved by the disparity, another pose another part."""
+    here = scenario()
+    light, rig = Light(here, FLAT, np.random.default_rng(0)), here.believed_rig()
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.37, -1.2, 2.0]))
+    white, depth = np.full((120, 160, 3), 255, np.uint8), np.full((120, 160), 2.0, np.float32)
+    left, right = (light.radiance(white, depth, eye, Moment(pose, 0.5))[..., 1] for eye in (0, 1))
+    pixel_m = 2.0 / rig.focal_px
+    shift = rig.baseline_m / pixel_m
+    column = np.arange(30, 150)
+    moved = np.array([np.interp(column, np.arange(160), row) for row in left])
+    seen = np.array([np.interp(column - shift, np.arange(160), row) for row in right])
+    assert np.abs(seen - moved).mean() < 0.02 * left.mean() and left.std() > 0.2 * left.mean()
+    # and each pixel shows the pattern where its ray meets the floor
+    pattern = Caustics(4.0, 1.0, CLEAR, here.seed).pattern(0.5)
+    for v, u in [(0, 0), (60, 80), (101, 17)]:
+        east = 0.37 + (u - rig.cx_px) * pixel_m * pose[0, 0] + (v - rig.cy_px) * pixel_m * pose[0, 1]
+        north = -1.2 + (u - rig.cx_px) * pixel_m * pose[1, 0] + (v - rig.cy_px) * pixel_m * pose[1, 1]
+        col, row = east * CELLS / TILE_M, north * CELLS / TILE_M
+        j, i = int(np.floor(col)), int(np.floor(row))
+        w, h = col - j, row - i
+        at = lambda r, c: pattern[r % CELLS, c % CELLS]  # noqa: E731
+        expected = (1 - h) * ((1 - w) * at(i, j) + w * at(i, j + 1)) + h * (
+            (1 - w) * at(i + 1, j) + w * at(i + 1, j + 1)
+        )
+        assert left[v, u] == pytest.approx(1000 / np.pi * expected, rel=2e-3)
+
+
+def test_without_caustics_daylight_is_even():
+    light = Light(scenario(caustics=0.0), FLAT, np.random.default_rng(0))
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    white, depth = np.full((120, 160, 3), 255, np.uint8), np.full((120, 160), 2.0, np.float32)
+    np.testing.assert_allclose(light.radiance(white, depth, 0, Moment(pose, 0.0)), 1000 / np.pi, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("sun", "fault"),
+    [
+        ({"caustics": 0.5}, r"sun\.caustics: 0\.5: there is no surface"),
+        ({"depth_m": 2.0}, r"sun\.depth_m: 2: the cameras fly above the surface \(allowed: more than 2\.2\)"),
+    ],
+)
+def test_a_sun_without_room_for_it_is_told(sun, fault):
+    with pytest.raises(TwinError, match=fault):
+        daylight_at(Sun(illuminance_lx=10.0, **sun), CLEAR, 2.2)

@@ -1,0 +1,73 @@
+"""What light and sensor cost beside MuJoCo's picture of the floor, in one process and turn by turn."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from twin import geometry
+from twin.mission import prepare
+from twin.scenario_file import load_scenario
+from twin.sea import RenderedSea
+from twin.timing import Stopwatch
+
+LARGE = ("rig.image_width_px=640", "rig.image_height_px=480")
+EFFECTS = (
+    "imaging.shadows=true", "imaging.forward_scatter=true", "water.jerlov=II", "sun.illuminance_lx=50.0",
+    "sun.depth_m=8.0", "sun.caustics=0.7",
+)  # fmt: skip
+CASES = {
+    "320x240, default set": ((), 1.0),
+    "640x480, default set": (LARGE, 1.5),
+    "640x480, all but snow and refraction, plain sensor": ((*LARGE, *EFFECTS), 1.5),
+    "640x480, all but snow and refraction, [sensor]": ((*LARGE, *EFFECTS, "sensor.bits=12"), 1.5),
+}
+N_PAIRS, WARM_UP = 60, 10
+
+
+class Clock:
+    """Times the stages of a camera [ms]: by the wall, and as work of all processors."""
+
+    def __init__(self) -> None:
+        self.taken: dict[str, list[tuple[float, float]]] = {}
+
+    def __call__(self, stage: str) -> Clock:
+        self.stage = stage
+        return self
+
+    def __enter__(self) -> None:
+        self.begun = time.perf_counter(), time.process_time()
+
+    def __exit__(self, *_: object) -> None:
+        ends = time.perf_counter(), time.process_time()
+        wall_ms, work_ms = (1000 * (end - start) for end, start in zip(ends, self.begun, strict=True))
+        self.taken.setdefault(self.stage, []).append((wall_ms, work_ms))
+
+
+def measure(overrides: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """(frames, 2) times of each stage, over the demo's reef."""
+    mission, clock = prepare(load_scenario("quickstart", list(overrides))), Clock()
+    with RenderedSea(mission, Stopwatch()) as sea:
+        sea.camera._watch = clock
+        for x in np.linspace(-1, 1, WARM_UP + N_PAIRS):
+            place = np.array([x, 0.2, mission.scenario.plan.altitude_m])
+            pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, place)
+            sea.camera.shoot(pose, stereo=True, twist_body=np.array([0.02, 0.01, 0.03, 0.35, 0.0, 0.0]))
+    return {stage: np.array(times[2 * WARM_UP :]) for stage, times in clock.taken.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_light_and_sensor_cost_about_what_the_picture_does(case: str) -> None:
+    """The limit is by the wall on two idle processors; here work counts, of both, as others may be busy beside."""
+    overrides, limit = CASES[case]
+    taken = measure(overrides)
+    by_wall, by_work = np.median(taken["optics"], axis=0) / np.median(taken["render"], axis=0)
+    (render_ms, _), (optics_ms, _) = (np.median(taken[stage], axis=0) for stage in ("render", "optics"))
+    print(
+        f"\n{case}: {by_wall:.2f} x the render by the wall (limit {limit:g}; {optics_ms:.1f} ms to {render_ms:.1f} ms),"
+        f" {by_work:.2f} x its work"
+    )
+    assert by_work < 2.5 * limit

@@ -1,0 +1,245 @@
+"""The surrogate: rays, what key points show, drawn measurements, and a calibration that finds where they came from."""
+
+import numpy as np
+import pytest
+
+from twin import geometry, survey
+from twin.errors import ScenarioError, TwinError
+from twin.mission import prepare
+from twin.scenario_file import load_scenario
+from twin.surrogate import calibration
+from twin.surrogate.calibrate import fit_to
+from twin.surrogate.chart import CellErrors
+from twin.surrogate.conditions import bounds_px
+from twin.surrogate.floor import Floor
+from twin.surrogate.model import ErrorModel, Law
+from twin.surrogate.sea import SurrogateSea, vision_beside
+from twin.surrogate.witness import Witness
+from twin.timing import Stopwatch
+
+SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]", "control.hold_s=1.0"]
+
+
+def mission(*sets):
+    return prepare(load_scenario("quickstart", [*SHORT, *sets]))
+
+
+def tilted(x, y, z):
+    return geometry.pose(geometry.rotation_from_rpy(np.pi - 0.15, 0.1, 0.7), np.array([x, y, z]))
+
+
+@pytest.fixture(scope="module")
+def reef():
+    return mission()
+
+
+@pytest.fixture(scope="module")
+def told(reef):
+    return vision_beside(reef, ErrorModel(), lambda: reef.start, Stopwatch())
+
+
+def test_a_ray_meets_the_floor_first_where_a_march_in_small_steps_first_dips_below_it(reef):
+    floor, pose = Floor(reef.terrain), tilted(0.3, -0.2, 1.5)
+    pixels = np.random.default_rng(0).uniform([0, 0], [319, 239], (40, 2))
+    depth = floor.depth_at(pixels, pose, reef.rig)
+    steps = np.arange(0.2, 4.0, 5e-4)
+    rays = np.column_stack([(pixels - [reef.rig.cx_px, reef.rig.cy_px]) / reef.rig.focal_px, np.ones(40)])
+    for ray, found in zip(rays, depth, strict=True):
+        points = geometry.transform(pose, ray * steps[:, None])
+        below = points[:, 2] < reef.terrain.height_at(points[:, 0], points[:, 1])
+        assert found == pytest.approx(steps[np.argmax(below)], abs=1e-3)
+
+
+def test_a_ray_that_leaves_the_floor_meets_nothing(reef):
+    up = geometry.pose(np.eye(3), np.array([0, 0, 2.0]))
+    beside = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([50.0, 0, 2.0]))
+    for pose in (up, beside):
+        assert np.isinf(Floor(reef.terrain).depth_at(np.array([[160.0, 120.0]]), pose, reef.rig)).all()
+
+
+def test_patches_are_placed_worse_in_murkier_water_from_farther_and_with_more_noise():
+    def bound(depth_m, *sets):
+        m = mission(*sets)
+        return bounds_px(m.scenario, m.terrain, np.array([depth_m]))[0]
+
+    base = bound(2.0)
+    assert bound(2.0, 'water.jerlov="3C"') > 2 * base
+    assert bound(3.0, 'water.jerlov="3C"') > 2 * bound(2.0, 'water.jerlov="3C"')
+    noisier = bound(2.0, "imaging.noise_sd=0.032", "imaging.shot_noise=0.024")
+    assert noisier == pytest.approx(4 * base, rel=0.05)
+
+
+def redrawn(vision, seed):
+    """The same vision with other numbers."""
+    vision._rng, vision._key, vision._drawn = np.random.default_rng(seed), seed, np.zeros((0, 6))
+    vision._used = 0
+    return vision
+
+
+def test_links_err_as_their_covariance_says(reef):
+    """With excess 1 and no correlation each of six degrees of freedom counts 1."""
+    model = ErrorModel(place_excess=1.0, correlation=1.0, steady=0.0, place_px=Law(0.05, 0.0))
+    poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
+    vision = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch())
+    true, squares = geometry.inverse(poses[0]) @ poses[1], []
+    for seed in range(150):
+        link = linked(redrawn(vision, seed), at)
+        error = geometry.log(geometry.inverse(true) @ link.a_from_b)
+        squares.append(error @ np.linalg.solve(link.cov, error) / 6)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
+
+
+def linked(vision, at):
+    """The link from the second of two key points to the first."""
+    at[0] = 0
+    assert vision.look(None, 0) is not None
+    vision.lay(0, vision._now.pose)
+    at[0] = 1
+    assert vision.look(None, 1) is not None
+    return vision._link(vision._now, vision._seen[0], 1, 0)
+
+
+def test_a_link_is_the_same_whatever_was_measured_before_it(reef):
+    poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
+    vision = vision_beside(reef, ErrorModel(), lambda: poses[at[0]], Stopwatch())
+    first = linked(vision, at)
+    vision._draw()
+    np.testing.assert_array_equal(vision._link(vision._now, vision._seen[0], 1, 0).a_from_b, first.a_from_b)
+
+
+def test_what_stays_the_same_cancels_around_a_triangle(reef):
+    poses, at = [tilted(0, 0, 2.0), tilted(0.05, 0, 2.0), tilted(0.1, 0, 2.0)], [0]
+
+    def closure(steady):
+        model = ErrorModel(steady=steady, common_px=0.0)
+        vision, left = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch()), []
+        for seed in range(60):
+            redrawn(vision, seed)
+            for k in range(3):
+                at[0] = k
+                vision.look(None, k)
+                vision.lay(k, poses[k])
+            seen = vision._seen
+            a, b, c = (vision._link(seen[j], seen[i], j, i).a_from_b for i, j in ((0, 1), (1, 2), (0, 2)))
+            left.append(np.sum(geometry.log(geometry.inverse(c) @ a @ b)[3:] ** 2))
+        return np.mean(left)
+
+    assert closure(0.95) < 0.5 * closure(0.0)
+
+
+@pytest.fixture
+def errors(told):
+    shape = told.chart.seen.shape
+    nothing = np.zeros(shape, np.float32)
+    return CellErrors(nothing, nothing, 0.0, np.array([1.0, 3.0]), np.zeros(2), np.full(2, 0.01), np.ones(2))
+
+
+def test_without_errors_a_key_point_hands_over_the_true_floor(told, errors):
+    pose = tilted(0.1, 0.2, 2.0)
+    patch = told.chart.hand_over(pose, None, pose, np.zeros((6, 6)), errors, np.random.default_rng(0))
+    known = np.isfinite(patch.height_m)
+    rows, cols = patch.height_m.shape
+    true = told.chart.height_m[patch.row : patch.row + rows, patch.col : patch.col + cols]
+    assert known.sum() > 5000
+    np.testing.assert_allclose(patch.height_m[known], true[known], atol=1e-6)
+
+
+def test_a_pose_believed_too_high_lifts_the_map_and_only_what_the_next_does_not_see_is_handed_over(told, errors):
+    pose, following = tilted(0.1, 0.2, 2.0), tilted(0.3, 0.2, 2.0)
+    lifted = pose.copy()
+    lifted[2, 3] += 0.01
+    whole, strip = (
+        told.chart.hand_over(pose, n, lifted, np.zeros((6, 6)), errors, np.random.default_rng(0))
+        for n in (None, following)
+    )
+    rows, cols = whole.height_m.shape
+    true = told.chart.height_m[whole.row : whole.row + rows, whole.col : whole.col + cols]
+    assert np.nanmean(whole.height_m - true) == pytest.approx(0.01, abs=1e-5)
+    handed = np.isfinite(strip.height_m)
+    assert 0.05 < handed.sum() / np.isfinite(whole.height_m).sum() < 0.4
+
+
+def test_a_surrogate_survey_ends_complete_and_is_the_same_again(tmp_path):
+    scenario = load_scenario("quickstart", SHORT)
+    results = [survey.run(scenario, tmp_path / name, shows=()) for name in "ab"]
+    metrics = results[0].metrics
+    assert metrics["status"] == "complete"
+    assert 1e-4 < metrics["trajectory"]["final"]["ate_rmse_m"] < 0.02
+    assert metrics["map"]["completeness"] > 0.95
+    final = [(r.folder / "trajectory_final.tum").read_bytes() for r in results]
+    assert final[0] == final[1]
+
+
+def test_what_the_surrogate_knows_nothing_of_is_refused():
+    for sets in (["snow.density_per_m3=100"], ["calibration.focal_error=0.01"], ['port.kind="flat"']):
+        with pytest.raises(ScenarioError, match="imaging.fidelity.*rendered"):
+            mission(*sets)
+
+
+def test_water_outside_the_calibration_is_warned_of():
+    kept = calibration.load()
+    murky = mission('water.jerlov="9C"', "plan.altitude_m=3", "plan.tracks=1")
+    warnings = SurrogateSea(murky, Stopwatch(), kept).warnings
+    assert len(warnings) == 1 and "calibrated from" in warnings[0]
+    assert SurrogateSea(mission(), Stopwatch(), kept).warnings == ()
+
+
+def test_a_calibration_comes_back_from_disk_and_a_file_that_is_none_is_told(tmp_path):
+    model = ErrorModel(place_px=Law(0.031, 0.7), f2f_lasting=0.123)
+    kept = calibration.Calibration(model, 7, {"place_px": 0.1})
+    calibration.save(kept, tmp_path / "model.toml")
+    assert calibration.load(tmp_path / "model.toml") == kept
+    (tmp_path / "other.toml").write_text("surveys = 3\n")
+    with pytest.raises(TwinError, match="imaging.calibration.*twin calibrate"):
+        calibration.load(tmp_path / "other.toml")
+
+
+def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
+    """The images are played by a surrogate with other errors than the one that it is compared with."""
+    true = ErrorModel(
+        place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_lasting=0.2, steady=0.4,
+        mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5,
+    )  # fmt: skip
+    notes = [
+        witnessed(mission(water), true, seed) for seed, water in enumerate(('water.jerlov="I"', 'water.jerlov="III"'))
+    ]
+    found = fit_to(notes, ErrorModel()).model
+    bound_px = found.bound_px[1]
+    for name in ("place_px", "f2f_px", "mosaic_px"):
+        assert getattr(found, name)(bound_px) == pytest.approx(getattr(true, name)(bound_px), rel=0.05), name
+    assert found.place_excess == pytest.approx(true.place_excess, rel=0.2)
+    assert found.f2f_excess == pytest.approx(true.f2f_excess, rel=0.1)
+    assert found.f2f_lasting == pytest.approx(true.f2f_lasting, abs=0.1)
+    assert found.steady == pytest.approx(true.steady, abs=0.2)
+    assert found.depth_px(bound_px) == pytest.approx(true.depth_px(bound_px), rel=0.15)
+    assert found.lateral_px == pytest.approx(true.lateral_px, rel=0.2)
+
+
+class Played:
+    """A surrogate in the part of the images: each point errs as one, not for those it stands for."""
+
+    def __init__(self, vision):
+        self._vision = vision
+
+    def __getattr__(self, name):
+        return getattr(self._vision, name)
+
+    def look(self, frame, row):
+        points = self._vision.look(frame, row)
+        return points._replace(cov=points.cov / self._vision.stand_for)
+
+
+def witnessed(flown, true, seed):
+    """What a witness notes on a survey whose vision obeys a model."""
+    sea = SurrogateSea(flown, Stopwatch(), calibration.Calibration(true, 2, {}))
+
+    def truth():
+        return sea.world_from_camera
+
+    redrawn(sea.vision, 100 + seed)
+    witness = Witness(Played(sea.vision), vision_beside(flown, ErrorModel(), truth, Stopwatch()), truth)
+    navigator = survey.make_navigator(flown, witness, Stopwatch())
+    survey.fly(flown, sea, navigator, lambda *_: None)
+    result = navigator.finish()
+    witness.map(result, flown.grid, np.zeros((len(result.key_frames), 6, 6)), lambda _: None)
+    return witness.notes

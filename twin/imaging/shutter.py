@@ -1,0 +1,182 @@
+"""The time that an exposure takes: what moves meanwhile is smeared, and a rolling shutter sees its rows at other times.
+
+A point of the floor at depth Z moves through the image of an eye with twist (w, v) by (Longuet-Higgins & Prazdny 1980;
+x, y from the axis, by the focal length f)
+
+    du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
+    dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
+
+Each pixel gathers light along its own path through the image of the middle of the exposure: the mean over the time that
+it is open, and behind a rolling shutter the light of the place where it was, or will be, by the delay of its row. Pose
+and true depth of a frame are those of the middle of the exposure of its middle row.
+
+Limits: path and flow are straight and even over the exposure (a path's bend is below f (w T)^2 / 8, vibration is not
+seen). A pixel takes its neighbours on the path to move like itself: an edge in depth keeps its place, marine snow is
+smeared as the floor is, and so are the veil and the lamps' pattern, which move with the camera but are smooth over a
+few pixels. Light is kept where the flow is even. Beyond the border of the image its last pixel goes on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.imaging.bands import in_bands
+
+Array = NDArray[np.float64]
+Radiance = NDArray[np.float32]
+Depth = NDArray[np.float32]
+
+SHORT_PX = 2.8  # a path that reaches no farther than the next pixels: for up to sqrt(8), three samples do
+
+
+def smear(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
+    """The light (H, W, 3) that a moving eye gathers while its shutter is open.
+
+    Args:
+        light: (H, W, 3) at the middle of the exposure.
+        depth: (H, W) along the optical axis [m]; inf moves by rotation alone.
+        twist: (6,) [angular, linear] velocity of the eye in its own axes [rad/s, m/s].
+        exposure_s: how long each row is open.
+    """
+    out, motion = np.empty_like(light), twist.astype(np.float32)
+    flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
+    in_bands(lambda first, end: _smear(flat, depth, focal, motion, open_s, out, first, end), len(light))
+    return out
+
+
+def roll(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
+    """The light (H, W, 3) as a moving eye sees it whose rows follow one another; arguments as of `smear`.
+
+    Args:
+        readout_s: from the first row to the last.
+    """
+    out, motion = np.empty_like(light), twist.astype(np.float32)
+    focal, whole_s = np.float32(focal_px), np.float32(readout_s)
+    in_bands(lambda first, end: _roll(light, depth, focal, motion, whole_s, out, first, end), len(light))
+    return out
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _flow(x, y, near, scale, twist):
+    """Velocity in the image [px/s] at tangents x, y for 1 / depth, or, scaled by a time too, a path [px]."""
+    one = np.float32(1.0)
+    du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
+    dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
+    return scale * du, scale * dv
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cubic(t):
+    """Weights of four neighbours at -1, 0, 1, 2 for a place t between the middle two (Keys 1981, a = -1/2)."""
+    half, one, steep = np.float32(0.5), np.float32(1.0), np.float32(1.5)
+    s = one - t
+    return (
+        -half * t * s * s, one - t * t * (one + steep - steep * t),
+        one - s * s * (one + steep - steep * s), -half * s * t * t,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _smear(flat, depth, focal, twist, exposure_s, out, first, end):
+    """Fills rows `first` to `end` of `out`; `flat` is the light (H W, 3)."""
+    height, width = depth.shape
+    values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
+    x, near = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    for u in range(width):
+        x[3 * u : 3 * u + 3] = (np.float32(u) - np.float32(0.5) * np.float32(width - 1)) / focal
+    for v in range(first, end):
+        y = (np.float32(v) - np.float32(0.5) * np.float32(height - 1)) / focal
+        for u in range(width):
+            near[3 * u] = near[3 * u + 1] = near[3 * u + 2] = np.float32(1.0) / depth[v, u]
+        rows = values[max(v - 1, 0)], values[v], values[min(v + 1, height - 1)]
+        short = _smear_row(rows[0], rows[1], rows[2], near, x, y, focal * exposure_s, twist, filled[v])
+        for u in range(0, width, max(width - 1, 1) if short else 1):
+            du, dv = _flow(x[3 * u], y, near[3 * u], focal * exposure_s, twist)
+            if abs(dv) >= abs(du):
+                _gather(flat, dv, du, v, u, height, width, width, 1, out[v, u])
+            else:
+                _gather(flat, du, dv, u, v, width, height, 1, width, out[v, u])
+
+
+@njit(cache=True, nogil=True)
+def _smear_row(above, here, below, near, x, y, scale, twist, out):
+    """Fills a row but for its ends, each (3 W,), where all paths in it are short; tells whether they are.
+
+    The nine samples have the moments of an even path: a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
+    """
+    beside, middle, beyond = slice(0, -6), slice(3, -3), slice(6, None)
+    a0, a1, a2 = above[beside], above[middle], above[beyond]
+    b0, b1, b2 = here[beside], here[middle], here[beyond]
+    c0, c1, c2 = below[beside], below[middle], below[beyond]
+    x, near, out = x[middle], near[middle], out[middle]
+    half, quarter, two, n_long = np.float32(0.5), np.float32(0.25), np.float32(2.0), 0
+    for k in range(out.size):
+        a, b = _flow(x[k], y, near[k], scale, twist)
+        n_long += max(abs(a), abs(b)) > np.float32(SHORT_PX)
+        aa, bb, ab = a * a * np.float32(1 / 12), b * b * np.float32(1 / 12), a * b * np.float32(1 / 12)
+        both, twice = ab * ab * np.float32(144 / 80), two * b1[k]
+        total = (aa - both) * half * (b0[k] + b2[k] - twice) + (bb - both) * half * (a1[k] + c1[k] - twice)
+        total += (both + ab) * quarter * (a0[k] + c2[k] - twice) + (both - ab) * quarter * (c0[k] + a2[k] - twice)
+        out[k] = max(b1[k] + total, np.float32(0.0))
+    return n_long == 0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _gather(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
+    """The mean of the light over a path around a pixel, from samples one pixel apart along its longer side a.
+
+    All 2 m + 1 samples weigh the same but the two at the ends, and these so that the variance of the path is that of an
+    even one, length^2 / 12: one formula from the shortest path to the longest. Interpolation across adds none.
+    """
+    m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
+    here = flat[a * stride_a + b * stride_b]
+    red, green, blue = here[0], here[1], here[2]
+    if m > 0:
+        tip = (length * length - np.float32(4 * m * (m - 1))) / np.float32(8 * m * (2 * m + 1))
+        inner = (np.float32(1.0) - np.float32(2.0) * tip) / np.float32(2 * m - 1)
+        red, green, blue = inner * red, inner * green, inner * blue
+        slope = aside / length
+        for k in range(1, m + 1):
+            offset = slope * np.float32(k)
+            j = int(np.floor(offset))
+            w = _cubic(offset - np.float32(j))
+            share = tip if k == m else inner
+            fore, back = min(a + k, size_a - 1) * stride_a, max(a - k, 0) * stride_a
+            for i in range(4):
+                weight = share * w[i]
+                ahead = flat[fore + min(max(b + j + i - 1, 0), size_b - 1) * stride_b]
+                behind = flat[back + min(max(b - j - i + 1, 0), size_b - 1) * stride_b]
+                red += weight * (ahead[0] + behind[0])
+                green += weight * (ahead[1] + behind[1])
+                blue += weight * (ahead[2] + behind[2])
+    zero = np.float32(0.0)
+    out[0], out[1], out[2] = max(red, zero), max(green, zero), max(blue, zero)
+
+
+@njit(cache=True, nogil=True)
+def _roll(light, depth, focal, twist, readout_s, out, first, end):
+    """Fills rows `first` to `end` of `out`."""
+    height, width = depth.shape
+    zero, half = np.float32(0.0), np.float32(0.5)
+    for v in range(first, end):
+        delay_s = readout_s * (np.float32(v) / np.float32(height - 1) - half)
+        y = (np.float32(v) - half * np.float32(height - 1)) / focal
+        for u in range(width):
+            x = (np.float32(u) - half * np.float32(width - 1)) / focal
+            du, dv = _flow(x, y, np.float32(1.0) / depth[v, u], focal * delay_s, twist)
+            at_u = min(max(np.float32(u) - du, zero), np.float32(width - 1))
+            at_v = min(max(np.float32(v) - dv, zero), np.float32(height - 1))
+            j, i = int(at_u), int(at_v)
+            across, down = _cubic(at_u - np.float32(j)), _cubic(at_v - np.float32(i))
+            red = green = blue = zero
+            for b in range(4):
+                row = light[min(max(i + b - 1, 0), height - 1)]
+                for a in range(4):
+                    weight = down[b] * across[a]
+                    pixel = row[min(max(j + a - 1, 0), width - 1)]
+                    red += weight * pixel[0]
+                    green += weight * pixel[1]
+                    blue += weight * pixel[2]
+            out[v, u, 0], out[v, u, 1], out[v, u, 2] = max(red, zero), max(green, zero), max(blue, zero)

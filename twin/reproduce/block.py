@@ -1,0 +1,50 @@
+"""The object of the turbidity ladder: a hollow concrete block on rippled sand."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains import Terrain
+from terrains.noise import fractal_field
+
+Array = NDArray[np.float64]
+
+SIZE_M, SPACING_M, TEXEL_M = (2.4, 2.0), 0.005, 0.002
+BLOCK_M, HEIGHT_M = (0.39, 0.19), 0.14  # a standard block, sunk in a little
+CORE_M, CORES_AT_M = (0.13, 0.12), (-0.0875, 0.0875)
+TURN_DEG = 25.0
+SAND, CONCRETE = (0.36, 0.31, 0.23), (0.45, 0.44, 0.42)  # albedo
+
+
+def block_on_sand(seed: int) -> Terrain:
+    """A floor around the origin whose reference plane is the sand."""
+    rng = np.random.default_rng(seed)
+    x, y = _grid(SPACING_M, edges=True)
+    ripples = 0.012 * np.sin(2 * np.pi * (x + 0.15 * np.sin(2.1 * y) + 0.04 * np.sin(5.3 * y)) / 0.16)
+    sand = ripples + 0.004 * fractal_field(x.shape, 120, 0.5, rng)
+    height = np.where(_inside(x, y), HEIGHT_M + 0.001 * fractal_field(x.shape, 8, 0.6, rng), sand)
+    x, y = _grid(TEXEL_M, edges=False)
+    grain = 1 + 0.2 * fractal_field(x.shape, 16, 0.85, rng)
+    albedo = np.where(_inside(x, y)[..., None], CONCRETE, SAND) * grain[..., None]
+    texture = np.clip(255 * albedo[::-1] + 0.5, 0, 255).astype(np.uint8)
+    west, south = (-side / 2 for side in SIZE_M)
+    return Terrain(height.astype(np.float32), SPACING_M, west, south, texture, TEXEL_M)
+
+
+def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
+    """Places (x, y) from south to north: of nodes on the edges, or of the middles of cells."""
+    sides = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
+    east, north = (side if edges else side + step_m / 2 for side in sides)
+    x, y = np.meshgrid(east, north)
+    return np.asarray(x, np.float64), np.asarray(y, np.float64)
+
+
+def _inside(x: Array, y: Array) -> NDArray[np.bool_]:
+    """Where the block is, its cores left out."""
+    turn = np.deg2rad(TURN_DEG)
+    along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    block = (np.abs(along) < BLOCK_M[0] / 2) & (np.abs(across) < BLOCK_M[1] / 2)
+    for at in CORES_AT_M:
+        block &= ~((np.abs(along - at) < CORE_M[0] / 2) & (np.abs(across) < CORE_M[1] / 2))
+    return block

@@ -1,0 +1,118 @@
+"""From what witnesses noted on rendered surveys to the error model: every claim and every error is matched in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import least_squares, nnls
+
+from twin.surrogate.model import ErrorModel, Law, Share
+
+Notes = Mapping[str, Sequence[float]]
+
+
+def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
+    """The model that would have answered these surveys as the images did; `model` is the one that was compared.
+
+    Deviations are matched by the medians of ratios, excesses by those of squared errors in their own claims, so that a
+    few failures do not rule; each survey counts the same.
+    """
+    bounds = np.array([np.median(s["bound_px"]) for s in surveys])
+
+    def ratio(name: str) -> np.ndarray:
+        return np.array([np.median(s[name]) for s in surveys])
+
+    def excess(name: str, own: float) -> float:
+        return own * float(np.median(np.sqrt(ratio(f"{name}_nees") / ratio(f"{name}_nees_surrogate"))))
+
+    place_px = ratio("place_ratio") * [model.place_px(b) for b in bounds]
+    place = _law(bounds, place_px)
+    f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
+    mosaic = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
+    widened = float(np.median(ratio("link_claim") / ratio("place_ratio")))
+    depth, lateral = (np.sqrt(x) for x in zip(*(_map_parts(s, "") for s in surveys), strict=True))
+    claimed = [np.sqrt(_map_parts(s, "_claimed")[0]) for s in surveys]
+    depth_px = [model.depth_px(b) * share for b, share in zip(bounds, claimed, strict=True)]
+    in_claims = ratio("mosaic_difference") - model.mosaic_excess**2
+    return model._replace(
+        bound_px=(float(bounds.min()), float(bounds.max())),
+        points=_share(bounds, ratio("points")),
+        place_px=place,
+        place_excess=excess("link", model.place_excess) * widened,
+        matched=_share(bounds, np.minimum(ratio("link_matched") * [model.matched(b) for b in bounds], 1.0)),
+        correlation=model.correlation * widened**2,
+        steady=_steady(surveys, model.steady),
+        f2f_px=f2f,
+        f2f_excess=excess("f2f", model.f2f_excess),
+        f2f_lasting=float(np.median([_lasting(s) for s in surveys])),
+        mosaic_px=mosaic,
+        depth_px=_law(bounds, np.array(depth_px)),
+        depth_excess=model.depth_excess * float(np.median(depth / claimed)),
+        lateral_px=model.lateral_px * float(np.median(lateral)),
+        complete=_share(bounds, ratio("map_known")),
+        mosaic_excess=float(np.sqrt(np.median(np.maximum(in_claims, 0.01) / ratio("mosaic_claim") ** 2))),
+    )
+
+
+def misfit(surveys: Sequence[Notes], compared: ErrorModel, model: ErrorModel) -> dict[str, float]:
+    """Root mean square over surveys of the logarithm of each claim over what the model says, by name."""
+    names = {"place_px": "place_ratio", "f2f_px": "f2f_claim", "mosaic_px": "mosaic_claim"}
+    return {law: _spread(surveys, ratio, getattr(compared, law), getattr(model, law)) for law, ratio in names.items()}
+
+
+def _spread(surveys: Sequence[Notes], ratio: str, compared: Law, law: Law) -> float:
+    bounds = [np.median(s["bound_px"]) for s in surveys]
+    logs = [np.log(np.median(s[ratio]) * compared(b) / law(b)) for s, b in zip(surveys, bounds, strict=True)]
+    return float(np.sqrt(np.mean(np.square(logs))))
+
+
+def _law(bounds: np.ndarray, deviations: np.ndarray) -> Law:
+    """Least squares of the logarithms."""
+
+    def off(x: np.ndarray) -> np.ndarray:
+        return np.log(np.hypot(x[0], x[1] * bounds) / deviations)
+
+    found = least_squares(off, [deviations.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
+    return Law(float(found.x[0]), float(found.x[1]))
+
+
+def _share(bounds: np.ndarray, shares: np.ndarray) -> Share:
+    def off(x: np.ndarray) -> np.ndarray:
+        return np.array([Share(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - shares
+
+    start = [min(float(shares.max()), 0.999), np.log(4 * bounds.max())]
+    found = least_squares(off, start, bounds=([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())]))
+    return Share(float(found.x[0]), float(np.exp(found.x[1])), 4.0)
+
+
+def _lasting(notes: Notes) -> float:
+    """Frames of one interval err together by l: their sum's variance is 1 + (n - 1) l^2 times that of as many alone."""
+    n, together = np.median(notes["f2f_frames"]), np.median(notes["f2f_interval"]) / np.median(notes["f2f_nees"])
+    return float(np.sqrt(max(together - 1, 0.0) / (n - 1)))
+
+
+def _steady(surveys: Sequence[Notes], own: float) -> float:
+    """By how much three links around three key points close better than they would one by one.
+
+    With equal deviations of both pairs the share left is (4 - 2 r - 2 r^2) / 6, where r is steady: of the six parts the
+    later pair's cancel where it is the later one twice, and what is the same whoever looks cancels at the other two.
+    Geometry adds the same to images and surrogate.
+    """
+    left, guessed = (
+        np.median([np.sum(s[f"closure{whose}"]) / np.sum(s[f"closure{whose}_parts"]) for s in surveys])
+        for whose in ("", "_surrogate")
+    )
+    share = left - guessed + (4 - 2 * own - 2 * own**2) / 6
+    return float(np.clip((np.sqrt(max(9 - 12 * share, 0.0)) - 1) / 2, 0.0, 0.98))
+
+
+def _map_parts(notes: Notes, what: str) -> np.ndarray:
+    """(2,) by how much the variances by depth and by sideways error have to grow for level and steep cells to agree."""
+    names = [name for name in ("level", "steep") if f"map_{name}_images{what}" in notes]
+    images, pose, depth, lateral = (
+        np.array([notes[f"map_{name}_{whose}{what}"][0] for name in names])
+        for whose in ("images", "pose", "depth", "lateral")
+    )
+    effects = np.stack([depth - pose, lateral - pose], axis=1) / images[:, None]
+    return nnls(effects, np.maximum(1 - pose / images, 0))[0]

@@ -1,0 +1,66 @@
+"""The sea of a surrogate survey: the same vehicle and sensors over the same floor, with nothing rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.geometry import Array
+from twin.judge.coverage import true_heights
+from twin.mission import Mission, Step
+from twin.sea import Sea, Sight, Watch, streams
+from twin.simulate.carrier import Carrier
+from twin.simulate.free_body import FreeBody
+from twin.simulate.sensors import NavigationSensors
+from twin.simulate.vehicle import physics_timestep_s
+from twin.surrogate.calibration import Calibration
+from twin.surrogate.chart import Chart
+from twin.surrogate.conditions import Conditions
+from twin.surrogate.floor import Floor
+from twin.surrogate.model import ErrorModel
+from twin.surrogate.vision import SurrogateVision
+
+_BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # a camera without pixels
+
+
+class SurrogateSea(Sea):
+    """Vision is asked for measurements instead of images: `vision` gives them."""
+
+    def __init__(self, mission: Mission, watch: Watch, calibration: Calibration):
+        scenario, rig, rng = mission.scenario, mission.rig, streams(mission.scenario.seed)
+        vehicle = (
+            FreeBody(
+                scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body,
+                physics_timestep_s(rig.frame_rate_hz),
+            )
+            if scenario.vehicle.dynamics == "rigid"
+            else Carrier(mission.start_of_body)
+        )  # fmt: skip
+        super().__init__(
+            mission, watch, vehicle, NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
+        )
+        self._told = vision_beside(mission, calibration.model, lambda: self.world_from_camera, watch)
+        self.vision = self._told
+        outside = calibration.outside(*self._told.bounds_px)
+        self.warnings = (f"surrogate: {outside}",) if outside else ()
+
+    def close(self) -> None:
+        pass
+
+    def look(self, step: Step) -> Sight:
+        pose, rig = self.world_from_camera, self.mission.rig
+        return Sight(_BLANK, _BLANK if step.key_point else None, lambda: self._told.floor.depth(pose, rig))
+
+    def seen(self) -> NDArray[np.bool_]:
+        return self._told.chart.seen
+
+
+def vision_beside(mission: Mission, model: ErrorModel, truth: Callable[[], Array], watch: Watch) -> SurrogateVision:
+    """The surrogate's answers for a vehicle whose camera truly is where `truth` says, (4, 4)."""
+    scenario, terrain = mission.scenario, mission.terrain
+    chart = Chart(mission.grid, true_heights(mission.grid, terrain.height_at), mission.rig)
+    conditions = Conditions(scenario, terrain)
+    rng = streams(scenario.seed)["surrogate"]
+    return SurrogateVision(mission.rig, scenario.estimate, model, truth, Floor(terrain), conditions, chart, rng, watch)

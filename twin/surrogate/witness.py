@@ -1,0 +1,163 @@
+"""What images answer, beside the truth: the raw material of a calibration.
+
+A witness passes every question on to the images, puts the same question to the surrogate at the same true poses, and
+writes down by how much the claims of the two differ and how far each is from the truth. Both see the same geometry, so
+the ratios are those of the error models alone.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from twin import geometry
+from twin.estimate.key_points import KeyPoint
+from twin.estimate.motion import Motion
+from twin.estimate.stereo import StereoPoints
+from twin.estimate.vision import StereoVision
+from twin.geometry import Array
+from twin.records import ElevationMap, Frame, MapGrid, SurveyResult
+from twin.surrogate.model import Law
+from twin.surrogate.vision import SurrogateVision
+
+_LEAST_CELLS = 300
+_EXACT = Law(1e-4, 0.0)
+
+
+class Witness:
+    """Vision by images, with a record of it.
+
+    Args:
+        images: what answers.
+        surrogate: what is compared.
+        truth: gives the true pose (4, 4) of the left camera now.
+    """
+
+    def __init__(self, images: StereoVision, surrogate: SurrogateVision, truth: Callable[[], Array]):
+        self.images, self.surrogate, self._truth = images, surrogate, truth
+        self.notes: dict[str, list[float]] = defaultdict(list)
+        self._poses: dict[int, Array] = {}
+        self._errors: dict[tuple[int, int], list[Array]] = {}
+        self._last_step = np.eye(4)
+        self._last: Array | None = None
+        self._walked: list[tuple[Array, Array]] = []  # error and claimed covariance of the frames since a key point
+
+    def step(self, frame: Frame) -> tuple[Motion, str]:
+        (seen, status), (guessed, _) = self.images.step(frame), self.surrogate.step(frame)
+        last, self._last = self._last, self._truth()
+        if last is not None and status == "ok" and seen.n_points:
+            true = geometry.inverse(last) @ self._last
+            self._compare("f2f", seen, guessed, true)
+            self._walked.append((geometry.log(geometry.inverse(true) @ seen.a_from_b), seen.cov))
+        return seen, status
+
+    def look(self, frame: Frame, row: int) -> StereoPoints | None:
+        points, guessed = self.images.look(frame, row), self.surrogate.look(frame, row)
+        if len(self._walked) > 1:
+            error, cov = (np.sum(x, axis=0) for x in zip(*self._walked, strict=True))
+            self.notes["f2f_interval"].append(_chi2(error, cov) / 6)
+            self.notes["f2f_frames"].append(float(len(self._walked)))
+        self._walked = []
+        if points is not None and guessed is not None:
+            self.notes["points"].append(len(points.xyz) / self.images.settings.points)
+            sizes = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, guessed)]
+            self.notes["place_ratio"].append(float(np.sqrt(sizes[0] / sizes[1] * self.surrogate.stand_for)))
+            self.notes["bound_px"].append(self.surrogate.bound_px)
+        return points
+
+    def restart(self) -> None:
+        self.images.restart()
+        self.surrogate.restart()
+
+    def register(self, world_from_camera: Array) -> Motion | None:
+        seen, guessed = self.images.register(world_from_camera), self.surrogate.register(world_from_camera)
+        if seen is not None and guessed is not None:
+            self.notes["mosaic_claim"].append(_ratio(seen.cov, guessed.cov))
+            off = geometry.log(geometry.inverse(guessed.a_from_b) @ seen.a_from_b)
+            self.notes["mosaic_difference"].append(_chi2(off, guessed.cov) / 6)
+        return seen
+
+    def lay(self, number: int, world_from_camera: Array) -> None:
+        self._poses[number] = self._truth()
+        self.images.lay(number, world_from_camera)
+        self.surrogate.lay(number, world_from_camera)
+
+    def relay(self, keys: Sequence[KeyPoint]) -> None:
+        self.images.relay(keys)
+        self.surrogate.relay(keys)
+
+    def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
+        answers, guesses = self.images.measure(node, others), self.surrogate.measure(node, others)
+        pose = self._poses.get(node.number)
+        here = self._truth() if pose is None else pose
+        for other, seen, guessed in zip(others, answers, guesses, strict=True):
+            if guessed is None:
+                continue
+            self.notes["link_found"].append(float(seen is not None))
+            if seen is not None:
+                true = geometry.inverse(self._poses[other.number]) @ here
+                self._close(other.number, node.number, (seen, guessed), true)
+                self._compare("link", seen, guessed, true)
+                self.notes["link_matched"].append(seen.n_points / guessed.n_points)
+        return answers
+
+    def map(
+        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
+    ) -> ElevationMap:
+        """The map of the images; and those of the surrogate along the same path, each with one error alone."""
+        mapped, model = self.images.map(result, grid, step_cov, progress), self.surrogate.model
+        alone = {
+            "pose": model._replace(depth_px=_EXACT, lateral_px=0.0),
+            "depth": model._replace(lateral_px=0.0),
+            "lateral": model._replace(depth_px=_EXACT),
+        }
+        chart = self.surrogate.chart
+        self.notes["map_known"].append(float(np.isfinite(mapped.height_m[chart.seen]).mean()))
+        for name, errors in alone.items():
+            self.surrogate.model = errors
+            self._note_map(name, self.surrogate.map(result, grid, step_cov, lambda _: None))
+        self.surrogate.model = model
+        self._note_map("images", mapped)
+        return mapped
+
+    def _note_map(self, whose: str, mapped: ElevationMap) -> None:
+        """Squares of the robust deviation, and of the claimed one, of level and of steep cells [m^2]."""
+        chart = self.surrogate.chart
+        error = mapped.height_m - chart.height_m
+        for name, where in (("level", chart.steepness < 0.3), ("steep", chart.steepness > 0.6)):
+            known = where & chart.seen & np.isfinite(error)
+            if known.sum() > _LEAST_CELLS:
+                off = error[known] - np.median(error[known])
+                self.notes[f"map_{name}_{whose}"].append(float((1.4826 * np.median(np.abs(off))) ** 2))
+                self.notes[f"map_{name}_{whose}_claimed"].append(float(np.median(mapped.sigma_m[known]) ** 2))
+
+    def _close(self, i: int, j: int, links: tuple[Motion, Motion], true: Array) -> None:
+        """Notes by how much less three links around the last three key points err together than one by one."""
+        self._errors[i, j] = [geometry.log(geometry.inverse(true) @ link.a_from_b) for link in links]
+        steps = (j - 2, j - 1), (j - 1, j), (j - 2, j)
+        if i == j - 2 and all(step in self._errors for step in steps):
+            sigma, carry = np.sqrt(np.diag(links[0].cov)), geometry.adjoint(geometry.inverse(self._last_step))
+            errors = zip(*(self._errors[step] for step in steps), strict=True)
+            for name, (a, b, c) in zip(("", "_surrogate"), errors, strict=True):
+                parts = [(carry @ a) / sigma, b / sigma, c / sigma]
+                self.notes[f"closure{name}"].append(float(np.sum((parts[0] + parts[1] - parts[2]) ** 2)))
+                self.notes[f"closure{name}_parts"].append(float(np.sum(np.square(parts))))
+        if i == j - 1:
+            self._last_step = true
+
+    def _compare(self, name: str, seen: Motion, guessed: Motion, true: Array) -> None:
+        self.notes[f"{name}_claim"].append(_ratio(seen.cov, guessed.cov))
+        for whose, motion in (("nees", seen), ("nees_surrogate", guessed)):
+            error = geometry.log(geometry.inverse(true) @ motion.a_from_b)
+            self.notes[f"{name}_{whose}"].append(_chi2(error, motion.cov) / 6)
+
+
+def _chi2(error: Array, cov: Array) -> float:
+    return float(error @ np.linalg.solve(cov, error))
+
+
+def _ratio(cov: Array, other: Array) -> float:
+    """By how much one covariance is wider than another: the mean ratio of their deviations in all directions."""
+    return float(np.exp((np.linalg.slogdet(cov)[1] - np.linalg.slogdet(other)[1]) / (2 * len(cov))))
