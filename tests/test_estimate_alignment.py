@@ -144,3 +144,25 @@ def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_nois
     by_body = np.column_stack(in_camera)
     sigma = np.diag([NOISE.attitude_rad, NOISE.attitude_rad, NOISE.heading_rad])
     np.testing.assert_allclose(cov[:3, :3], by_body @ sigma**2 @ by_body.T, rtol=1e-3, atol=1e-9)
+
+
+def test_of_many_gross_links_every_one_is_dropped_and_next_to_none_of_the_good_ones():
+    """A raster of legs, a link in four gross: weights alone settle slowly, and till then good links look wrong."""
+    rng, rows, cols = np.random.default_rng(4), 8, 30
+    poses = [geometry.pose(np.eye(3), np.array([0.25 * c, 0.6 * r, 0.0])) for r in range(rows) for c in range(cols)]
+    near = [1, 2, 6, cols, cols + 1, 2 * cols]
+    pairs = [(k, k + step) for step in near for k in range(len(poses) - step)]
+    cov, links, gross = np.diag([1e-8] * 3 + [1e-7] * 3), [], set()
+    for i, j in pairs:
+        error = np.sqrt(np.diag(cov)) * rng.standard_normal(6)
+        if j - i > 1 and rng.random() < 0.3:
+            error += 0.3 * rng.standard_normal(6)
+            gross.add((i, j))
+        links.append(Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error), cov, 1.0, 100))
+    start = [pose @ geometry.exp(2e-3 * rng.standard_normal(6)) for pose in poses]
+    aligned = align(key_points([poses[0], *start[1:]]), links, ANCHOR, RIG, NOISE)
+    dropped = {(link.i, link.j) for link in aligned.dropped}
+    assert gross <= dropped
+    assert len(dropped - gross) <= 0.01 * len(links)
+    off = np.linalg.norm([a[:3, 3] - b[:3, 3] for a, b in zip(aligned.poses, poses, strict=True)], axis=1)
+    assert off.max() < 3e-3

@@ -43,7 +43,7 @@ def solve(links: Sequence[Link], start: dict[int, Array] | None = None, huber: f
     graph = _held(numbers[0], values.atPose3(numbers[0]))
     for factor in between_factors(links, huber):
         graph.add(factor)
-    values = optimise(graph, values)
+    values, _ = optimise(graph, values)
     return Solved({number: values.atPose3(number).matrix() for number in numbers}, graph.error(values))
 
 
@@ -68,8 +68,10 @@ def gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
 
 
-def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
-    """The nearest minimum by Levenberg-Marquardt.
+def optimise(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int = 100
+) -> tuple[gtsam.Values, bool]:
+    """The nearest minimum by Levenberg-Marquardt, and whether it was reached in so many iterations.
 
     Raises:
         RuntimeError: the factors do not hold every variable.
@@ -77,7 +79,9 @@ def optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Va
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0)
     parameters.setAbsoluteErrorTol(_LEAST_GAIN)
-    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+    parameters.setMaxIterations(iterations)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
+    return optimizer.optimize(), optimizer.iterations() < iterations
 
 
 def chi2(factors: Sequence[gtsam.BetweenFactorPose3], covs: Array, values: gtsam.Values) -> Array:
