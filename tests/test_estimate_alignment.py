@@ -147,7 +147,7 @@ def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_nois
 
 
 def test_of_many_gross_links_every_one_is_dropped_and_next_to_none_of_the_good_ones():
-    """A raster of legs, a link in four gross: weights alone settle slowly, and till then good links look wrong."""
+    """A raster of legs, a link in four gross."""
     rng, rows, cols = np.random.default_rng(4), 8, 30
     poses = [geometry.pose(np.eye(3), np.array([0.25 * c, 0.6 * r, 0.0])) for r in range(rows) for c in range(cols)]
     near = [1, 2, 6, cols, cols + 1, 2 * cols]

@@ -170,6 +170,13 @@ def test_a_surrogate_survey_ends_complete_and_is_the_same_again(tmp_path):
     assert final[0] == final[1]
 
 
+def test_water_in_which_nothing_can_be_matched_ends_the_survey_and_is_named(tmp_path):
+    scenario = load_scenario("quickstart", [*SHORT, 'water.jerlov="9C"', "water.turbidity=4"])
+    metrics = survey.run(scenario, tmp_path, shows=()).metrics
+    assert metrics["status"] == "aborted"
+    assert "9C" in metrics["reason"] and "too few points" in metrics["reason"]
+
+
 def test_what_the_surrogate_knows_nothing_of_is_refused():
     for sets in (["snow.density_per_m3=100"], ["calibration.focal_error=0.01"], ['port.kind="flat"']):
         with pytest.raises(ScenarioError, match="imaging.fidelity.*rendered"):

@@ -7,6 +7,7 @@ import numpy as np
 from twin import geometry
 from twin.estimate import matching, motion
 from twin.estimate.stereo import StereoPoints, normalised
+from twin.geometry import Array
 from twin.records import StereoRig
 
 MOST_POINTS = 150  # the best ones: key points correct what the frames between them drift
@@ -50,8 +51,11 @@ class FrameToFrame:
     def _coast(self) -> tuple[motion.Motion, str]:
         """The last velocity, held: the points cannot be followed any more."""
         self.pixels, self.xyz = self.pixels[:0], self.xyz[:0]
-        step = geometry.log(self.last_motion)
-        sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(step[3:]))])
-        return motion.Motion(
-            self.last_motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf
-        ), "too few points matched"
+        return coast(self.last_motion)
+
+
+def coast(last_motion: Array) -> tuple[motion.Motion, str]:
+    """The last motion (4, 4) of a frame once more, with a covariance that admits it, and why."""
+    step = geometry.log(last_motion)
+    sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(step[3:]))])
+    return motion.Motion(last_motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), "too few points matched"

@@ -58,11 +58,6 @@ def normal_equations(rows, weight, value):
     return normal, right
 
 
-def transfer(z_b: Array, a_from_b: Array, baseline_m: float) -> tuple[Array, Array, Array]:
-    """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
-    return transfer_of(z_b, a_from_b, baseline_m)
-
-
 def linearise(
     a: Array, b: Array, structure: Array, cov_a: Array, cov_b: Array, a_from_b: Array, baseline_m: float
 ) -> Observations:
@@ -81,7 +76,8 @@ def adjust_structure(seen: Observations, b: Array, cov_b: Array, twist: Array) -
 
 
 @njit(cache=True, nogil=True)
-def transfer_of(z_b, a_from_b, baseline):
+def transfer(z_b, a_from_b, baseline):
+    """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
     n = len(z_b)
     z_a, by_point, by_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
     rotation, lever = np.empty((3, 3)), np.empty(3)
@@ -113,7 +109,7 @@ def transfer_of(z_b, a_from_b, baseline):
 
 @njit(cache=True, nogil=True)
 def linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline):
-    predicted, by_point, by_motion = transfer_of(structure, a_from_b, baseline)
+    predicted, by_point, by_motion = transfer(structure, a_from_b, baseline)
     n = len(a)
     error, information, size = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
     cov = np.empty((3, 3))

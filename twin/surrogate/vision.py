@@ -20,6 +20,7 @@ from twin import geometry
 from twin.config import Estimation
 from twin.estimate import elevation, network, observation, stereo
 from twin.estimate.f2f import MOST_POINTS as F2F_POINTS
+from twin.estimate.f2f import coast
 from twin.estimate.key_points import KeyPoint
 from twin.estimate.motion import Motion
 from twin.estimate.stereo import StereoPoints
@@ -92,7 +93,8 @@ class SurrogateVision:
         self._last: Array | None = None
         self._seen: dict[int, _Seen] = {}
         self._now: _Seen | None = None
-        self._f2f = (np.zeros((6, 6)), np.eye(6) * 1e-12, np.zeros(6))  # root of the true covariance, claimed, lasting
+        self._f2f: tuple[Array, Array, Array] | None = None  # root of the true covariance, claimed one, lasting error
+        self._last_motion = np.eye(4)
         self._owners = Owners(rig)
         self._key = int(rng.integers(2**63))
         self._drawn, self._used = np.zeros((0, 6)), 0
@@ -122,10 +124,14 @@ class SurrogateVision:
         last, self._last = self._last, now
         if last is None:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
+        if self._f2f is None:
+            return coast(self._last_motion)
         root, cov, lasting = self._f2f
-        return Motion(_moved(last, now, root, self._draw(), lasting), cov, F2F_POINTS, 0.0), "ok"
+        self._last_motion = _moved(last, now, root, self._draw(), lasting)
+        return Motion(self._last_motion, cov, F2F_POINTS, 0.0), "ok"
 
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
+        self._f2f = None  # until `restart`: where stereo finds nothing, there is nothing to follow
         with self.watch("stereo"):
             pose, model = self._truth(), self.model
             self.chart.see(pose)
@@ -272,7 +278,7 @@ def _solve(points, here, there, fresh, steady, common, there_from_here, camera, 
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
     """
     focal, cx, cy, width, height, baseline = camera
-    seen, _, _ = observation.transfer_of(points, there_from_here, baseline)
+    seen, _, _ = observation.transfer(points, there_from_here, baseline)
     n, margin, passing = 0, 5.0, np.sqrt(1 - steady * steady)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):

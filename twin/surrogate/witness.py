@@ -93,10 +93,7 @@ class Witness:
         pose = self._poses.get(node.number)
         here = self._truth() if pose is None else pose
         for other, seen, guessed in zip(others, answers, guesses, strict=True):
-            if guessed is None:
-                continue
-            self.notes["link_found"].append(float(seen is not None))
-            if seen is not None:
+            if seen is not None and guessed is not None:
                 true = geometry.inverse(self._poses[other.number]) @ here
                 self._close(other.number, node.number, (seen, guessed), true)
                 self._compare("link", seen, guessed, true)
