@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +51,11 @@ class StereoRig:
     def left_from_right(self) -> Array:
         """(4, 4) pose of the right camera in the left."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
+
+    def binned(self, by: int) -> StereoRig:
+        """The same rig where squares of `by` x `by` pixels are one; sides are multiples of it."""
+        size = self.width_px // by, self.height_px // by
+        return replace(self, width_px=size[0], height_px=size[1], focal_px=self.focal_px / by)
 
     def project(self, points: Array) -> Array:
         """Pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind it."""

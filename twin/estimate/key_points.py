@@ -48,10 +48,13 @@ class ImageSpool:
     """Stereo pairs on disk as lossless PNG, the latest normalised ones in memory too.
 
     Memory stays bounded however long the survey is.
+
+    Args:
+        binning: of the normalised ones.
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    def __init__(self, folder: Path, binning: int = 1):
+        self.folder, self.binning = folder, binning
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = ThreadPoolExecutor(1)  # compression takes the second core
         self._lock = threading.Lock()  # links are measured by other threads
@@ -81,11 +84,12 @@ class ImageSpool:
         return self._read(row, "left"), self._read(row, "right")
 
     def normalised(self, row: int) -> tuple[matching.Image, matching.Image]:
-        """Left and right image, locally normalised."""
+        """Left and right image, binned and locally normalised."""
         with self._lock:
             if row not in self._normalised:
                 left, right = self.pair(row)
-                self._remember(row, (matching.normalise(left), matching.normalise(right)))
+                even = [matching.normalise(image, self.binning) for image in (left, right)]
+                self._remember(row, (even[0], even[1]))
             self._normalised.move_to_end(row)
             return self._normalised[row]
 

@@ -5,6 +5,8 @@ Stereo and the links between key points need more than Lucas-Kanade gives: `patc
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import cv2
 import numpy as np
 from numba import njit
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Points = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
@@ -21,22 +24,32 @@ _FLAT_GRAY = 2.0  # deviations below this are sensor noise, not texture
 _ROUND_TRIP_PX = 0.5
 
 
-def normalise(rgb: Image) -> Image:
+def normalise(rgb: Image, binning: int = 1) -> Image:
     """Grey image with local mean and contrast removed: the lamp pattern moves with the vehicle and must not be tracked.
 
     Args:
         rgb: (height, width, 3).
+        binning: so many pixels become one along either side.
 
     Returns:
-        (height, width) uint8, local mean 128, local deviation about 36 grey levels.
+        (height / binning, width / binning) uint8, local mean 128, local deviation about 36 grey levels.
     """
-    gray = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (3, 3), _SMOOTH_PX)
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    gray = cv2.GaussianBlur(binned(gray, binning), (3, 3), _SMOOTH_PX)
     size = (gray.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
     square = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
     even = np.empty(gray.shape, np.uint8)
     _even(gray.ravel(), mean.ravel(), square.ravel(), even.ravel())
     return even
+
+
+def binned(image: Pixels, by: int) -> Pixels:
+    """The image (height, width, ...) with squares of `by` x `by` pixels averaged to one."""
+    if by == 1:
+        return image
+    smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
+    return smaller
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -69,6 +69,16 @@ def on_one_row(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArr
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
+def corners_with_disparity(
+    left: matching.Image, dense_px: NDArray[np.float32], count: int, patch_px: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Whole pixels (n, 2) of well-textured points whose disparity (n,) [px] a dense map knows."""
+    pixels = np.round(matching.corners(left, count, patch_px)).astype(np.float32)
+    columns, rows = pixels.astype(int).T
+    known = np.isfinite(dense_px[rows, columns])
+    return pixels[known], dense_px[rows, columns][known]
+
+
 def points_of_pair(
     left: matching.Image,
     right: matching.Image,
@@ -78,10 +88,7 @@ def points_of_pair(
     patch_px: int,
 ) -> StereoPoints:
     """Corners of the left image with their disparity, started from a dense disparity map (NaN where unknown)."""
-    pixels = np.round(matching.corners(left, count, patch_px)).astype(np.float32)
-    columns, rows = pixels.astype(int).T
-    known = np.isfinite(dense_px[rows, columns])
-    pixels, disparity_px = pixels[known], dense_px[rows, columns][known]
+    pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
     slope = patches.disparity_slope(dense_px, pixels, patch_px)
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope

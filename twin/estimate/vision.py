@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.config import Estimation
-from twin.estimate import disparity, matching, stereo
+from twin.estimate import disparity, matching, scale, stereo
 from twin.estimate.f2f import FrameToFrame
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.map_builder import KeyPointImages, build_map
@@ -68,12 +68,12 @@ class Vision(Protocol):
 
 
 class StereoVision:
-    """Vision by the images themselves.
+    """Vision by the images themselves, at the scale that the first key point asks for.
 
     Args:
         rig: calibration as believed.
         settings: the scenario's [estimate].
-        cell_m: cell of the mosaic, about a pixel's footprint.
+        cell_m: cell of the mosaic at full size, about a pixel's footprint.
         folder: where the key points' images and the mosaic's tiles are spooled.
         watch: context manager per stage name.
     """
@@ -86,26 +86,36 @@ class StereoVision:
         folder: Path,
         watch: Callable[[str], AbstractContextManager[None]],
     ):
-        self.rig, self.settings, self.watch = rig, settings, watch
-        self.spool = ImageSpool(folder)
-        self.f2f = FrameToFrame(rig, settings.patch_px)
-        self.mosaic = Mosaic(cell_m, folder / "mosaic")
-        self.matcher = PairMatch(rig, self.spool, settings.patch_px)
-        self.reach = disparity.Reach(rig)
+        self.full_rig, self.settings, self.watch = rig, settings, watch
+        self._cell_m, self._folder = cell_m, folder
+        self._use(binning=1)
+        self._looked = False
         self._depth_of_key: dict[int, NDArray[np.float16]] = {}
-        self._image = np.zeros((rig.height_px, rig.width_px), np.uint8)
-        self._depth_m = np.zeros((rig.height_px, rig.width_px), np.float32)
         self._points: StereoPoints | None = None
+
+    def _use(self, binning: int) -> None:
+        """Makes the tools for images of this scale."""
+        self.binning, self.rig = binning, self.full_rig.binned(binning)
+        self.spool = ImageSpool(self._folder, binning)
+        self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
+        self.mosaic = Mosaic(self._cell_m * binning, self._folder / "mosaic")
+        self.matcher = PairMatch(self.rig, self.spool, self.settings.patch_px)
+        self.reach = disparity.Reach(self.rig)
+        self._image = np.zeros((self.rig.height_px, self.rig.width_px), np.uint8)
+        self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
 
     def step(self, frame: Frame) -> tuple[Motion, str]:
         with self.watch("f2f"):
-            self._image = matching.normalise(frame.left)
+            self._image = matching.normalise(frame.left, self.binning)
             return self.f2f.step(self._image)
 
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None
         with self.watch("stereo"):
-            right = matching.normalise(frame.right)
+            if not self._looked:
+                self._use(scale.binning(frame.left, frame.right, self.full_rig, self.settings))
+                self._image, self._looked = matching.normalise(frame.left, self.binning), True
+            right = matching.normalise(frame.right, self.binning)
             dense_px = disparity.search(self._image, right, self.reach.max_disparity_px)
             self.reach.see(dense_px)
             points = stereo.points_of_pair(
@@ -151,7 +161,7 @@ class StereoVision:
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         return build_map(
-            (KeyPointImages(*self.spool.pair(int(row))) for row in result.key_frames),
+            (self._pair(int(row)) for row in result.key_frames),
             result.final.world_from_camera[result.key_frames],
             result.node_cov,
             self.rig,
@@ -159,6 +169,10 @@ class StereoVision:
             progress=progress,
             step_cov=step_cov,
         )
+
+    def _pair(self, row: int) -> KeyPointImages:
+        left, right = self.spool.pair(row)
+        return KeyPointImages(matching.binned(left, self.binning), matching.binned(right, self.binning))
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:

@@ -1,0 +1,60 @@
+"""The scale of matching: pixels are binned where texture is coarser than noise, and nothing moves by it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from twin.config import Estimation
+from twin.estimate import matching, scale
+from twin.records import StereoRig
+
+RIG = StereoRig(320, 240, 343.0, 0.3, 30.0, np.eye(4))
+DISPARITY_PX = 24
+
+
+def pair(texel_px: float, contrast: float, noise: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """Both views (height, width, 3) of a flat floor whose texture begins at this size, each with its own noise."""
+    rng = np.random.default_rng(4)
+    wide = RIG.width_px + DISPARITY_PX
+    texels = rng.standard_normal((int(RIG.height_px / texel_px) + 2, int(wide / texel_px) + 2)).astype(np.float32)
+    floor = cv2.resize(texels, (wide, RIG.height_px), interpolation=cv2.INTER_CUBIC) * contrast + 110
+    views = floor[:, : RIG.width_px], floor[:, DISPARITY_PX:]
+    grey = [np.clip(v + noise * rng.standard_normal(v.shape), 0, 255).astype(np.uint8) for v in views]
+    return np.dstack([grey[0]] * 3), np.dstack([grey[1]] * 3)
+
+
+@pytest.mark.parametrize(("texel_px", "contrast", "expected"), [(2.0, 12.0, (1,)), (12.0, 4.0, (2, 4))])
+def test_pixels_are_binned_where_the_texture_is_coarser_than_the_noise(texel_px, contrast, expected):
+    left, right = pair(texel_px, contrast)
+    assert scale.binning(left, right, RIG, Estimation()) in expected
+
+
+def test_an_image_that_shows_nothing_stays_as_it_is():
+    flat = np.full((240, 320, 3), 90, np.uint8)
+    assert scale.binning(flat, flat, RIG, Estimation()) == 1
+
+
+def test_an_image_is_not_binned_to_a_broken_pixel():
+    left, right = pair(12.0, 4.0)
+    odd = StereoRig(319, 239, 343.0, 0.3, 30.0, np.eye(4))
+    assert scale.binning(left[:239, :319], right[:239, :319], odd, Estimation()) == 1
+
+
+@pytest.mark.parametrize("by", [1, 2, 4])
+def test_a_binned_rig_sees_a_point_where_the_binned_image_shows_it(by):
+    point = np.array([[0.31, -0.2, 2.0]])
+    (u, v), (binned_u, binned_v) = RIG.project(point)[0], RIG.binned(by).project(point)[0]
+    assert np.allclose([binned_u, binned_v], [(u - (by - 1) / 2) / by, (v - (by - 1) / 2) / by], atol=1e-12)
+    columns, rows = np.meshgrid(np.arange(320), np.arange(240))
+    spot = np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * 9.0**2)).astype(np.float32)
+    small = matching.binned(spot, by)
+    rows, columns = np.indices(small.shape)
+    assert np.average(columns, weights=small) == pytest.approx(binned_u, abs=1e-3)
+    assert np.average(rows, weights=small) == pytest.approx(binned_v, abs=1e-3)
+
+
+def test_binning_by_four_halves_the_noise_twice():
+    noise = np.random.default_rng(1).standard_normal((240, 320)).astype(np.float32)
+    assert matching.binned(noise, 4).std() == pytest.approx(0.25, rel=0.02)
