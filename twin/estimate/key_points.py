@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -33,6 +33,7 @@ class KeyPoint:
         points: matched points of the pair while it is the newest.
         readings: of the navigation sensors.
         walked: displacement since the node before by the DVL; None without.
+        walked_cov: (6, 6) what the motions up to here err by in sum, less what the mosaic told, in the world's axes.
     """
 
     number: int
@@ -42,6 +43,7 @@ class KeyPoint:
     points: StereoPoints | None
     readings: Readings
     walked: Displacement | None = None
+    walked_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 class ImageSpool:

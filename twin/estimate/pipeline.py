@@ -18,7 +18,7 @@ from twin.errors import SurveyAborted
 from twin.estimate import network
 from twin.estimate.alignment import Aligned, align
 from twin.estimate.key_points import KeyPoint
-from twin.estimate.pose_filter import PoseFilter, carried
+from twin.estimate.pose_filter import PoseFilter, carried, clipped
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.estimate.vision import Vision
@@ -149,7 +149,7 @@ class Navigator:
         chain = self._follow_chain(key) if is_node else None
         self.filter.fix(frame.readings)  # after the chain, so that it corrects what the chain leaves
         with self.watch("f2m"):
-            self._register_with_mosaic()
+            self._register_with_mosaic(key, chain)
             key.world_from_camera = self.filter.world_from_camera
             self.vision.lay(key.number, key.world_from_camera)
         if is_node:
@@ -158,14 +158,20 @@ class Navigator:
         key.points = None  # links start from the new node's points: memory need not hold the old ones
         return status
 
-    def _register_with_mosaic(self) -> None:
-        """Corrects the position by the mosaic (F2M)."""
-        if not self.settings.use_f2m:
-            return
-        correction = self.vision.register(self.filter.world_from_camera)
-        if correction is not None:
-            cov = correction.cov + np.diag(_F2M_SIGMA**2)
-            self.filter.correct_pose(self.filter.world_from_camera @ correction.a_from_b, cov)
+    def _register_with_mosaic(self, key: KeyPoint, chain: Link | None) -> None:
+        """Corrects the position by the mosaic (F2M), as far as the motion since that was laid is less sure."""
+        pose, step_cov = self.filter.world_from_camera, self.since_node[1] if chain is None else chain.cov
+        to_world, from_world = geometry.adjoint(pose), geometry.adjoint(geometry.inverse(pose))
+        if self.nodes:
+            key.walked_cov = self.nodes[-1].walked_cov + to_world @ step_cov @ to_world.T
+        found = self.vision.register(pose) if self.settings.use_f2m else None
+        if found is not None:
+            walked_cov = from_world @ (key.walked_cov - self.keys[found.laid_by].walked_cov) @ from_world.T
+            since = clipped(walked_cov, step_cov, least=1.0) if self.nodes else walked_cov
+            cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
+            learnt = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
+            if learnt is not None:
+                key.walked_cov = key.walked_cov - to_world @ learnt @ to_world.T
 
     def _follow_chain(self, node: KeyPoint) -> Link | None:
         """Measures the motion since the last node, and lets it take the place of the F2F motion in the online position.

@@ -26,13 +26,31 @@ class PoseFilter:
         self.world_from_camera = self.world_from_camera @ a_from_b
         self.cov = carried(self.cov, a_from_b) + cov
 
-    def correct_pose(self, measured: Array, cov: Array) -> bool:
-        """Fuses a measured pose; refused (False) where it contradicts the prediction beyond both uncertainties."""
+    def correct_pose(self, measured: Array, cov: Array, since: Array) -> Array | None:
+        """Fuses a pose measured against something laid earlier.
+
+        What had been laid errs by what the position had erred by until then, so the measurement tells of the motion
+        since only: the gain is S (S + R)^-1, and the covariance falls by the gain times S, which is less than by an
+        absolute position (Schmidt's consider filter, with the past position considered).
+
+        Args:
+            measured: (4, 4).
+            cov: R, (6, 6) of the measurement.
+            since: (6, 6) of the motion since; taken for S as far as the position knows no less.
+
+        Returns:
+            (6, 6) by how much the covariance fell; None where the measurement contradicts the prediction beyond both
+            uncertainties and is refused.
+        """
+        moved = clipped(since, self.cov, most=1.0)
         residual = geometry.log(geometry.inverse(self.world_from_camera) @ measured)
-        if residual @ np.linalg.solve(self.cov + cov, residual) > _GATE:
-            return False
-        self._update(residual, np.eye(6), cov)
-        return True
+        inverse = np.linalg.inv(moved + cov)
+        if residual @ inverse @ residual > _GATE:
+            return None
+        gain = moved @ inverse
+        learnt = np.asarray(gain @ moved, np.float64)
+        self.reset(self.world_from_camera @ geometry.exp(gain @ residual), self.cov - learnt)
+        return learnt
 
     def aid(self, readings: Readings) -> None:
         """Fuses what the navigation sensors said of height and attitude."""
@@ -70,6 +88,15 @@ class PoseFilter:
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
         self.world_from_camera, self.cov = _updated(self.world_from_camera, self.cov, residual, jacobian, cov)
+
+
+def clipped(cov: Array, other: Array, least: float = 0.0, most: float = np.inf) -> Array:
+    """A covariance (n, n), cut to between `least` and `most` times another, in the axes that both have in common."""
+    root = np.linalg.cholesky(other)
+    inward = np.linalg.inv(root)
+    sizes, axes = np.linalg.eigh(inward @ cov @ inward.T)
+    axes = root @ axes
+    return np.asarray(axes * np.clip(sizes, least, most) @ axes.T, np.float64)
 
 
 @njit(cache=True, nogil=True)

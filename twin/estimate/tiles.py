@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Layers = NDArray[np.float32]
 
 SIDE = 256
-_MOST_TILES = 96  # 50 MB of two layers: a footprint touches about 20
+_MOST_TILES = 64  # 50 MB of three layers: a footprint touches about 20
 
 
 class TiledRaster:

@@ -19,7 +19,7 @@ from twin.estimate import disparity, matching, scale, stereo
 from twin.estimate.f2f import FrameToFrame
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.map_builder import KeyPointImages, build_map
-from twin.estimate.mosaic import Mosaic
+from twin.estimate.mosaic import Mosaic, Registration
 from twin.estimate.motion import Motion
 from twin.estimate.network import PairMatch
 from twin.estimate.stereo import StereoPoints
@@ -44,7 +44,7 @@ class Vision(Protocol):
         """F2F goes on from the key point just looked at."""
         ...
 
-    def register(self, world_from_camera: Array) -> Motion | None:
+    def register(self, world_from_camera: Array) -> Registration | None:
         """F2M: correction of the predicted pose of the key point; None where the mosaic does not tell."""
         ...
 
@@ -131,13 +131,13 @@ class StereoVision:
         if self._points is not None:
             self.f2f.restart(self._image, self._points)
 
-    def register(self, world_from_camera: Array) -> Motion | None:
+    def register(self, world_from_camera: Array) -> Registration | None:
         assert self._points is not None
         half_m = half_window_m(self._points, self.rig)
-        return self.mosaic.register(self._image, world_from_camera, half_m, self.rig)
+        return self.mosaic.register(self._image, self._depth_m, world_from_camera, half_m, self.rig)
 
     def lay(self, number: int, world_from_camera: Array) -> None:
-        self.mosaic.add(self._image, self._depth_m, world_from_camera, self.rig)
+        self.mosaic.add(number, self._image, self._depth_m, world_from_camera, self.rig)
         self._depth_of_key[number] = self._depth_m.astype(np.float16)
 
     def relay(self, keys: Sequence[KeyPoint]) -> None:
@@ -146,7 +146,7 @@ class StereoVision:
         for key in keys:
             image = self.spool.normalised(key.row)[0]
             depth_m = self._depth_of_key[key.number].astype(np.float32)
-            self.mosaic.add(image, depth_m, key.world_from_camera, self.rig)
+            self.mosaic.add(key.number, image, depth_m, key.world_from_camera, self.rig)
 
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
         with self.watch("flow"):

@@ -22,6 +22,7 @@ from twin.estimate import elevation, network, observation, stereo
 from twin.estimate.f2f import MOST_POINTS as F2F_POINTS
 from twin.estimate.f2f import coast
 from twin.estimate.key_points import KeyPoint
+from twin.estimate.mosaic import Registration
 from twin.estimate.motion import Motion
 from twin.estimate.stereo import StereoPoints
 from twin.geometry import Array
@@ -171,7 +172,7 @@ class SurrogateVision:
         cov = np.asarray(np.linalg.inv(normal) * (sigma_px / self.rig.focal_px) ** 2, np.float64)
         return np.asarray(np.linalg.cholesky(cov), np.float64), cov
 
-    def register(self, world_from_camera: Array) -> Motion | None:
+    def register(self, world_from_camera: Array) -> Registration | None:
         assert self._now is not None
         now = self._now.pose
         shares = self._owners.shares(now, self._now.points)
@@ -183,7 +184,9 @@ class SurrogateVision:
             offset += share * geometry.log(predicted_from_world @ told)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
         error = root @ self._draw() * self.model.mosaic_excess
-        return Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
+        found = Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
+        older = np.cumsum([share for _, _, share in sorted(shares, key=lambda s: s[0])])
+        return Registration(found, sorted(number for number, _, _ in shares)[int(np.searchsorted(older, 0.5))])
 
     def lay(self, number: int, world_from_camera: Array) -> None:
         assert self._now is not None

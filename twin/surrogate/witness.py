@@ -14,6 +14,7 @@ import numpy as np
 
 from twin import geometry
 from twin.estimate.key_points import KeyPoint
+from twin.estimate.mosaic import Registration
 from twin.estimate.motion import Motion
 from twin.estimate.stereo import StereoPoints
 from twin.estimate.vision import StereoVision
@@ -71,13 +72,14 @@ class Witness:
         self.images.restart()
         self.surrogate.restart()
 
-    def register(self, world_from_camera: Array) -> Motion | None:
-        seen, guessed = self.images.register(world_from_camera), self.surrogate.register(world_from_camera)
-        if seen is not None and guessed is not None:
+    def register(self, world_from_camera: Array) -> Registration | None:
+        found, drawn = self.images.register(world_from_camera), self.surrogate.register(world_from_camera)
+        if found is not None and drawn is not None:
+            seen, guessed = found.correction, drawn.correction
             self.notes["mosaic_claim"].append(_ratio(seen.cov, guessed.cov))
             off = geometry.log(geometry.inverse(guessed.a_from_b) @ seen.a_from_b)
             self.notes["mosaic_difference"].append(_chi2(off, guessed.cov) / 6)
-        return seen
+        return found
 
     def lay(self, number: int, world_from_camera: Array) -> None:
         self._poses[number] = self._truth()
