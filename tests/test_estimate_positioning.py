@@ -347,10 +347,10 @@ LINK_COV = np.diag([0.002**2] * 3 + [0.01**2] * 3)
 
 
 class Script:
-    """A camera that answers the navigator with the true motions between given poses, each a key point."""
+    """A camera that answers the navigator with the motions between given poses, each a key point: true, or with noise."""
 
-    def __init__(self, poses, blind=(), correction=None):
-        self.poses, self.blind, self.correction, self.row = poses, blind, correction, -1
+    def __init__(self, poses, blind=(), correction=None, rng=None):
+        self.poses, self.blind, self.correction, self.rng, self.row = poses, blind, correction, rng, -1
 
     def step(self, frame):
         self.row = frame.index
@@ -374,6 +374,8 @@ class Script:
 
     def measure(self, node, others):
         true = [geometry.inverse(self.poses[k.number]) @ self.poses[node.number] for k in others]
+        if self.rng is not None:
+            true = [t @ geometry.exp(e) for t, e in zip(true, self.rng.normal(0, 1e-3, (len(true), 6)), strict=True)]
         return [None if node.number in self.blind else Motion(t, LINK_COV, 200, 1.0) for t in true]
 
 
@@ -447,3 +449,12 @@ def test_a_mismatch_far_away_does_not_widen_the_window_of_the_mosaic(diver):
     window_m = vision.half_window_m(node.points._replace(xyz=wild), RIG)
     assert window_m == pytest.approx(vision.half_window_m(node.points, RIG), rel=0.05)
     assert window_m > ALTITUDE_M * RIG.width_px / RIG.focal_px / 2
+
+
+def test_poses_stay_rotations_however_often_they_are_aligned():
+    """Those at the start are in the window of every loop: in 34 alignments they grew by 0.3 %, and with them the map."""
+    poses = [scene.down_camera(0.0, 0.1 * (k % 3), 2.4, (0.01 * k, 0.02, 0.1 * (k % 3))) for k in range(120)]
+    navigator = navigated(Script(poses, rng=np.random.default_rng(1)), [1 + k // 3 for k in range(120)])
+    for key in navigator.keys:
+        rotation = key.world_from_camera[:3, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)

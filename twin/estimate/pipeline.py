@@ -279,7 +279,7 @@ class Navigator:
         for key in self.keys:
             if key.number in poses:
                 shift = poses[key.number] @ geometry.inverse(key.world_from_camera)
-            key.world_from_camera = shift @ key.world_from_camera
+            key.world_from_camera = geometry.rigid(shift @ key.world_from_camera)  # else errors treble
         for k, node in enumerate(self.nodes):
             self.node_poses[k] = node.world_from_camera
 
