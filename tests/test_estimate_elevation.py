@@ -114,6 +114,46 @@ def test_a_wrong_first_height_is_outvoted():
     assert np.abs(result[(np.abs(X) < 0.3) & (np.abs(Y) < half)]).max() < 1e-3
 
 
+def retired(*heights_and_variances):
+    """The map of level floors at these heights, each seen once with this variance, one after another."""
+    mapper, pose = elevation.ElevationMapper(GRID), down_camera(0, 0, 2.0)
+    for height, variance in heights_and_variances:
+        seen = even(np.full((120, 160), 2.0 - height), variance)
+        mapper.retire(surface.rasterise(seen, pose, EXACT, RIG, GRID))
+    result = mapper.result()
+    middle = (np.abs(X) < 0.3) & (np.abs(Y) < 0.3)
+    return result.height_m[middle], result.sigma_m[middle]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(("of_higher", "expected"), [(1e-4, 0.0), (4e-5, 0.0), (4e-6, 0.3)])
+def test_of_two_heights_the_lower_stands_unless_the_higher_is_far_better_known(order, of_higher, expected):
+    height, sigma = retired(*[(0.0, 1e-4), (0.3, of_higher)][::order])
+    np.testing.assert_allclose(height, expected, atol=1e-6)
+    assert np.all(sigma > 0.1)  # a doubt of one in six about 0.3 m
+    assert np.all(sigma < 0.12)
+
+
+def test_where_two_heights_agree_there_is_no_doubt():
+    _, sigma = retired((0.0, 1e-4), (0.001, 1e-4))
+    np.testing.assert_allclose(sigma, 0.01 / np.sqrt(2), rtol=1e-3)
+
+
+def test_cells_beside_a_step_may_be_those_of_the_other_side():
+    mapper, step_m = elevation.ElevationMapper(GRID), 0.4
+    patches = []
+    for height, columns in ((step_m, np.s_[:80]), (0.0, np.s_[80:])):
+        depth = np.full((120, 160), np.nan)
+        depth[:, columns] = 2.0 - height
+        patches.append(surface.rasterise(even(depth, 1e-8), down_camera(0, 0, 2.0), EXACT, RIG, GRID))
+        mapper.retire(patches[-1])
+    sigma, across_m = mapper.result().sigma_m[:, 100], np.abs(Y[:, 100])
+    share = np.mean([patch.lateral_m for patch in patches]) / (2 * GRID.cell_m)
+    beside, away = across_m < 0.02, (across_m > 0.06) & (across_m < 0.3)
+    np.testing.assert_allclose(sigma[beside], np.hypot(np.sqrt(share), share) * step_m, rtol=1e-3)
+    np.testing.assert_allclose(sigma[away], 1e-4, rtol=1e-2)
+
+
 def test_the_mosaic_is_even_under_a_lamp_that_travels_along():
     v, u = np.mgrid[:120, :160]
     lamp = np.exp(-((u - 80.0) ** 2 + (v - 60.0) ** 2) / 80**2)

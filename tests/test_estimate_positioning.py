@@ -347,7 +347,7 @@ LINK_COV = np.diag([0.002**2] * 3 + [0.01**2] * 3)
 
 
 class Script:
-    """A camera that answers the navigator with the motions between given poses, each a key point: true, or with noise."""
+    """A camera that answers the navigator with the motions between given poses, true or noisy, each a key point."""
 
     def __init__(self, poses, blind=(), correction=None, rng=None):
         self.poses, self.blind, self.correction, self.rng, self.row = poses, blind, correction, rng, -1
@@ -452,7 +452,7 @@ def test_a_mismatch_far_away_does_not_widen_the_window_of_the_mosaic(diver):
 
 
 def test_poses_stay_rotations_however_often_they_are_aligned():
-    """Those at the start are in the window of every loop: in 34 alignments they grew by 0.3 %, and with them the map."""
+    """Those at the start are in the window of every loop: 34 alignments made them 0.3 % too large."""
     poses = [scene.down_camera(0.0, 0.1 * (k % 3), 2.4, (0.01 * k, 0.02, 0.1 * (k % 3))) for k in range(120)]
     navigator = navigated(Script(poses, rng=np.random.default_rng(1)), [1 + k // 3 for k in range(120)])
     for key in navigator.keys:
