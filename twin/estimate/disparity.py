@@ -27,7 +27,7 @@ AGREE_PX = 1.0
 FLOOR_PX = 0.03
 #: Widest search [share of the image's width].
 WIDEST = 0.4
-#: A disparity less certain than this is none [px].
+#: A disparity less certain than this is none [px], were the noise of pixels independent: beyond are mismatches.
 LIMIT_PX = 1.0
 
 
@@ -59,7 +59,7 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
     coarse = search_both(_flattened(left), _flattened(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
     sigma = np.hypot(fine.own_sigma_px, np.float32(FLOOR_PX))
-    return Disparity(fine.disparity_px, sigma).surer_than(LIMIT_PX)
+    return Disparity(fine.disparity_px, sigma).surer_than(LIMIT_PX * fine.shared**0.5)
 
 
 class Reach:

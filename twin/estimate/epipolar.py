@@ -53,17 +53,19 @@ class Refinement(NamedTuple):
     Args:
         sigma_px: (H, W) standard deviation if the start was good to `PRIOR_PX`.
         gain: (H, W) share of an error of the start that the images corrected: 1 on texture, 0 where there is none.
+        shared: by how much the noise of a window varies more than if pixels were independent; `sigma_px` is without.
     """
 
     disparity_px: Map
     sigma_px: Map
     gain: Map
     noise: float
+    shared: float
 
     @property
     def own_sigma_px(self) -> Map:
         """(H, W) standard deviation as a measurement of its own, whatever the start was; infinite without texture."""
-        return _own_sigma(self.sigma_px, self.gain)
+        return _own_sigma(self.sigma_px, self.gain) * np.float32(self.shared**0.5)
 
 
 STEREO = TwoView(np.eye(3), np.array([-1.0, 0.0, 0.0]))
@@ -94,13 +96,15 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         view: where the other image sees a disparity.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, NOTHING).astype(np.float32)
-    sigma, gain, excess, noise_variance, spread_px = fitted, fitted, fitted, 1.0, SPREAD_PX
+    sigma, gain, excess, noise_variance, shared, spread_px = fitted, fitted, fitted, 1.0, 1.0, SPREAD_PX
     for _ in range(iterations):
         residual, slope, seen = _balanced_warp(reference, other, fitted, view)
         fitted = np.where(seen, fitted, NOTHING)
         noise_variance = _noise_variance(residual, seen)
         noise = _local_noise(residual, seen, noise_variance)
         fit = _fit_planes(fitted, residual, slope, noise, _taper(spread_px), np.float32(SUPPORT_PX), _PRIORS)
+        left = residual - slope * (fit[0] - fitted)
+        shared = _shared(left, seen, noise_variance)
         fitted, weight, gain, excess = fit
         sigma = np.sqrt(weight * np.maximum(excess, noise))
         spread_px = _spread(_own_sigma(sigma, gain), fitted, spread_px)
@@ -110,6 +114,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         np.where(known, sigma, np.nan).astype(np.float32),
         np.where(known, gain, np.nan).astype(np.float32),
         float(noise_variance**0.5),
+        shared,
     )
 
 
@@ -168,6 +173,17 @@ def _noise_variance(residual: Map, seen: Mask) -> float:
     if sample.size < 100:
         return 1.0
     return max(float(1.4826 * np.median(sample)) ** 2, LEAST_NOISE)
+
+
+def _shared(left: Map, seen: Mask, variance: float) -> float:
+    """By how much neighbours that share their noise make that of a window vary more, by what the fit left of it.
+
+    The colours of a Bayer mosaic are interpolated: taken as independent, sigma was 1.6 times too small.
+    """
+    noise = np.where(seen, np.clip(left, -3 * variance**0.5, 3 * variance**0.5), 0)
+    power = float(np.mean(noise * noise)) + 1e-6
+    along, across = (float(np.mean(a * b)) / power for a, b in ((noise[:, 1:], noise[:, :-1]), (noise[1:], noise[:-1])))
+    return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
 
 
 def _local_noise(residual: Map, seen: Mask, most: float) -> Map:
