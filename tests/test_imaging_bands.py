@@ -26,6 +26,14 @@ SPIKES = types.SimpleNamespace(
 )
 
 
+@pytest.mark.parametrize(("n_rows", "pixels", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
+def test_bands_are_cut_where_there_are_pixels_enough(monkeypatch, n_rows, pixels, n_bands):
+    monkeypatch.setattr(bands, "_processors", lambda: bands.THREADS)
+    seen = []
+    bands.in_bands(lambda *band: seen.append(band), n_rows, pixels)
+    assert len(seen) == n_bands
+
+
 @pytest.mark.parametrize("n_rows", [1, 63, 64, 65, 481])
 def test_every_row_is_worked_on_once(monkeypatch, n_rows):
     monkeypatch.setattr(bands, "_processors", lambda: bands.THREADS)

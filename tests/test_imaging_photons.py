@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 from twin.config import Scenario
+from twin.imaging import photo_sensor
 from twin.imaging.light import Light, Moment
 from twin.imaging.photo_sensor import PhotoSensor
 from twin.imaging.photons import electrons_per_cd, photons_per_lux, vignetting
@@ -199,3 +200,10 @@ def test_without_a_filter_the_colours_are_the_same():
     setting = Setting(0.0, 0.01)
     one, three = (sensor_with(bayer=b).image(smooth.astype(np.float32), setting, None) for b in (True, False))
     assert np.abs(one[2:-2, 2:-2].astype(int) - three[2:-2, 2:-2]).max() <= 2
+
+
+def test_each_band_is_metered_with_the_weights_of_the_lens():
+    rng = np.random.default_rng(0)
+    light, share = rng.uniform(0, 9, (31, 45, 3)).astype(np.float32), rng.uniform(0, 1, (31, 45)).astype(np.float32)
+    want = (light * share[..., None]).mean((0, 1), dtype=np.float64)
+    np.testing.assert_allclose(photo_sensor._weighted_mean(light, share), want, rtol=1e-6)

@@ -11,7 +11,7 @@ from twin.imaging import bands
 from twin.imaging.camera import AT_REST, StereoCamera
 from twin.imaging.light import Light, Moment
 from twin.imaging.photo_sensor import sensor_of
-from twin.imaging.sensor import Exposure, Setting, expose
+from twin.imaging.sensor import Exposure, Setting, _mean, expose
 from twin.timing import Stopwatch
 
 PHYSICAL = {"bits": 12, "bayer": True, "readout_ms": 10.0}
@@ -165,3 +165,9 @@ def test_both_eyes_are_exposed_alike():
 def test_the_right_eye_has_noise_and_place_of_its_own(sensor):
     shot = shots([True] * 5, sensor)[0]
     assert shot.right.shape == shot.left.shape and (shot.right != shot.left).mean() > 0.5
+
+
+def test_metering_is_numpys_mean_to_the_last_bit():
+    light = np.random.default_rng(0).gamma(2, 20, (63, 85, 3)).astype(np.float32)
+    want = light.mean(axis=0, dtype=np.float64).mean(axis=0)
+    np.testing.assert_array_equal(_mean(light.reshape(63, -1)), want)

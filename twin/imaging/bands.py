@@ -11,13 +11,15 @@ THREADS = 2  # more of them wait for one another: the work of an image takes mil
 LEAST_ROWS = 32  # of a band; for less, waking a thread costs more than it does
 
 
-def in_bands(work: Callable[[int, int], None], n_rows: int) -> None:
+def in_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1) -> None:
     """Runs `work(first_row, end_row)` over all rows, side by side where there are processors; its kernels free the GIL.
 
+    Args:
+        pixels: rows of the image that each of these stands for.
     Raises:
         Exception: what `work` raised in any band.
     """
-    if n_rows < THREADS * LEAST_ROWS or _processors() < THREADS:
+    if n_rows * pixels < THREADS * LEAST_ROWS or _processors() < THREADS:
         work(0, n_rows)
         return
     cuts = [n_rows * k // THREADS for k in range(THREADS + 1)]

@@ -45,9 +45,11 @@ class Caustics:
         weight = np.where(among & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
         height = np.sqrt(weight) * (rng.normal(size=k.shape) + 1j * rng.normal(size=k.shape))
         height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # half of a wave's square is its mean
-        self._omega = np.sqrt(GRAVITY_MPS2 * k)
-        self._slope = [(1j * along * height).astype(np.complex64) for along in (kx, ky)]
-        self._throw = (1 - 1 / WATER_INDEX) * depth_m * CELLS / TILE_M
+        some = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))  # no waves beyond
+        self._omega = np.sqrt(GRAVITY_MPS2 * k[:, some])
+        # of a real surface half the waves tell the others
+        self._slope = [(0.5j * along * height)[:, some].astype(np.complex64) for along in (kx, ky)]
+        self._throw = np.float32((1 - 1 / WATER_INDEX) * depth_m * CELLS / TILE_M)
         self._blur = _blur(k[:, : CELLS // 2 + 1], depth_m, water).astype(np.float32)
         self._share = np.float32(share)
         self._now: tuple[float, NDArray[np.float32]] | None = None
@@ -61,7 +63,8 @@ class Caustics:
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(CELLS, CELLS) slopes of the surface to the east and to the north."""
         turned = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # waves on deep water
-        east, north = (np.real(np.asarray(fft.ifft2(slope * turned, norm="forward"))) for slope in self._slope)
+        size = CELLS, CELLS
+        east, north = (np.asarray(fft.irfft2(slope * turned, s=size, norm="forward")) for slope in self._slope)
         return east, north
 
     def _at(self, time_s: float) -> NDArray[np.float32]:
@@ -87,23 +90,23 @@ def _blur(k: Array, depth_m: float, water: Medium) -> Array:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _land(east, north, throw, light):
     """Adds to `light` (n, n) rays from all over the surface, each shared among the four cells it lands between."""
-    n, each = light.shape[0], np.float32(1 / RAYS**2)
+    n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
     for i in range(n):
         i1 = (i + 1) & (n - 1)
         for j in range(n):
             j1 = (j + 1) & (n - 1)
             for part in range(RAYS * RAYS):
-                a, b = (part // RAYS) / RAYS, (part % RAYS) / RAYS
-                to_east = (1 - a) * ((1 - b) * east[i, j] + b * east[i, j1])
-                to_east += a * ((1 - b) * east[i1, j] + b * east[i1, j1])
-                to_north = (1 - a) * ((1 - b) * north[i, j] + b * north[i, j1])
-                to_north += a * ((1 - b) * north[i1, j] + b * north[i1, j1])
-                col, row = j + b - throw * to_east, i + a - throw * to_north
+                a, b = np.float32((part // RAYS) / RAYS), np.float32((part % RAYS) / RAYS)
+                to_east = (one - a) * ((one - b) * east[i, j] + b * east[i, j1])
+                to_east += a * ((one - b) * east[i1, j] + b * east[i1, j1])
+                to_north = (one - a) * ((one - b) * north[i, j] + b * north[i, j1])
+                to_north += a * ((one - b) * north[i1, j] + b * north[i1, j1])
+                col, row = np.float32(j) + b - throw * to_east, np.float32(i) + a - throw * to_north
                 left, low = np.floor(col), np.floor(row)
-                w, h = np.float32(col - left), np.float32(row - low)
+                w, h = col - left, row - low
                 k, m = int(left) & (n - 1), int(low) & (n - 1)
                 k1, m1 = (k + 1) & (n - 1), (m + 1) & (n - 1)
-                light[m, k] += each * (1 - w) * (1 - h)
-                light[m, k1] += each * w * (1 - h)
-                light[m1, k] += each * (1 - w) * h
+                light[m, k] += each * (one - w) * (one - h)
+                light[m, k1] += each * w * (one - h)
+                light[m1, k] += each * (one - w) * h
                 light[m1, k1] += each * w * h

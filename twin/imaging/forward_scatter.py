@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from twin.imaging.bands import in_bands
 from twin.imaging.optics import Depth, Radiance
+from twin.imaging.powers import LOG2_E, two_to
 from twin.imaging.shading import FAR_M, PATH_MAX_M
 from twin.imaging.water import FORWARDNESS, Medium, phase_function
 from twin.records import StereoRig
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 
 FORWARD_DEG = 15.0  # scattering by more takes light out of the image
 LEVELS = 4  # of the variance: 1, 2, 4, 8 times the least; between two levels light is shared
-STEP_M = 0.02  # of the tables over range
+STEP_M = 0.02  # of the table of levels over range
 MAX_LOG_GAIN = 60.0  # where that much is scattered forward, nothing arrives
 
 
@@ -55,10 +56,10 @@ class ForwardScatter:
 
     def __init__(self, rig: StereoRig, water: Medium):
         lobe = forward_lobe(water.mean_cosine)
-        range_m = np.arange(0.0, PATH_MAX_M, STEP_M)
-        thickness = max(lobe.share - water.kept_share, 0.0) * water.scattering_per_m * range_m[:, None]
+        scattered_per_m = max(lobe.share - water.kept_share, 0.0) * water.scattering_per_m
+        thickness = scattered_per_m * np.arange(0.0, PATH_MAX_M, STEP_M)[:, None]
         times = np.where(thickness > 1e-9, thickness / -np.expm1(-np.maximum(thickness, 1e-9)), 1.0)
-        self._gain = np.expm1(np.minimum(thickness, MAX_LOG_GAIN)).astype(np.float32)
+        self._scattered_per_m = scattered_per_m.astype(np.float32)
         self._level = _level_of(times).astype(np.float32)
         self._focal_px = rig.focal_px
         self._variance_px2 = rig.focal_px**2 * lobe.variance_rad2 / 3 * 2.0 ** np.arange(LEVELS)
@@ -77,14 +78,15 @@ class ForwardScatter:
     def add(self, direct: Radiance, depth: Depth, light: Radiance) -> None:
         """Adds to `light` (H, W, 3) what arrives from the floor, scattered forward or not."""
         spread = self._draw(direct, depth)
-        in_bands(lambda first, end: _add(light[first:end], spread[first:end], direct[first:end]), len(light))
+        parts = light.reshape(len(light), -1), spread.reshape(len(light), -1), direct.reshape(len(light), -1)
+        in_bands(lambda first, end: _add(*parts, first, end), len(light))
 
     def _draw(self, direct: Radiance, depth: Depth) -> Radiance:
         """The same as `spread`, in memory of its own until the next call: to get fresh one takes as long as to fill."""
         size, (height, width) = self._bin_px, depth.shape
         bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
-        scene = direct, depth, np.float32(self._focal_px), self._gain, self._level, size, bins
-        in_bands(lambda first, end: _collect(*scene, first, end), height // size)
+        scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
+        in_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
         # what lies in a bin has its variance already, and drawing straight lines between bins adds to it
         sigma = np.sqrt(np.maximum(self._variance_px2 / size**2 - (0.25 - 1 / (4 * size**2)), 1e-3))
         pairs = zip(bins, sigma, strict=True)
@@ -109,42 +111,50 @@ def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
-def _collect(direct, depth, focal, gain, level, size, bins, first, end):
-    """Adds the light that is scattered forward of each pixel to its bin, shared between the two levels of its range.
+def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, end):
+    """Puts the light that is scattered forward of each pixel into its bin, shared between the two levels of its range.
 
-    Of the bins' rows from `first` to `end`. Light is counted pixel by pixel; its width is that of the last pixel of a
-    bin's row.
+    Of the bins' rows from `first` to `end`. Light is counted pixel by pixel; its width is that of a bin's mean range.
     """
     levels, _, cols, _ = bins.shape
-    last, far, half = gain.shape[0] - 1, np.float32(FAR_M), np.float32(0.5)
-    for v in range(first * size, end * size):
-        y = (np.float32(v) - half * np.float32(depth.shape[0] - 1)) / focal
-        row = v // size
+    width, last = depth.shape[1], level.shape[0] - 1
+    one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
+    red, green, blue = np.float32(LOG2_E) * scattered_per_m
+    most = np.float32(LOG2_E * MAX_LOG_GAIN)
+    # light of each band, range, and number of pixels with a floor
+    found, of_bins = np.empty((5, width), np.float32), np.empty((5, cols), np.float32)
+    for row in range(first, end):
+        found[:] = zero
+        for v in range(row * size, (row + 1) * size):
+            y = (np.float32(v) - half * np.float32(depth.shape[0] - 1)) / focal
+            here, light = depth[v], direct[v].reshape(-1)
+            for u in range(width):
+                x = (np.float32(u) - half * np.float32(width - 1)) / focal
+                way = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else zero
+                found[0, u] += light[3 * u] * (two_to(min(red * way, most)) - one)
+                found[1, u] += light[3 * u + 1] * (two_to(min(green * way, most)) - one)
+                found[2, u] += light[3 * u + 2] * (two_to(min(blue * way, most)) - one)
+                found[3, u] += way
+                found[4, u] += one if way > zero else zero
+        for k in range(5):
+            of_pixels = found[k]
+            for col in range(cols):
+                total = zero
+                for u in range(size):
+                    total += of_pixels[col * size + u]
+                of_bins[k, col] = total
         for col in range(cols):
-            red = green = blue = np.float32(0.0)
-            at = -1
-            for u in range(col * size, (col + 1) * size):
-                z = depth[v, u]
-                if z < far:
-                    x = (np.float32(u) - half * np.float32(depth.shape[1] - 1)) / focal
-                    way = z * np.sqrt(x * x + y * y + np.float32(1.0))
-                    at = min(int(way * np.float32(1 / STEP_M) + half), last)
-                    red += direct[v, u, 0] * gain[at, 0]
-                    green += direct[v, u, 1] * gain[at, 1]
-                    blue += direct[v, u, 2] * gain[at, 2]
-            if at < 0:
-                continue
-            for c, light in enumerate((red, green, blue)):
+            at = min(int(of_bins[3, col] / max(of_bins[4, col], one) * np.float32(1 / STEP_M) + half), last)
+            for c in range(3):
                 k = min(int(level[at, c]), levels - 2)
-                above = light * (level[at, c] - np.float32(k))
-                bins[k, row, col, c] += light - above
-                bins[k + 1, row, col, c] += above
+                above = of_bins[c, col] * (level[at, c] - np.float32(k))
+                bins[k, row, col, c] = of_bins[c, col] - above
+                bins[k + 1, row, col, c] = above
 
 
 @njit(cache=True, nogil=True)
-def _add(light, one, other):
-    """Adds two images to a third (H, W, 3)."""
-    for v in range(light.shape[0]):
-        for u in range(light.shape[1]):
-            for c in range(3):
-                light[v, u, c] = light[v, u, c] + one[v, u, c] + other[v, u, c]
+def _add(light, one, other, first, end):
+    """Adds two images to a third (H, 3 W), in its rows from `first` to `end`."""
+    for v in range(first, end):
+        for k in range(light.shape[1]):
+            light[v, k] = light[v, k] + one[v, k] + other[v, k]

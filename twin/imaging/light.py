@@ -115,7 +115,8 @@ class Light:
         ground = np.array([east, north, -up])
         ground[:2] *= CELLS / TILE_M
         ground[2, 3] += self._depth_m
-        return Overhead(None if self._caustics is None else self._caustics.pattern(moment.time_s), ground)
+        waves = None if self._caustics is None else np.pad(self._caustics.pattern(moment.time_s), (0, 1), mode="wrap")
+        return Overhead(waves, ground)
 
     def _world_from_eye(self, eye: int, moment: Moment) -> Array:
         return moment.world_from_left @ (self._rig.left_from_right if eye else np.eye(4))

@@ -41,7 +41,8 @@ class Overhead(NamedTuple):
     """The surface above an eye.
 
     Args:
-        waves: (n, n) light against the mean; None where it is even.
+        waves: (n + 1, n + 1) light against the mean, n a power of two; the last row and column repeat the first. None
+            where it is even.
         ground: (3, 4) column and row in `waves`, and depth below the surface [m], by place in the eye.
     """
 
@@ -77,7 +78,7 @@ class Optics:
         self._tables = [_tables(rig, self._medium, lights) for lights in self._lights]
         falls = bool(daylight.per_m.any())
         self._surface_lx = np.full(3, sun.illuminance_lx) if falls else daylight.eye_lx
-        self._down = _transmission(daylight.per_m) if falls else None
+        self._loss_per_m = np.array([daylight.per_m, self._medium.attenuation_per_m], np.float32)
         self._level = Overhead(None, np.array([[0.0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, sun.depth_m - altitude_m]]))
 
     def radiance(
@@ -133,10 +134,10 @@ class Optics:
     ) -> None:
         lights, focal = self._lights[eye], np.float32(self._rig.focal_px)
         waves, ground = self._level if overhead is None else overhead
-        sky = self._surface_lx.astype(np.float32), self._down, waves, np.asarray(ground, np.float32)
+        sky = self._surface_lx.astype(np.float32), self._loss_per_m, waves, np.asarray(ground, np.float32)
         lamps = np.column_stack([lights.position_m, lights.axis, lights.intensity_cd, lights.colour])
         beams, transmission, veil = self._tables[eye]
-        scene = albedo, depth, focal, lamps.astype(np.float32), beams, transmission, veil, sky
+        scene = np.ascontiguousarray(albedo), depth, focal, lamps.astype(np.float32), beams, transmission, veil, sky
         in_bands(lambda first, end: shade(*scene, out, lit, veil_out, first, end), len(depth))
 
 

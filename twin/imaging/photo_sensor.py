@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from twin import config
 from twin.config import Scenario
+from twin.imaging.bands import in_bands
 from twin.imaging.photons import electrons_per_cd, vignetting
 from twin.imaging.pixels import Pixels, Raw, read_out
 from twin.imaging.sensor import Array, Depth, Exposure, PlainSensor, Radiance, Setting
@@ -89,10 +90,10 @@ class PhotoSensor:
     def develop(self, raw: Raw) -> Image:
         """An 8-bit RGB image (H, W, 3): black level off, white balanced for clear water, linear, bands interpolated."""
         toned = np.empty(raw.shape, np.uint8)
+        bands = raw.reshape(*raw.shape[:2], -1), self._tones, toned.reshape(*raw.shape[:2], -1)
+        in_bands(lambda first, end: _tone(*bands, first, end), len(raw))
         if raw.ndim == 3:
-            _tone(raw, self._tones, toned)
             return toned
-        _tone(raw[..., None], self._tones, toned[..., None])
         image = np.empty((*raw.shape, 3), np.uint8)
         cv2.cvtColor(toned, cv2.COLOR_BayerRGGB2RGB, image)
         return image
@@ -109,22 +110,26 @@ class PhotoSensor:
         return np.clip(255 * self._white[:, None] * signal + 0.5, 0, 255).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _weighted_mean(light, weights):
     """(3,) mean of each band of `light` (H, W, 3) times `weights` (H, W)."""
     total = np.zeros(3)
     for v in range(weights.shape[0]):
-        for u in range(weights.shape[1]):
-            for c in range(3):
-                total[c] += weights[v, u] * light[v, u, c]
+        row, shares = light[v].reshape(-1), weights[v]
+        red = green = blue = np.float32(0.0)
+        for u in range(shares.size):
+            red += shares[u] * row[3 * u]
+            green += shares[u] * row[3 * u + 1]
+            blue += shares[u] * row[3 * u + 2]
+        total[0], total[1], total[2] = total[0] + red, total[1] + green, total[2] + blue
     return total / weights.size
 
 
 @njit(cache=True, nogil=True)
-def _tone(raw, tones, out):
-    """Looks up each number of `raw` (H, W, 1 or 3) in the tones of its band."""
-    height, width, bands = raw.shape
-    for v in range(height):
+def _tone(raw, tones, out, first, end):
+    """Looks up each number of `raw` (H, W, 1 or 3), in rows `first` to `end`, in the tones of its band."""
+    _, width, bands = raw.shape
+    for v in range(first, end):
         for u in range(width):
             for k in range(bands):
                 out[v, u, k] = tones[(v & 1) + (u & 1) if bands == 1 else k, raw[v, u, k]]

@@ -47,7 +47,7 @@ class Exposure:
 
     def gain(self, radiance: Radiance) -> float:
         """Gain of this frame [1 / (cd/m2)]; the light of this frame counts for the next ones."""
-        return self.gain_for(float(radiance.mean(axis=0, dtype=np.float64).mean(axis=0).max()))
+        return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
         """The same for a mean of the brightest channel [cd/m2]; what is out of reach is not waited for."""
@@ -112,6 +112,19 @@ def expose(radiance: Radiance, gain: float, imaging: Imaging, rng: np.random.Gen
     seed, normal = seed_of(rng), normal_numbers()
     in_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
     return image
+
+
+@njit(cache=True, nogil=True)
+def _mean(light):
+    """(3,) mean of each band of an image (H, 3 W): of its columns, then of these."""
+    columns, total = np.zeros(light.shape[1]), np.zeros(3)
+    for v in range(light.shape[0]):
+        row = light[v]
+        for k in range(row.size):
+            columns[k] += row[k]
+    for k in range(columns.size):
+        total[k % 3] += columns[k] / light.shape[0]
+    return total / (light.shape[1] // 3)
 
 
 @njit(cache=True, nogil=True)

@@ -1,9 +1,15 @@
-"""The formulas of `optics`, compiled: a row of pixels at a time, in steps that a processor does for many at once."""
+"""The formulas of `optics`, compiled: a row of pixels at a time, in steps that a processor does for many at once.
+
+Where a table is looked up, a first loop over the row finds the cell and how far in it (`places`), a second one reads:
+the first is then done for many pixels at once. Rows of colours are indexed as they lie in memory, for the same reason.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
+
+from twin.imaging.powers import LOG2_E, two_to
 
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # of the tables of transmission
 FAR_M = 1e6  # no floor beyond
@@ -23,16 +29,18 @@ def shade(albedo, depth, focal, lamps, beams, transmission, veil, sky, out, lit,
         beams: (n, m) share of the intensity on the axis over even steps of sqrt(1 - cos) of the angle off it, 0 to 1.
         transmission: (3, m) over even steps of path.
         veil: (rows, cols, 3, ranges) over a coarse grid of pixels and even r / (r + scale).
-        sky: daylight (3,); share of it (3, m) over even steps of depth, or None; pattern of the waves (n, n), or None;
-            (3, 4) column and row in that pattern and depth below the surface, by place in the eye.
+        sky: daylight at the surface (3,); its loss by depth and by path to the eye (2, 3) [1/m]; pattern of the waves
+            (n + 1, n + 1), or None; (3, 4) column and row in it and depth below the surface, by place in the eye.
         lit: (n, H, W), or None.
     """
     height, width = depth.shape
     rows, cols, _, ranges = veil.shape
-    daylight, down, waves, ground = sky
+    daylight, loss, waves, ground = sky
     way, normal = np.empty(width, np.float32), np.empty((3, width), np.float32)
     lamp, light = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    haze = np.zeros((3, width), np.float32)
+    haze, dark = np.zeros((3, width), np.float32), np.zeros((3, width), np.float32)
+    cells, parts = np.empty((2, width), np.int32), np.empty((2, width), np.float32)
+    places = cells[0], cells[1], parts[0], parts[1]
     veil_of_row = np.empty((cols, 3, ranges), np.float32)
     sunny = daylight.max() > 0
     for v in range(first, end):
@@ -40,22 +48,24 @@ def shade(albedo, depth, focal, lamps, beams, transmission, veil, sky, out, lit,
         _surface(depth, v, y, focal, way, normal)
         light[:] = np.float32(0.0)
         if sunny:
-            _add_daylight(depth[v], y, focal, daylight, down, waves, ground, transmission, way, light)
+            _cast_waves(depth[v], y, focal, waves, ground, places, lamp[0])
+            _add_daylight(depth[v], y, focal, daylight, loss, ground, way, lamp[0], light)
         for k in range(lamps.shape[0]):
             _shine(lamps[k], depth[v], y, focal, normal, lamp)
             if lit is not None:
                 for u in range(width):
                     lamp[0, u] = lamp[0, u] if lit[k, v, u] else np.float32(0.0)
-            _add_lamp(lamps[k], beams[k], transmission, way, lamp, light)
+            _add_lamp(lamps[k], beams[k], transmission, way, lamp, places, light)
         if ranges:
             _blend_rows(veil, np.float32(v) * np.float32(rows - 1) / np.float32(height - 1), veil_of_row)
-            _look_into_veil(veil_of_row, way, haze)
+            _look_into_veil(veil_of_row, way, places, haze)
         if veil_out is None:
             _reflect(albedo[v], light, haze, out[v])
         else:
-            _reflect(albedo[v], light, np.zeros((3, width), np.float32), out[v])
+            _reflect(albedo[v], light, dark, out[v])
+            of_row = veil_out[v].reshape(-1)
             for u in range(width):
-                veil_out[v, u, 0], veil_out[v, u, 1], veil_out[v, u, 2] = haze[0, u], haze[1, u], haze[2, u]
+                of_row[3 * u], of_row[3 * u + 1], of_row[3 * u + 2] = haze[0, u], haze[1, u], haze[2, u]
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
@@ -106,67 +116,68 @@ def _shine(lamp, here, y, focal, normal, out):
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _add_lamp(lamp, beam, transmission, back, lamplight, light):
+def _add_lamp(lamp, beam, transmission, back, lamplight, places, light):
     """Adds to `light` (3, W) what a lamp of this beam sends to the floor, on its way there and back."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
     last = np.int32(transmission.shape[1] - 2)
+    at_beam, at_path, part_of_beam, part_of_path = places
     for u in range(back.size):
         at = lamplight[1, u] * steps
-        i = np.uint32(min(np.int32(at), last_b))
-        share = beam[i] + (at - np.float32(i)) * (beam[i + np.uint32(1)] - beam[i])
-        e = lamplight[0, u] * share
+        at_beam[u] = min(np.int32(at), last_b)
+        part_of_beam[u] = at - np.float32(at_beam[u])
         at = (lamplight[2, u] + back[u]) * per_step
-        i = np.uint32(min(np.int32(at), last))
-        j, w = i + np.uint32(1), min(at - np.float32(i), one)
+        at_path[u] = min(np.int32(at), last)
+        part_of_path[u] = min(at - np.float32(at_path[u]), one)
+    for u in range(back.size):
+        i, w = np.uint32(at_beam[u]), part_of_beam[u]
+        e = lamplight[0, u] * (beam[i] + w * (beam[i + np.uint32(1)] - beam[i]))
+        i, w = np.uint32(at_path[u]), part_of_path[u]
+        j = i + np.uint32(1)
         light[0, u] += e * red * (transmission[0, i] + w * (transmission[0, j] - transmission[0, i]))
         light[1, u] += e * green * (transmission[1, i] + w * (transmission[1, j] - transmission[1, i]))
         light[2, u] += e * blue * (transmission[2, i] + w * (transmission[2, j] - transmission[2, i]))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _add_daylight(here, y, focal, daylight, down, waves, ground, transmission, back, light):
-    """Adds to `light` (3, W) the daylight that falls on a row's floor, on its way back."""
-    half, one, far, per_step = np.float32(0.5), np.float32(1.0), np.float32(FAR_M), np.float32(1 / PATH_STEP_M)
-    last, width = np.int32(transmission.shape[1] - 2), here.size
-    for u in range(width):
-        z = here[u]
-        if not z < far:
-            continue
-        x = (np.float32(u) - half * np.float32(width - 1)) / focal * z
-        share = one
-        if waves is not None:
-            col = ground[0, 0] * x + ground[0, 1] * y * z + ground[0, 2] * z + ground[0, 3]
-            row = ground[1, 0] * x + ground[1, 1] * y * z + ground[1, 2] * z + ground[1, 3]
-            share = _of_pattern(waves, col, row)
-        at = back[u] * per_step
-        i = np.uint32(min(np.int32(at), last))
-        j, w = i + np.uint32(1), min(at - np.float32(i), one)
-        k, s = np.uint32(0), np.float32(0.0)
-        if down is not None:
-            deep = ground[2, 0] * x + ground[2, 1] * y * z + ground[2, 2] * z + ground[2, 3]
-            deep = max(deep * per_step, np.float32(0.0))
-            k = np.uint32(min(np.int32(deep), np.int32(down.shape[1] - 2)))
-            s = min(deep - np.float32(k), one)
-        for c in range(3):
-            e = share * daylight[c]
-            if down is not None:
-                e *= down[c, k] + s * (down[c, k + np.uint32(1)] - down[c, k])
-            light[c, u] += e * (transmission[c, i] + w * (transmission[c, j] - transmission[c, i]))
+def _cast_waves(here, y, focal, waves, ground, places, share):
+    """Fills `share` (W,) with the light of a row's floor against the mean: 0 where no floor is."""
+    half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
+    for u in range(here.size):
+        share[u] = one if here[u] < far else zero
+    if waves is None:
+        return
+    last, stride = np.int32(waves.shape[0] - 2), np.uint32(waves.shape[0])
+    at, _, to_east, to_north = places
+    for u in range(here.size):
+        z = here[u] if here[u] < far else zero
+        x, down = (np.float32(u) - half * np.float32(here.size - 1)) / focal * z, y * z
+        col = ground[0, 0] * x + ground[0, 1] * down + ground[0, 2] * z + ground[0, 3]
+        row = ground[1, 0] * x + ground[1, 1] * down + ground[1, 2] * z + ground[1, 3]
+        left, low = np.floor(col), np.floor(row)
+        to_east[u], to_north[u] = col - left, row - low
+        at[u] = (np.int32(low) & last) * np.int32(stride) + (np.int32(left) & last)
+    flat = waves.reshape(-1)
+    for u in range(here.size):
+        i, w = np.uint32(at[u]), to_east[u]
+        k = i + stride
+        south = flat[i] + w * (flat[i + np.uint32(1)] - flat[i])
+        north = flat[k] + w * (flat[k + np.uint32(1)] - flat[k])
+        share[u] *= south + to_north[u] * (north - south)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy", inline="always")
-def _of_pattern(waves, col, row):
-    """Between four points of a pattern (n, n) that repeats itself; n is a power of two."""
-    n = waves.shape[0]
-    left, low = np.floor(col), np.floor(row)
-    w, h = col - left, row - low
-    i, k = np.uint32(np.int64(low) & (n - 1)), np.uint32(np.int64(left) & (n - 1))
-    j, m = np.uint32((i + 1) & (n - 1)), np.uint32((k + 1) & (n - 1))
-    lower = waves[i, k] + w * (waves[i, m] - waves[i, k])
-    upper = waves[j, k] + w * (waves[j, m] - waves[j, k])
-    return lower + h * (upper - lower)
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _add_daylight(here, y, focal, daylight, loss, ground, back, share, light):
+    """Adds to `light` (3, W) the daylight that falls on a row's floor, by a share of each pixel, on its way back."""
+    half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
+    for c in range(3):
+        surface, by_depth, by_way = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]
+        for u in range(here.size):
+            z = here[u] if here[u] < far else zero
+            x = (np.float32(u) - half * np.float32(here.size - 1)) / focal * z
+            deep = max(ground[2, 0] * x + ground[2, 1] * (y * z) + ground[2, 2] * z + ground[2, 3], zero)
+            light[c, u] += share[u] * surface * two_to(by_depth * deep + by_way * back[u])
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
@@ -181,30 +192,43 @@ def _blend_rows(veil, row, out):
                 out[i, c, r] = lower[i, c, r] + w * (upper[i, c, r] - lower[i, c, r])
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _look_into_veil(veil, way, haze):
-    """The veil (3, W) in front of a row's floor."""
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _look_into_veil(veil, way, places, haze):
+    """The veil (3, W) in front of a row's floor.
+
+    Each band is the same mean of four, in the order in which images have been made since the first, to the last bit.
+    """
     cols, _, ranges = veil.shape
-    one, per_px, scale = np.float32(1.0), np.float32(cols - 1) / np.float32(way.size - 1), np.float32(RANGE_SCALE_M)
+    one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
+    n_cols, per_px = np.float32(cols - 1), one / np.float32(way.size - 1)
     last_c, last_r = np.int32(cols - 2), np.int32(ranges - 2)
+    at_col, at_range, part_of_col, part_of_range = places
     for u in range(way.size):
-        at = np.float32(u) * per_px
-        i = np.uint32(min(np.int32(at), last_c))
-        w = at - np.float32(i)
-        at = way[u] / (way[u] + scale) * np.float32(ranges - 1)
-        k = np.uint32(min(np.int32(at), last_r))
-        m, s = k + np.uint32(1), min(at - np.float32(k), one)
-        j = i + np.uint32(1)
-        for c in range(3):
-            left = veil[i, c, k] + s * (veil[i, c, m] - veil[i, c, k])
-            right = veil[j, c, k] + s * (veil[j, c, m] - veil[j, c, k])
-            haze[c, u] = left + w * (right - left)
+        at = np.float32(u) * n_cols * per_px
+        at_col[u] = min(np.int32(at), last_c)
+        part_of_col[u] = at - np.float32(at_col[u])
+        at = way[u] * np.float32(ranges - 1) / (way[u] + scale)
+        at_range[u] = min(np.int32(at), last_r)
+        part_of_range[u] = min(at - np.float32(at_range[u]), one)
+    for u in range(way.size):
+        i, w = np.uint32(at_col[u]), part_of_col[u]
+        k, s = np.uint32(at_range[u]), part_of_range[u]
+        j, m = i + np.uint32(1), k + np.uint32(1)
+        left = veil[i, 0, k] + s * (veil[i, 0, m] - veil[i, 0, k])
+        right = veil[j, 0, k] + s * (veil[j, 0, m] - veil[j, 0, k])
+        haze[0, u] = left + w * (right - left)
+        left = veil[i, 1, k] + s * (veil[i, 1, m] - veil[i, 1, k])
+        haze[1, u] = left + w * ((veil[j, 1, k] - left) + s * (veil[j, 1, m] - veil[j, 1, k]))
+        left = veil[i, 2, k] + s * (veil[i, 2, m] - veil[i, 2, k])
+        haze[2, u] = left + w * ((veil[j, 2, k] - left) + s * (veil[j, 2, m] - veil[j, 2, k]))
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, haze, out):
     """Radiance (W, 3) of a Lambertian floor (albedo of 255) under this light, behind this veil."""
     reflected = np.float32(1 / (255 * np.pi))
+    white, filled = albedo.reshape(-1), out.reshape(-1)
     for u in range(out.shape[0]):
-        for c in range(3):
-            out[u, c] = light[c, u] * (reflected * np.float32(albedo[u, c])) + haze[c, u]
+        filled[3 * u] = light[0, u] * (reflected * np.float32(white[3 * u])) + haze[0, u]
+        filled[3 * u + 1] = light[1, u] * (reflected * np.float32(white[3 * u + 1])) + haze[1, u]
+        filled[3 * u + 2] = light[2, u] * (reflected * np.float32(white[3 * u + 2])) + haze[2, u]

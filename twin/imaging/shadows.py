@@ -114,11 +114,15 @@ def _look_between(height, tops, rises, west, south, spacing, depth, focal, pose,
     for k in range(lamps.shape[0]):
         place = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
+            low, high = i * STRIDE_PX, min((i + 1) * STRIDE_PX, depth.shape[0])
+            out[k, low:high] = lattice[k, i, 0]
             for j in range(lattice.shape[2] - 1):
                 known = lattice[k, i, j]
                 seen = known + lattice[k, i, j + 1] + lattice[k, i + 1, j] + lattice[k, i + 1, j + 1]
                 agree = seen == 0 or seen == 4
-                for v in range(i * STRIDE_PX, min((i + 1) * STRIDE_PX, depth.shape[0])):
+                if agree and known == lattice[k, i, 0]:
+                    continue
+                for v in range(low, high):
                     for u in range(j * STRIDE_PX, min((j + 1) * STRIDE_PX, depth.shape[1])):
                         if agree:
                             out[k, v, u] = known
@@ -134,33 +138,28 @@ def _sees(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v
     z = np.float64(depth[v, u])
     if not np.isfinite(z):
         return np.uint8(1)
-    x = (u - 0.5 * (depth.shape[1] - 1)) / focal * z
-    y = (v - 0.5 * (depth.shape[0] - 1)) / focal * z
+    x = (u - 0.5 * (depth.shape[1] - 1)) * (z / focal)
+    y = (v - 0.5 * (depth.shape[0] - 1)) * (z / focal)
     east = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
     north = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
     up = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-    col, row = (east - west) / spacing, (north - south) / spacing
+    per_m = 1 / spacing
+    col, row = (east - west) * per_m, (north - south) * per_m
     return np.uint8(0 if _blocked(height, tops, rises, col, row, up, lamp[0] - col, lamp[1] - row, lamp[2] - up) else 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _step(at, along, size):
-    """Of a way at + t along, in a lattice of lines `size` apart: the step of its cells, t from line to line."""
-    if along > 0:
-        return 1, size / along
-    if along < 0:
-        return -1, -size / along
-    return 0, np.inf
+def _lines(at, along, cell, size):
+    """Of a way at + t along, in a cell of a lattice of lines `size` apart.
 
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _next_line(at, along, cell, size):
-    """Where (t) a way that is in a cell of a lattice of lines `size` apart leaves it."""
-    if along > 0:
-        return ((cell + 1) * size - at) / along
-    if along < 0:
-        return (cell * size - at) / along
-    return np.inf
+    Returns:
+        Step of its cells; t where it meets the next line, and from line to line.
+    """
+    if along == 0:
+        return 0, np.inf, np.inf
+    per_along = 1 / along
+    step = 1 if along > 0 else -1
+    return step, ((cell + (along > 0)) * size - at) * per_along, step * size * per_along
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -170,13 +169,12 @@ def _blocked(height, tops, rises, x, y, z, dx, dy, dz):
     r = min(max(int(np.floor(y / BLOCK_CELLS)), 0), rows - 1)
     c = min(max(int(np.floor(x / BLOCK_CELLS)), 0), cols - 1)
     size = float(BLOCK_CELLS)
-    step_c, per_c = _step(x, dx, size)
-    step_r, per_r = _step(y, dy, size)
-    at_c, at_r = _next_line(x, dx, c, size), _next_line(y, dy, r, size)
-    t, rise, clear = 0.0, dz / max(np.hypot(dx, dy), 1e-12), True
+    step_c, at_c, per_c = _lines(x, dx, c, size)
+    step_r, at_r, per_r = _lines(y, dy, r, size)
+    t, clear = 0.0, dz > 0
     while t < 1 and 0 <= r < rows and 0 <= c < cols:
         leave = min(at_c, at_r, 1.0)
-        clear = clear and rises[r, c] < rise
+        clear = clear and rises[r, c] ** 2 * (dx * dx + dy * dy) < dz * dz
         if not clear and tops[r, c] > z + min(dz * t, dz * leave) + BIAS_M:
             if _blocked_in(height, x, y, z, dx, dy, dz, t, leave, r, c):
                 return True
@@ -196,9 +194,8 @@ def _blocked_in(height, x, y, z, dx, dy, dz, t, end, block_r, block_c):
     last_c = min(first_c + BLOCK_CELLS, height.shape[1] - 1) - 1
     r = min(max(int(np.floor(y + dy * t)), first_r), last_r)
     c = min(max(int(np.floor(x + dx * t)), first_c), last_c)
-    step_c, per_c = _step(x, dx, 1.0)
-    step_r, per_r = _step(y, dy, 1.0)
-    at_c, at_r = _next_line(x, dx, c, 1.0), _next_line(y, dy, r, 1.0)
+    step_c, at_c, per_c = _lines(x, dx, c, 1.0)
+    step_r, at_r, per_r = _lines(y, dy, r, 1.0)
     while first_r <= r <= last_r and first_c <= c <= last_c:
         across = dx - dy
         if across != 0.0:  # the cell's diagonal, from south-west to north-east

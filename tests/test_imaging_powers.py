@@ -1,0 +1,29 @@
+"""Powers of two by a polynomial: what they are against numpy's, and that nothing lost is nothing lost."""
+
+import numpy as np
+from numba import njit
+
+from twin.imaging.powers import LOG2_E, two_to
+
+
+@njit
+def powers(exponents):
+    out = np.empty_like(exponents)
+    for k in range(exponents.size):
+        out[k] = two_to(exponents[k])
+    return out
+
+
+def test_powers_are_those_of_numpy_to_the_last_digits():
+    exponents = np.concatenate([np.linspace(-126, 127, 100_001), np.linspace(-1e-3, 1e-3, 1001)]).astype(np.float32)
+    np.testing.assert_allclose(powers(exponents), np.exp2(exponents.astype(np.float64)), rtol=2e-7)
+    np.testing.assert_allclose(powers(np.array([LOG2_E], np.float32)), np.e, rtol=2e-7)
+
+
+def test_whole_exponents_are_exact_and_clear_water_takes_nothing():
+    whole = np.arange(-126, 128)
+    np.testing.assert_array_equal(powers(whole.astype(np.float32)), np.ldexp(1.0, whole))
+
+
+def test_what_is_lost_in_single_precision_stays_next_to_nothing():
+    assert (powers(np.array([-127, -1e4, -1e30, -np.inf], np.float32)) <= 2.0**-126).all()
