@@ -35,16 +35,17 @@ class Allocation(NamedTuple):
 
         A wrench beyond reach is scaled down as a whole: its direction is kept.
         """
-        return _commands(self.thrusts_from_wrench, self.thrust_table_n, self.command_table, wrench)
+        return share_out(self, wrench)
 
 
 @njit(cache=True, nogil=True)
-def _commands(thrusts_from_wrench, thrust_table, command_table, wrench):
-    thrusts = thrusts_from_wrench @ wrench
+def share_out(allocation, wrench):
+    """As `Allocation.commands`."""
+    thrusts, table = allocation.thrusts_from_wrench @ wrench, allocation.thrust_table_n
     load = 1.0
     for thrust in thrusts:
-        load = max(load, thrust / (thrust_table[-1] if thrust > 0 else thrust_table[0]))
-    return np.interp(thrusts / load, thrust_table, command_table), 1 / load
+        load = max(load, thrust / (table[-1] if thrust > 0 else table[0]))
+    return np.interp(thrusts / load, table, allocation.command_table), 1 / load
 
 
 def allocation(effects: Array, thrust_of_command: Callable[[Array], Array], weights: Array | None = None) -> Allocation:

@@ -17,12 +17,19 @@ _CIRCLE_POINTS = 181  # every second degree
 
 
 class Reference(NamedTuple):
-    """Where camera or body shall be in the world: position [m], velocity [m/s], yaw [rad], acceleration [m/s2]."""
+    """Where camera or body shall be in the world: position [m], velocity [m/s], yaw [rad], acceleration [m/s2].
+
+    At one time (3,), yaw (); or at n times (n, 3), yaw (n,).
+    """
 
     position: Array
     velocity: Array
-    yaw: float
+    yaw: Array | float
     acceleration: Array
+
+    def row(self, k: int) -> Reference:
+        """The k-th of n."""
+        return Reference(*(part[k] for part in self))  # type: ignore[index]
 
 
 class Line(NamedTuple):
@@ -37,11 +44,12 @@ class Line(NamedTuple):
         start = np.array(self.start)
         return np.stack([start, start + self.profile.length_m * np.array(self.direction)])
 
-    def at(self, time_s: float) -> Reference:
-        """Where the camera shall be at a time since the start, bow to the east; at rest before and after."""
-        travelled, speed, acceleration = self.profile.at(time_s)
+    def at(self, times_s: Array) -> Reference:
+        """Where the camera shall be at times (n,) since the start, bow to the east; at rest before and after."""
+        travelled, speed, acceleration = _along(self.profile, times_s)
         direction = np.array(self.direction)
-        return Reference(np.array(self.start) + travelled * direction, speed * direction, 0.0, acceleration * direction)
+        place = np.array(self.start) + travelled * direction
+        return Reference(place, speed * direction, np.zeros(len(times_s)), acceleration * direction)
 
 
 class Circle(NamedTuple):
@@ -55,16 +63,16 @@ class Circle(NamedTuple):
         """Points along it (n, 3) [m], close enough to draw and to bound it; the first is the last."""
         return self._around(np.linspace(0, 2 * np.pi, _CIRCLE_POINTS)) + np.array(self.centre)
 
-    def at(self, time_s: float) -> Reference:
-        """Where the camera shall be at a time since the start, bow to the east; at rest before and after."""
-        travelled, speed, acceleration = self.profile.at(time_s)
+    def at(self, times_s: Array) -> Reference:
+        """Where the camera shall be at times (n,) since the start, bow to the east; at rest before and after."""
+        travelled, speed, acceleration = _along(self.profile, times_s)
         radius_m = math.dist(self.start, self.centre)
-        outwards = self._around(np.array([travelled / radius_m]))[0] / radius_m
-        ahead = np.array([-outwards[1], outwards[0], 0.0])
+        outwards = self._around(travelled[:, 0] / radius_m) / radius_m
+        ahead = np.stack([-outwards[:, 1], outwards[:, 0], np.zeros(len(times_s))], axis=1)
         return Reference(
             np.array(self.centre) + radius_m * outwards,
             speed * ahead,
-            0.0,
+            np.zeros(len(times_s)),
             acceleration * ahead - speed**2 / radius_m * outwards,
         )
 
@@ -76,6 +84,11 @@ class Circle(NamedTuple):
 
 
 Segment = Line | Circle
+
+
+def _along(profile: SpeedProfile, times_s: Array) -> Array:
+    """Distance, speed and acceleration at times (n,): (3, n, 1) [m, m/s, m/s2]."""
+    return np.array([profile.at(t) for t in times_s.tolist()]).reshape(-1, 3).T[:, :, None]
 
 
 def line(start: Point, end: Point, cruise_mps: float, acceleration_mps2: float) -> Line:

@@ -119,12 +119,17 @@ class SurveyPlan:
 
     def reference(self, track: int, time_s: float) -> Reference:
         """Where the left camera shall be at a time since the start of a track (from 1); at rest before and after it."""
+        return self.references(track, np.array([time_s])).row(0)
+
+    def references(self, track: int, times_s: Array) -> Reference:
+        """The same at times (n,), rising."""
         *others, last = self.paths[track - 1]
+        parts, left_s = [], times_s
         for segment in others:
-            if time_s < segment.profile.duration_s:
-                return segment.at(time_s)
-            time_s -= segment.profile.duration_s
-        return last.at(time_s)
+            n = int(np.searchsorted(left_s, segment.profile.duration_s))
+            parts.append(segment.at(left_s[:n]))
+            left_s = left_s[n:] - segment.profile.duration_s
+        return Reference(*map(np.concatenate, zip(*parts, last.at(left_s), strict=True)))
 
 
 def frames_per_key(request: SurveyRequest, speed_mps: float) -> int:

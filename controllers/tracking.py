@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from controllers.allocation import Allocation
+from controllers.allocation import Allocation, share_out
 from controllers.segments import Reference
 
 Array = NDArray[np.float64]
@@ -63,15 +63,39 @@ def critical_gains(natural_frequency_radps: float) -> Gains:
 
 def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
     """Where a level body shall be so that a point of it (3,) [m, in the body] follows its own reference."""
-    c, s = np.cos(camera.yaw), np.sin(camera.yaw)
+    return camera._replace(position=camera.position - level_arm(float(camera.yaw), lever_arm_m))
+
+
+@njit(cache=True, nogil=True)
+def level_arm(yaw: float, lever_arm_m: Array) -> Array:
+    """From a level body to a point of it (3,) [m, in the body], in the world."""
+    c, s = np.cos(yaw), np.sin(yaw)
     forward, left, up = lever_arm_m
-    offset = np.array([c * forward - s * left, s * forward + c * left, up])
-    return camera._replace(position=camera.position - offset)
+    return np.array([c * forward - s * left, s * forward + c * left, up])
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
     """Velocity (3,) [m/s] that takes a point to its reference: along with it, and back to it in a time 1 / w."""
     return reference.velocity + natural_frequency_radps * (reference.position - position)
+
+
+class Steering(NamedTuple):
+    """What a pilot goes by.
+
+    Args:
+        hull: the believed hull.
+        allocation: of the thrusters.
+        gains: of its errors.
+        period_s: time between commands.
+        integral: (6,) of its errors [rad/s2 in the body, m/s2 in the world: currents and buoyancy do not turn with
+            us], changed in place.
+    """
+
+    hull: HullModel
+    allocation: Allocation
+    gains: Gains
+    period_s: float
+    integral: Array
 
 
 class Pilot:
@@ -85,11 +109,7 @@ class Pilot:
     """
 
     def __init__(self, hull: HullModel, allocation: Allocation, natural_frequency_radps: float, period_s: float):
-        self._hull, self._allocation, self._period_s = hull, allocation, period_s
-        self._gains = critical_gains(natural_frequency_radps)
-        self._integral = np.zeros(
-            6
-        )  # [rad/s2 in the body, m/s2 in the world]: currents and buoyancy do not turn with us
+        self.steering = Steering(hull, allocation, critical_gains(natural_frequency_radps), period_s, np.zeros(6))
 
     def command(self, world_from_body: Array, twist_body: Array, reference: Reference) -> Array:
         """Thruster commands in [-1, 1] (n,) for one period.
@@ -99,13 +119,21 @@ class Pilot:
             twist_body: (6,) estimated [angular, linear] velocity in the body [rad/s, m/s].
             reference: of the body, in the world.
         """
-        wrench, error = _wrench(
-            world_from_body, twist_body, reference.position, reference.velocity, reference.acceleration,
-            float(reference.yaw), self._hull, self._gains, self._integral,
+        return commanded(
+            self.steering, world_from_body, twist_body, reference.position, reference.velocity,
+            reference.acceleration, float(reference.yaw),
         )  # fmt: skip
-        commands, share = self._allocation.commands(wrench)
-        self._integral = _integrated(self._integral, self._gains.integral * self._period_s, error, share < 1)
-        return commands
+
+
+@njit(cache=True, nogil=True)
+def commanded(steering, pose, twist, position, velocity, acceleration, yaw):
+    """As `Pilot.command`."""
+    wrench, error = _wrench(
+        pose, twist, position, velocity, acceleration, yaw, steering.hull, steering.gains, steering.integral
+    )
+    commands, share = share_out(steering.allocation, wrench)
+    steering.integral[:] = _integrated(steering.integral, steering.gains.integral * steering.period_s, error, share < 1)
+    return commands
 
 
 @njit(cache=True, nogil=True)

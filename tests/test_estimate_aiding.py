@@ -11,7 +11,7 @@ from twin.estimate.alignment import align
 from twin.estimate.key_points import KeyPoint
 from twin.estimate.motion import Motion
 from twin.estimate.pose_filter import PoseFilter
-from twin.estimate.velocity_log import Displacement, VelocityLog, body_displacement, fuse
+from twin.estimate.velocity_log import Displacement, VelocityLog, body_displacement, fuse, logged
 from twin.records import Link, Readings, SensorNoise, Sighting, StereoRig
 
 MOUNT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
@@ -97,9 +97,16 @@ def test_a_frame_motion_and_a_displacement_are_fused_as_kalman_does():
     step = way + [1e-3, -2e-3, 5e-4]
     jacobian = numeric(lambda m: body_displacement(motion.a_from_b @ geometry.exp(m), MOUNT)[0], np.zeros(6))
     moved, after = dense_update(motion.cov, jacobian, step_cov, step - way)
-    fused = fuse(motion, step, step_cov, MOUNT)
-    np.testing.assert_allclose(geometry.log(geometry.inverse(motion.a_from_b) @ fused.a_from_b), moved, atol=1e-9)
-    np.testing.assert_allclose(fused.cov, after, atol=1e-11)
+    fused, cov = fuse(motion.a_from_b, motion.cov, step, step_cov, MOUNT)
+    np.testing.assert_allclose(geometry.log(geometry.inverse(motion.a_from_b) @ fused), moved, atol=1e-9)
+    np.testing.assert_allclose(cov, after, atol=1e-11)
+
+
+def aid(log, motion, velocity):
+    """The motion with what the log says of it."""
+    reading = np.full(3, np.nan) if velocity is None else velocity
+    fused, cov = logged(log.way, log.beams, motion.a_from_b, motion.cov, reading)
+    return motion._replace(a_from_b=fused, cov=cov)
 
 
 def sea_path(n):
@@ -120,13 +127,13 @@ def sea_path(n):
 def walk(poses, velocity, noise, motion_cov, rng=None):
     """The displacement that the log tells over a path whose attitude vision sees with this covariance."""
     log = VelocityLog(RIG, noise)
-    log.aid(Motion(np.eye(4), np.eye(6) * 1e-12, 100, 0.0), velocity[0])
+    aid(log, Motion(np.eye(4), np.eye(6) * 1e-12, 100, 0.0), velocity[0])
     log.at_node(0)
     root = np.linalg.cholesky(motion_cov)
     for a, b, v in zip(poses, poses[1:], velocity[1:], strict=False):
         true = geometry.inverse(a @ MOUNT) @ b @ MOUNT
         seen = true if rng is None else true @ geometry.exp(root @ rng.normal(size=6))
-        log.aid(Motion(seen, motion_cov, 100, 0.0), v)
+        aid(log, Motion(seen, motion_cov, 100, 0.0), v)
     return log.at_node(1)
 
 
@@ -159,11 +166,11 @@ def test_the_scale_error_of_a_straight_way_adds_up_frame_by_frame():
     scale_only = SensorNoise(0.01, 0.003, 0.01, dvl_mps=1e-9, dvl_scale=0.01)
     log, blind = VelocityLog(RIG, scale_only), np.eye(6)
     blind[:3, :3] *= 1e-16
-    log.aid(Motion(np.eye(4), blind, 0, 0.0), velocity[0])
+    aid(log, Motion(np.eye(4), blind, 0, 0.0), velocity[0])
     log.at_node(0)
     variance = 0.0
     for v in velocity[1:]:
-        fused = log.aid(Motion(np.eye(4), blind, 0, 0.0), v)
+        fused = aid(log, Motion(np.eye(4), blind, 0, 0.0), v)
         variance += (MOUNT[:3, :3] @ fused.cov[3:, 3:] @ MOUNT[:3, :3].T)[0, 0]
     assert np.sqrt(variance) == pytest.approx(0.01 * 0.3, rel=1e-4)  # a second at 0.3 m/s
 
@@ -171,21 +178,23 @@ def test_the_scale_error_of_a_straight_way_adds_up_frame_by_frame():
 def test_without_readings_the_motion_stays_and_no_displacement_is_told():
     log, motion = VelocityLog(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.01)), np.eye(6) * 1e-6, 100, 1.0)
     log.at_node(0)
-    assert log.aid(motion, None) is motion
+    unaided = aid(log, motion, None)
+    np.testing.assert_array_equal(unaided.a_from_b, motion.a_from_b)
+    np.testing.assert_array_equal(unaided.cov, motion.cov)
     assert log.at_node(1) is None
-    log.aid(motion, np.zeros(3))
+    aid(log, motion, np.zeros(3))
     log.at_node(2)
-    log.aid(motion, np.zeros(3))
+    aid(log, motion, np.zeros(3))
     assert log.at_node(3) is not None
-    log.aid(motion, None)
+    aid(log, motion, None)
     assert log.at_node(4) is None  # one reading lacks
 
 
 def test_vision_that_fails_leaves_the_motion_to_the_log():
     velocity = np.array([0.3, -0.1, 0.05])
     log, blind = VelocityLog(RIG, NOISE), Motion(np.eye(4), np.diag([1e-10] * 3 + [1e-2] * 3), 0, np.inf)
-    log.aid(blind, velocity)
-    fused = log.aid(blind, velocity)
+    aid(log, blind, velocity)
+    fused = aid(log, blind, velocity)
     np.testing.assert_allclose(body_displacement(fused.a_from_b, MOUNT)[0], velocity / 30, atol=1e-5)
 
 

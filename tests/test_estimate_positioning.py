@@ -18,7 +18,7 @@ from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.estimate.mosaic import Mosaic, Registration
 from twin.estimate.motion import Motion
 from twin.estimate.pipeline import Navigator
-from twin.estimate.pose_filter import PoseFilter
+from twin.estimate.pose_filter import PoseFilter, aided
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.records import Frame, Link, Readings, SensorNoise
 
@@ -291,10 +291,8 @@ def test_pressure_corrects_height_alone_and_by_the_weight_of_its_noise():
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([1.0, 2.0, 3.0]))
     believed = PoseFilter(pose, RIG, SensorNoise(0.01, 0.003, 0.01))
     believed.cov = np.diag([1e-8] * 3 + [1e-4] * 3)
-    believed.aid(Readings(pressure_z_m=3.02))
-    np.testing.assert_allclose(
-        believed.world_from_camera[:3, 3], [1.0, 2.0, 3.01], atol=1e-6
-    )  # equal variances: half way
+    after, _ = aided(pose, believed.cov, believed.level, 3.02, np.full(3, np.nan))
+    np.testing.assert_allclose(after[:3, 3], [1.0, 2.0, 3.01], atol=1e-6)  # equal variances: half way
 
 
 def test_a_correction_beyond_both_uncertainties_is_refused():
@@ -350,7 +348,8 @@ class Script:
     """A camera that answers the navigator with the motions between given poses, true or noisy, each a key point."""
 
     def __init__(self, poses, blind=(), correction=None, rng=None):
-        self.poses, self.blind, self.correction, self.rng, self.row = poses, blind, correction, rng, -1
+        self.poses, self.blind, self.correction, self.rng = poses, blind, correction, rng
+        self.row, self.looks = -1, []
 
     def step(self, frame):
         self.row = frame.index

@@ -119,3 +119,21 @@ def test_the_summary_has_plain_numbers_only(found):
     summary = findings.summary(found, {"name": "study"})
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     assert summary["surveys"] == summary["complete"] + summary["aborted"] + summary["refused"] + summary["failed"]
+
+
+def test_what_cameras_saw_counts_for_surveys_that_broke_off_and_missing_contrast_is_not_shown(tmp_path):
+    shown = 'show = ["map.le90_m", "vision.points_median", "vision.contrast_median"]'
+    study = study_of(tmp_path, STUDY, ('show = ["map.le90_m"]', shown), ("samples = 12", "samples = 40"))
+
+    def see(survey):
+        points = 400.0 if survey.values["water.turbidity"] < 25 else 3.0
+        return fly(survey) | {"vision.points_median": points, "vision.contrast_median": None}
+
+    found = found_of(study, tmp_path, see)
+    aborted = found.status == "aborted"
+    assert aborted.any()
+    assert found.counted("vision.points_median").all()
+    assert not found.counted("map.le90_m")[aborted].any()
+    assert found.metrics == ["map.le90_m", "vision.points_median"]
+    rising = {f.metric: f.correlation.value for f in found.influences if f.key == "water.turbidity"}
+    assert rising["vision.points_median"] < -0.5 < 0.5 < rising["map.le90_m"]

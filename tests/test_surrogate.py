@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twin import geometry, survey
-from twin.errors import ScenarioError, TwinError
+from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.mission import prepare
 from twin.scenario_file import load_scenario
 from twin.surrogate import calibration
@@ -103,7 +103,7 @@ def test_a_link_is_the_same_whatever_was_measured_before_it(reef):
     poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
     vision = vision_beside(reef, ErrorModel(), lambda: poses[at[0]], Stopwatch())
     first = linked(vision, at)
-    vision._draw()
+    vision.draw(1)
     np.testing.assert_array_equal(vision._link(vision._now, vision._seen[0], 1, 0).a_from_b, first.a_from_b)
 
 
@@ -250,3 +250,36 @@ def witnessed(flown, true, seed):
     result = navigator.finish()
     witness.map(result, flown.grid, np.zeros((len(result.key_frames), 6, 6)), lambda _: None)
     return witness.notes
+
+
+@pytest.mark.parametrize("aiding", ['["pressure", "ahrs", "dvl"]', "[]"])
+def test_frames_at_once_are_what_they_are_one_by_one(aiding, monkeypatch, tmp_path):
+    """The compiled loop takes every step that a single frame takes, and draws the same numbers for it."""
+    flown = mission(f"navigation.aiding={aiding}", "plan.tracks=1")
+
+    def fly():
+        with survey.open_sea(flown, Stopwatch()) as sea:
+            navigator = survey.make_navigator(flown, survey.vision_in(sea, tmp_path), Stopwatch())
+            survey.fly(flown, sea, navigator, lambda *_: None)
+            return sea.truth().trajectory, navigator.finish()
+
+    true, at_once = fly()
+    monkeypatch.setattr(SurrogateSea, "glide", lambda *_: None)
+    true_single, single = fly()
+    np.testing.assert_array_equal(true.world_from_camera, true_single.world_from_camera)
+    for name in ("f2f", "online", "final"):
+        ours, theirs = getattr(at_once, name), getattr(single, name)
+        np.testing.assert_array_equal(ours.times_s, theirs.times_s)
+        np.testing.assert_array_equal(ours.world_from_camera, theirs.world_from_camera)
+
+
+def test_where_the_physics_diverges_frames_at_once_end_and_say_so():
+    flown = mission()
+    with survey.open_sea(flown, Stopwatch()) as sea:
+        navigator, pilot = survey.make_navigator(flown, sea.vision, Stopwatch()), survey.make_pilot(flown)
+        course, glide = flown.fly(1), sea.glide(navigator, pilot)
+        navigator.update(sea.observe(course[0], 1), 1)
+        sea.vehicle.body.velocity[0] = np.nan
+        with pytest.raises(SurveyAborted, match="the physics diverged at"):
+            glide(course, 1, 1)
+        assert len(sea) == len(navigator.times_s) == 2  # the frame that showed it is kept

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin import records, run_writer, scenario_file, sea, survey
+from twin import records, scenario_file, sea, survey
 from twin.errors import ScenarioError, SurveyAborted
 from twin.mission import prepare
 from twin.timing import Stopwatch
@@ -28,7 +28,7 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         if not report:
-            patch.setattr(run_writer, "write_report", lambda *_: None)
+            patch.setattr("twin.judge.report.write_report", lambda *_: None)
         return survey.run(scenario, out, progress)
 
 

@@ -175,9 +175,10 @@ def rpy_from_rotation(rotation: Array) -> Array:
     return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
-def wrap_angle(angle: Array | float) -> Array:
-    """The same angle in [-pi, pi) (rad)."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+@njit(cache=True, nogil=True)
+def wrap_angle(angle: Array) -> Array:
+    """The same angles in [-pi, pi) (rad)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def quaternion_wxyz(rotation: Array) -> Array:

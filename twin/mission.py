@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import terrains
 from controllers import lawnmower, loops, segments
@@ -36,6 +36,27 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Course:
+    """Frames that follow one another: a sequence of steps.
+
+    Args:
+        reference: of the left camera, at each.
+        key_point: (n,) bool.
+        holding: whether they keep station.
+    """
+
+    reference: segments.Reference
+    key_point: NDArray[np.bool_]
+    holding: bool
+
+    def __len__(self) -> int:
+        return len(self.key_point)
+
+    def __getitem__(self, k: int) -> Step:
+        return Step(self.reference.row(k), bool(self.key_point[k]), self.holding)
+
+
+@dataclass(frozen=True)
 class Mission:
     """A checked survey."""
 
@@ -56,16 +77,16 @@ class Mission:
         """(4, 4) world_from_body there."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
-    def fly(self, track: int) -> Iterator[Step]:
+    def fly(self, track: int) -> Course:
         """The frames of a track (from 1); every N-th is a key point, and the last one."""
-        for time_s, key_point in self.plan.frames_of_track(track):
-            yield Step(self.plan.reference(track, time_s), key_point, False)
+        times_s, key_points = zip(*self.plan.frames_of_track(track), strict=True)
+        return Course(self.plan.references(track, np.array(times_s)), np.array(key_points), holding=False)
 
-    def hold(self, track: int) -> Iterator[Step]:
+    def hold(self, track: int) -> Course:
         """The frames of half the station keeping after a track."""
-        end = self.plan.reference(track, self.plan.track_duration_s(track))
-        for _ in range(self._n_holding):
-            yield Step(end, False, True)
+        n = self._n_holding
+        end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
+        return Course(end, np.zeros(n, np.bool_), holding=True)
 
     @property
     def _n_holding(self) -> int:

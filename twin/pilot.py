@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from controllers.segments import Reference
-from controllers.tracking import body_reference, commanded_velocity
+from controllers.tracking import Steering, commanded, commanded_velocity, level_arm
 from twin import geometry
 from twin.geometry import Array
 from twin.mission import Mission
@@ -22,7 +24,7 @@ PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
     """A pilot that flies on estimates alone: (estimate of the left camera, its reference) -> command of the vehicle."""
-    return _rov_pilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
+    return RovPilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
 
 
 def _carrier_pilot(mission: Mission) -> PilotOfEstimates:
@@ -35,19 +37,49 @@ def _carrier_pilot(mission: Mission) -> PilotOfEstimates:
     return command
 
 
-def _rov_pilot(mission: Mission) -> PilotOfEstimates:
+class Helm(NamedTuple):
+    """What the pilot of the ROV goes by.
+
+    Args:
+        camera_from_body, to_body: (4, 4) of the body, and (6, 6) that carries a twist of the camera to the body.
+        lever_arm_m: (3,) of the camera in the body.
+        smoothing: share of a new velocity.
+        twist: (6,) smoothed, of the body, changed in place.
+        steering: of the body.
+    """
+
+    camera_from_body: Array
+    to_body: Array
+    lever_arm_m: Array
+    smoothing: float
+    twist: Array
+    steering: Steering
+
+
+class RovPilot:
     """The pilot of the ROV: -> thruster commands (8,), -1 to 1."""
-    rig = mission.rig
-    camera_from_body = geometry.inverse(rig.body_from_camera)
-    to_body = geometry.adjoint(rig.body_from_camera)
-    smoothing = 1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz)
-    pilot = nominal_pilot(mission.scenario.control.natural_frequency_radps, rig.frame_rate_hz)
-    twist = np.zeros(6)
 
-    def command(estimate: Estimate, reference: Reference) -> Array:
-        nonlocal twist
-        twist = twist + smoothing * (to_body @ estimate.camera_velocity - twist)
-        body = estimate.world_from_camera @ camera_from_body
-        return pilot.command(body, twist, body_reference(reference, rig.body_from_camera[:3, 3]))
+    def __init__(self, mission: Mission):
+        rig = mission.rig
+        self.helm = Helm(
+            camera_from_body=geometry.inverse(rig.body_from_camera),
+            to_body=geometry.adjoint(rig.body_from_camera),
+            lever_arm_m=rig.body_from_camera[:3, 3].copy(),
+            smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
+            twist=np.zeros(6),
+            steering=nominal_pilot(mission.scenario.control.natural_frequency_radps, rig.frame_rate_hz).steering,
+        )
 
-    return command
+    def __call__(self, estimate: Estimate, reference: Reference) -> Array:
+        return steer(
+            self.helm, estimate.world_from_camera, estimate.camera_velocity, reference.position, reference.velocity,
+            reference.acceleration, float(reference.yaw),
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def steer(helm, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
+    """Commands for an estimated pose (4, 4) and twist (6,) of the camera, and its reference."""
+    helm.twist[:] = helm.twist + helm.smoothing * (helm.to_body @ camera_velocity - helm.twist)
+    body, place = world_from_camera @ helm.camera_from_body, position - level_arm(yaw, helm.lever_arm_m)
+    return commanded(helm.steering, body, helm.twist, place, velocity, acceleration, yaw)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from twin import geometry
 
@@ -172,6 +172,31 @@ class Trajectory:
         return Trajectory(rows[:, 0], poses)
 
 
+class Rows:
+    """Rows of one shape, one after another in one array; its room doubles when it is full."""
+
+    def __init__(self, *shape: int, kind: type = float):
+        self._room, self._n = np.empty((64, *shape), kind), 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    @property
+    def array(self) -> NDArray[Any]:
+        """All of them so far (n, *shape), a view."""
+        return self._room[: self._n]
+
+    def add(self, rows: ArrayLike) -> None:
+        """Adds one row (*shape) or more (k, *shape)."""
+        rows = np.asarray(rows).reshape(-1, *self._room.shape[1:])
+        end = self._n + len(rows)
+        if end > len(self._room):
+            grown = np.empty((max(end, 2 * len(self._room)), *self._room.shape[1:]), self._room.dtype)
+            grown[: self._n] = self.array
+            self._room = grown
+        self._room[self._n : end], self._n = rows, end
+
+
 class Link(NamedTuple):
     """One connection of the key-point network: the measured motion between two nodes.
 
@@ -210,6 +235,20 @@ class Alignment(NamedTuple):
     dropped: int
 
 
+class Look(NamedTuple):
+    """What a look with both eyes had to go by, whether it made a key point or not.
+
+    Args:
+        row: frame of the trajectory.
+        n_points: matched points; of a surrogate, those it stands for.
+        contrast: of the left image (`matching.contrast`); None where there is no image.
+    """
+
+    row: int
+    n_points: int
+    contrast: float | None
+
+
 @dataclass
 class SurveyResult:
     """What the estimators leave behind: the three trajectories, the network and the map.
@@ -217,6 +256,7 @@ class SurveyResult:
     ``key_frames`` are the rows of the trajectories that are key points; ``track_of_key`` the track (from 1) of each.
     ``node_cov`` (n_keys, 6, 6) is the marginal covariance of each final key-point pose, in the camera.
     ``before_ga``/``after_ga`` hold per track the key-point poses (n, 4, 4) just before and after its alignment.
+    ``looks`` are all with both eyes, also those that found too little for a key point.
     """
 
     f2f: Trajectory
@@ -229,6 +269,7 @@ class SurveyResult:
     alignments: list[Alignment] = field(default_factory=list)
     before_ga: list[Array] = field(default_factory=list)
     after_ga: list[Array] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from twin import scenario_file, view
+from twin import scenario_file
 from twin.errors import TwinError
-from twin.exchange import geotiff, mesh, posegraph
-from twin.judge.report import write_report
+from twin.exchange import posegraph
 from twin.mission import Mission
 from twin.records import ElevationMap, SurveyResult, Trajectory, Truth
 from twin.timing import Stopwatch
@@ -29,12 +28,13 @@ class RunFolder:
 
     Args:
         shows: which of `PICTURES` are drawn when all is over; in a study, drawing takes longer than a short flight.
+            None: nobody looks at paths and maps either, and they are not written.
 
     Raises:
         TwinError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, mission: Mission, shows: Collection[str] = PICTURES):
+    def __init__(self, folder: Path, mission: Mission, shows: Collection[str] | None = PICTURES):
         self.path, self._reserve, self._shows = folder, folder / ".reserve", shows
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -81,18 +81,27 @@ class RunFolder:
         waiting = ".metrics.json.part"
         self._write(waiting, json.dumps(metrics, indent=1))
         try:
-            self._write_paths(mission, result, truth, watch)
-            self._write_maps(elevation, truth, mission)
-            if "report" in self._shows:
-                write_report(self.path, metrics)
-            if "recording" in self._shows:
-                view.write_recording(self.path, metrics)
+            if self._shows is not None:
+                self._write_paths(mission, result, truth, watch)
+                self._write_maps(elevation, truth, mission)
+                self._draw(self._shows, metrics)
         except OSError as error:
             metrics = metrics | {"status": "aborted", "reason": metrics["reason"] or str(error)}
             self._write(waiting, json.dumps(metrics, indent=1))
         (self.path / waiting).replace(self.path / "metrics.json")
         self.log(metrics["status"], reason=metrics["reason"])
         return metrics
+
+    def _draw(self, shows: Collection[str], metrics: dict[str, Any]) -> None:
+        """Report and recording; what draws them is loaded now."""
+        if "report" in shows:
+            from twin.judge import report
+
+            report.write_report(self.path, metrics)
+        if "recording" in shows:
+            from twin import view
+
+            view.write_recording(self.path, metrics)
 
     def _write(self, name: str, text: str) -> None:
         (self.path / name).write_text(text, encoding="utf-8")
@@ -108,6 +117,7 @@ class RunFolder:
         index = {
             "frames": result.key_frames.tolist(),
             "tracks": result.track_of_key.tolist(),
+            "looks": [look._asdict() for look in result.looks],
             "n_per_key": mission.plan.n_frames_per_key,
             "timing_ms": {stage: watch.durations_ms(stage) for stage in ("f2f", "stereo")},
         }
@@ -115,6 +125,8 @@ class RunFolder:
         self._write("keypoints/index.json", json.dumps(index))
 
     def _write_maps(self, elevation: ElevationMap | None, truth: Truth, mission: Mission) -> None:
+        from twin.exchange import geotiff, mesh
+
         geotiff.write_layer(self.path / "dem_truth.tif", truth.height_m, mission.grid, "true elevation [m]")
         if elevation is None:
             return

@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import scenes.builder
+from twin.estimate.pipeline import Navigator
 from twin.estimate.vision import Vision
 from twin.geometry import Array
 from twin.imaging.camera import StereoCamera
 from twin.imaging.light import Light
 from twin.imaging.renderer import Renderer
 from twin.judge.coverage import Coverage, true_heights
-from twin.mission import Mission, Step
-from twin.records import Frame, Image, Trajectory, Truth
+from twin.mission import Course, Mission, Step
+from twin.pilot import PilotOfEstimates
+from twin.records import Frame, Image, Rows, Trajectory, Truth
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
 from twin.simulate.sensors import NavigationSensors
@@ -30,6 +32,8 @@ _STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons", "sn
 
 
 Watch = Callable[[str], AbstractContextManager[None]]
+#: Flies the frames of a course from this one on, up to the next key point, on this track; returns the next frame.
+Glide = Callable[[Course, int, int], int]
 
 
 class Sight(NamedTuple):
@@ -55,8 +59,8 @@ class Sea(ABC):
         self, mission: Mission, watch: Watch, vehicle: Vehicle | FreeBody | Carrier, sensors: NavigationSensors
     ):
         self.mission, self.watch, self.vehicle, self.sensors = mission, watch, vehicle, sensors
-        self.true_poses: list[Array] = []
-        self.steps: list[tuple[int, Step]] = []
+        self._true_poses, self._references = Rows(4, 4), Rows(3)
+        self._holding, self._tracks = Rows(kind=bool), Rows(kind=int)
 
     def __enter__(self) -> Self:
         return self
@@ -83,10 +87,8 @@ class Sea(ABC):
 
     def observe(self, step: Step, track: int) -> Frame:
         """What the vehicle sees now; the truth of it is kept here."""
-        index = len(self.true_poses)
-        sight = self.look(step)
-        self.true_poses.append(self.world_from_camera)
-        self.steps.append((track, step))
+        index, sight = len(self), self.look(step)
+        self.record(self.world_from_camera, step.reference.position, step.holding, track)
         time_s = index / self.mission.rig.frame_rate_hz
         depth_m = sight.depth_m if step.key_point else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
@@ -97,15 +99,31 @@ class Sea(ABC):
         with self.watch("physics"):
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
+    def __len__(self) -> int:
+        """Frames so far."""
+        return len(self._true_poses)
+
+    def record(self, poses: Array, references: Array, holding: bool, track: int) -> None:
+        """Keeps the truth of one frame or more: true poses (4, 4) or (n, 4, 4), planned positions (3,) or (n, 3)."""
+        n = len(self)
+        self._true_poses.add(poses)
+        n = len(self) - n
+        self._references.add(references)
+        self._holding.add(np.full(n, holding))
+        self._tracks.add(np.full(n, track))
+
+    def glide(self, navigator: Navigator, pilot: PilotOfEstimates) -> Glide | None:
+        """The closed loop over many frames at once, for a world that needs no image of them; None: frame by frame."""
+        return None
+
     def truth(self) -> Truth:
         """All that the judge needs."""
-        n = len(self.true_poses)
-        times = np.arange(n) / self.mission.rig.frame_rate_hz
+        n = len(self)
         return Truth(
-            trajectory=Trajectory(times, np.array(self.true_poses).reshape(n, 4, 4)),
-            reference=np.array([s.reference.position for _, s in self.steps]).reshape(n, 3),
-            holding=np.array([s.holding for _, s in self.steps], dtype=bool),
-            track=np.array([track for track, _ in self.steps], dtype=np.int64),
+            trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
+            reference=self._references.array,
+            holding=self._holding.array,
+            track=self._tracks.array,
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
         )

@@ -11,7 +11,7 @@ from twin.config import Scenario
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
 from twin.estimate.vision import StereoVision, Vision
-from twin.mission import Mission, Step, prepare
+from twin.mission import Course, Mission, Step, prepare
 from twin.pilot import make_pilot
 from twin.records import Estimate
 from twin.results import RunResult, conclude
@@ -37,12 +37,12 @@ def run(
     out: Path,
     progress: Callable[[Progress], None] = lambda _: None,
     live: bool = False,
-    shows: Collection[str] = PICTURES,
+    shows: Collection[str] | None = PICTURES,
 ) -> RunResult:
     """Flies a scenario and leaves a run folder; an aborted survey keeps what it has.
 
     Args:
-        shows: what is drawn of it in the end, "report" and "recording".
+        shows: what is drawn of it in the end, "report" and "recording"; None: its figures alone are wanted.
 
     Raises:
         ScenarioError: the survey cannot be flown as asked; nothing was written.
@@ -67,21 +67,22 @@ def run(
 def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Step, Estimate, Any], None]) -> None:
     """The closed loop: what the vehicle sees moves what it believes, what it believes moves the vehicle."""
     pilot = make_pilot(mission)
+    glide = sea.glide(navigator, pilot)
 
-    def steer(step: Step, track: int) -> None:
-        frame = sea.observe(step, track)
-        estimate = navigator.update(frame, track)
-        watcher(step, estimate, frame)
-        sea.act(pilot(estimate, step.reference))
+    def follow(course: Course, track: int) -> None:
+        k = 0
+        while k < len(course):
+            frame = sea.observe(course[k], track)
+            estimate = navigator.update(frame, track)
+            watcher(course[k], estimate, frame)
+            sea.act(pilot(estimate, course[k].reference))
+            k = k + 1 if glide is None else glide(course, k + 1, track)
 
     for track in mission.tracks:
-        for step in mission.fly(track):
-            steer(step, track)
-        for step in mission.hold(track):
-            steer(step, track)
+        follow(mission.fly(track), track)
+        follow(mission.hold(track), track)
         navigator.align_track(track)  # while the vehicle keeps station
-        for step in mission.hold(track):
-            steer(step, track)
+        follow(mission.hold(track), track)
 
 
 def open_sea(mission: Mission, watch: Stopwatch) -> Sea:
@@ -108,7 +109,8 @@ def image_vision(mission: Mission, folder: Path, watch: Watch) -> StereoVision:
 def make_navigator(mission: Mission, vision: Vision, watch: Stopwatch) -> Navigator:
     """The estimators with all they may know: calibration, data sheets, settings, the planned start."""
     scenario = mission.scenario
-    return Navigator(vision, mission.rig, scenario.believed_noise(), scenario.estimate, mission.start, watch)
+    noise, beside = scenario.believed_noise(), scenario.imaging.fidelity == "rendered"
+    return Navigator(vision, mission.rig, noise, scenario.estimate, mission.start, watch, beside)
 
 
 class _Watcher:
@@ -123,10 +125,9 @@ class _Watcher:
             from twin.view import Live
 
             self.live = Live(mission.rig)
-        self.blind, self.count, self.status = 0, 0, "ok"
+        self.blind, self.status = 0, "ok"
 
     def __call__(self, step: Step, estimate: Estimate, frame) -> None:
-        self.count += 1
         self.blind = 0 if estimate.status == "ok" else self.blind + 1
         if estimate.status != self.status:
             self.folder.log("vision", time_s=estimate.time_s, status=estimate.status)
@@ -134,6 +135,7 @@ class _Watcher:
         if self.live is not None:
             self.live.log_frame(frame, estimate)
         wall_s = time.perf_counter() - self.begun
-        self.progress(Progress(estimate.time_s, wall_s, self.count / self.n_frames, estimate.sigma_m, "survey"))
+        share = (frame.index + 1) / self.n_frames
+        self.progress(Progress(estimate.time_s, wall_s, share, estimate.sigma_m, "survey"))
         if self.blind > _PATIENCE_S * self.rate_hz:
             raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")

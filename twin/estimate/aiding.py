@@ -34,28 +34,33 @@ def add_readings(
 ) -> None:
     """Adds a factor for each reading of the nodes, and the beacons and the scale error that they tell of."""
     camera_from_body = geometry.inverse(rig.body_from_camera)
+    height = gtsam.noiseModel.Diagonal.Sigmas(np.array([_FREE_M, _FREE_M, noise.pressure_m]))
+    attitude = gaussian(pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1])  # the same for every reading
     for node in nodes:
-        _add_height(graph, node, noise)
-        _add_attitude(graph, node, camera_from_body, noise)
+        _add_height(graph, node, height)
+        _add_attitude(graph, node, camera_from_body, noise, attitude)
         _add_fix(graph, node, noise)
     _add_beacons(graph, start, nodes, rig, noise)
     _add_displacements(graph, start, nodes, rig, noise)
 
 
-def _add_height(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, noise: SensorNoise) -> None:
+def _add_height(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, model: gtsam.noiseModel.Diagonal) -> None:
     if node.readings.pressure_z_m is not None:
         position = node.world_from_camera[:3, 3].copy()
         position[2] = node.readings.pressure_z_m
-        sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array([_FREE_M, _FREE_M, noise.pressure_m]))
-        graph.add(gtsam.GPSFactor(node.number, position, sigmas))
+        graph.add(gtsam.GPSFactor(node.number, position, model))
 
 
 def _add_attitude(
-    graph: gtsam.NonlinearFactorGraph, node: KeyPoint, camera_from_body: Array, noise: SensorNoise
+    graph: gtsam.NonlinearFactorGraph,
+    node: KeyPoint,
+    camera_from_body: Array,
+    noise: SensorNoise,
+    model: gtsam.noiseModel.Gaussian,
 ) -> None:
     if node.readings.ahrs_rpy_rad is not None:
-        rotation, cov = pose_filter.attitude(node.readings.ahrs_rpy_rad, camera_from_body, noise)
-        graph.add(gtsam.PoseRotationPrior3D(node.number, gtsam.Rot3(rotation), gaussian(cov)))
+        rotation, _ = pose_filter.attitude(node.readings.ahrs_rpy_rad, camera_from_body, noise)
+        graph.add(gtsam.PoseRotationPrior3D(node.number, gtsam.Rot3(rotation), model))
 
 
 def _add_fix(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, noise: SensorNoise) -> None:

@@ -29,6 +29,10 @@ _FEW_ITERATIONS = 10  # of a round: with gross links in, Huber's weights settle 
 _HUBER = 3.0
 
 
+#: Of links, by the numbers of their nodes.
+Factors = dict[tuple[int, int], gtsam.BetweenFactorPose3]
+
+
 class Aligned(NamedTuple):
     """Poses (n, 4, 4) and marginal covariances (n, 6, 6) of the nodes asked for, and the links that were dropped."""
 
@@ -44,6 +48,7 @@ def align(
     rig: StereoRig,
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
+    factors: Factors | None = None,
 ) -> Aligned:
     """Aligns a window of nodes.
 
@@ -53,9 +58,10 @@ def align(
         anchors: number of each held node: its covariance (6, 6) [rotation, translation].
         rig, noise: calibration as believed.
         marginals_of: numbers of the nodes whose covariance is wanted; all if None, zeros for the others.
+        factors: of links aligned before, by their ends; those of new ones are added.
     """
     graph, values = _without_links(nodes, anchors, rig, noise)
-    fit = _Fit(graph, list(links), pose_graph.between_factors(links, _HUBER))
+    fit = _Fit(graph, list(links), _factors_of(links, {} if factors is None else factors))
     dropped: list[Link] = []
     reached = False
     for _ in range(_ROUNDS):
@@ -104,6 +110,13 @@ class _Fit(NamedTuple):
     def without(self, wrong: Mask) -> _Fit:
         rows = np.flatnonzero(~wrong)
         return _Fit(self.of_nodes, [self.links[k] for k in rows], [self.of_links[k] for k in rows])
+
+
+def _factors_of(links: Sequence[Link], known: Factors) -> list[gtsam.BetweenFactorPose3]:
+    """A factor of each link: windows share most of theirs."""
+    new = [link for link in links if (link.i, link.j) not in known]
+    known.update(zip(((link.i, link.j) for link in new), pose_graph.between_factors(new, _HUBER), strict=True))
+    return [known[link.i, link.j] for link in links]
 
 
 def _without_links(nodes, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

@@ -34,14 +34,30 @@ def normalise(rgb: Image, binning: int = 1) -> Image:
     Returns:
         (height / binning, width / binning) uint8, local mean 128, local deviation about 36 grey levels.
     """
+    gray, mean, square = _levels(rgb, binning)
+    even = np.empty(gray.shape, np.uint8)
+    _even(gray.ravel(), mean.ravel(), square.ravel(), even.ravel())
+    return even
+
+
+def contrast(rgb: Image, binning: int = 1) -> float:
+    """RMS contrast of what is matched: deviation of grey levels around a place over their mean, median over the image.
+
+    Before it is made even by `normalise`. Noise counts as well: in the dark, and in thick water, little else is left.
+    """
+    _, mean, square = (level[::4, ::4] for level in _levels(rgb, binning))
+    deviation = np.sqrt(np.maximum(square - mean**2, 0))
+    return float(np.median(deviation / np.maximum(mean, 1.0)))
+
+
+def _levels(rgb: Image, binning: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Grey levels, hardly smoothed; their mean and mean square in the window around, an eighth of the image wide."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     gray = cv2.GaussianBlur(binned(gray, binning), (3, 3), _SMOOTH_PX)
     size = (gray.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
     square = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
-    even = np.empty(gray.shape, np.uint8)
-    _even(gray.ravel(), mean.ravel(), square.ravel(), even.ravel())
-    return even
+    return np.asarray(gray, np.float32), np.asarray(mean, np.float32), np.asarray(square, np.float32)
 
 
 def binned(image: Pixels, by: int) -> Pixels:

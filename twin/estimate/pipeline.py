@@ -6,9 +6,10 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -16,14 +17,15 @@ from twin import geometry
 from twin.config import Estimation
 from twin.errors import SurveyAborted
 from twin.estimate import network
-from twin.estimate.alignment import Aligned, align
+from twin.estimate.alignment import Aligned, Factors, align
 from twin.estimate.key_points import KeyPoint
 from twin.estimate.pose_filter import PoseFilter, carried, clipped
+from twin.estimate.reckoning import Instruments, Reckoning, reckon, said
 from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.estimate.vision import Vision
 from twin.geometry import Array
-from twin.records import Alignment, Estimate, Frame, Link, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.records import Alignment, Estimate, Frame, Link, Rows, SensorNoise, StereoRig, SurveyResult, Trajectory
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
@@ -41,6 +43,7 @@ class Navigator:
         settings: the scenario's [estimate].
         start: (4, 4) world_from_camera of the reference position, where the survey begins by plan.
         watch: context manager per stage name.
+        beside: links are measured by a thread beside the flight: worth it where images take long.
     """
 
     def __init__(
@@ -51,6 +54,7 @@ class Navigator:
         settings: Estimation,
         start: Array,
         watch: Callable[[str], AbstractContextManager[None]],
+        beside: bool = True,
     ):
         self.vision, self.rig, self.noise, self.settings, self.watch = vision, rig, noise, settings, watch
         self.velocity_log = VelocityLog(rig, noise)
@@ -63,11 +67,10 @@ class Navigator:
         self.nodes: list[KeyPoint] = []
         self.node_poses = np.empty((64, 4, 4))  # theirs, and room for more
         self.links: list[Link] = []
-        self.measuring: deque[Future[list[Link]]] = deque()
-        self.behind = ThreadPoolExecutor(1)
-        self.times_s: list[float] = []
-        self.f2f_poses: list[Array] = []
-        self.online_poses: list[Array] = []
+        self.measuring: deque[Callable[[], list[Link]]] = deque()
+        self.behind = ThreadPoolExecutor(1) if beside else None
+        self.times_s, self.f2f_poses, self.online_poses = Rows(), Rows(4, 4), Rows(4, 4)
+        self.factors: Factors = {}
         self.dropped: list[Link] = []
         self.alignments: list[Alignment] = []
         self.before_ga: list[Array] = []
@@ -76,15 +79,37 @@ class Navigator:
     def update(self, frame: Frame, track: int) -> Estimate:
         """Takes one frame; a frame with a right image is a key point of the track (from 1)."""
         seen, status = self.vision.step(frame)
-        self.f2f_pose = self.f2f_pose @ seen.a_from_b
-        motion = self.velocity_log.aid(seen, frame.readings.dvl_mps)
-        self.filter.predict(motion.a_from_b, motion.cov)
-        relative, cov = self.since_node
-        self.since_node = (relative @ motion.a_from_b, carried(cov, motion.a_from_b) + motion.cov)
-        self.filter.aid(frame.readings)
+        reckoned, moved = reckon(self.reckoning, self.instruments, seen.a_from_b, seen.cov, *said(frame.readings))
+        self.go_on(reckoned)
         if frame.right is not None:
             status = self._visit_key_point(frame, track, status)
-        return self._record(frame, geometry.log(motion.a_from_b) * self.rig.frame_rate_hz, status)
+        online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
+        self.record(frame.time_s, f2f, online)
+        velocity = geometry.log(moved) * self.rig.frame_rate_hz
+        sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
+        return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
+
+    @property
+    def reckoning(self) -> Reckoning:
+        """Where the frames have led so far."""
+        believed = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
+        return Reckoning(self.f2f_pose, *believed, *self.since_node)
+
+    @property
+    def instruments(self) -> Instruments:
+        """What speaks at every frame."""
+        return Instruments(self.filter.level, self.velocity_log.beams, self.velocity_log.way)
+
+    def go_on(self, reckoned: Reckoning) -> None:
+        """Takes over where frames have led."""
+        self.f2f_pose, self.since_node = reckoned.f2f, (reckoned.walked, reckoned.walked_cov)
+        self.filter.world_from_camera, self.filter.cov = reckoned.online, reckoned.cov
+
+    def record(self, times_s: float | Array, f2f: Array, online: Array) -> None:
+        """Notes one frame or more: times () or (n,) [s], poses (4, 4) or (n, 4, 4)."""
+        self.times_s.add(times_s)
+        self.f2f_poses.add(f2f)
+        self.online_poses.add(online)
 
     def align_track(self, track: int) -> None:
         """Global alignment over the window that ends with this track; the vehicle keeps station meanwhile."""
@@ -112,8 +137,7 @@ class Navigator:
                 aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
             owner = np.searchsorted([n.number for n in self.nodes], [k.number for k in self.keys], side="right") - 1
             cov = aligned.covs[owner]
-        times = np.array(self.times_s)
-        f2f, online = np.array(self.f2f_poses), np.array(self.online_poses)
+        times, f2f, online = (rows.array for rows in (self.times_s, self.f2f_poses, self.online_poses))
         rows = np.array([k.row for k in self.keys], dtype=np.int64)
         final = interpolate_between_keys(f2f, rows, self._key_poses()) if self.settings.use_ga else online
         return SurveyResult(
@@ -127,6 +151,7 @@ class Navigator:
             alignments=self.alignments,
             before_ga=self.before_ga,
             after_ga=self.after_ga,
+            looks=[look for look in self.vision.looks if look.row < len(times)],
         )
 
     def _forget_unfinished(self) -> None:
@@ -199,12 +224,14 @@ class Navigator:
         s = self.settings
         with self.watch("network"):
             first = bisect_left(self.nodes, node.track - s.window_tracks, key=lambda k: k.track)
-            inside = np.r_[0 : min(_START_NODES, first), first : len(self.nodes)]
-            window, poses = [self.nodes[k] for k in inside], self.node_poses[inside]
+            oldest, n = min(_START_NODES, first), len(self.nodes)
+            window = self.nodes[:oldest] + self.nodes[first:]
+            poses = np.concatenate([self.node_poses[:oldest], self.node_poses[first:n]])
             chosen = network.choose_links(node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px)
         others = [(replace(k), share) for k, share in chosen if k is not self.nodes[-1]]
         bridge = self._bridge(node) if self.nodes and chain is None else None
-        self.measuring.append(self.behind.submit(self._links_of, replace(node), others, chain, bridge))
+        measure = partial(self._links_of, replace(node), others, chain, bridge)
+        self.measuring.append(self.behind.submit(measure).result if self.behind else measure)
         self._take_links(all_but=_MOST_BEHIND)
         walked = self.velocity_log.at_node(node.number)
         node.walked = walked if chain else None  # without a chain, the F2F motion has it in
@@ -235,7 +262,7 @@ class Navigator:
         """
         while len(self.measuring) > all_but:
             try:
-                self.links += self.measuring[0].result()
+                self.links += self.measuring[0]()
             except OSError:
                 self.measuring.clear()
                 self.alignable = False
@@ -261,7 +288,7 @@ class Navigator:
         anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
         begun = time.perf_counter()
         try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, self.factors)
         except RuntimeError as error:  # gtsam: the links do not hold every node
             self.alignable = False
             raise SurveyAborted(f"global alignment failed: {str(error).strip().splitlines()[0]}") from None
@@ -286,16 +313,9 @@ class Navigator:
     def _rebase(self, aligned: Aligned) -> None:
         """Moves the online position along with the last key point."""
         last = self.keys[-1]
-        last_from_now = geometry.inverse(self.online_poses[last.row]) @ self.filter.world_from_camera
+        last_from_now = geometry.inverse(self.online_poses.array[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, carried(aligned.covs[-1], last_from_now))
         self.cov_at_node = aligned.covs[-1]
 
     def _key_poses(self) -> Array:
         return np.array([k.world_from_camera for k in self.keys]).reshape(-1, 4, 4)
-
-    def _record(self, frame: Frame, velocity: Array, status: str) -> Estimate:
-        self.times_s.append(frame.time_s)
-        self.f2f_poses.append(self.f2f_pose.copy())
-        self.online_poses.append(self.filter.world_from_camera.copy())
-        sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
-        return Estimate(frame.time_s, self.online_poses[-1], self.f2f_poses[-1], velocity, sigma_m, status)

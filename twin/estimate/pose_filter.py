@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -18,13 +20,8 @@ class PoseFilter:
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
         self.world_from_camera = world_from_camera
         self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
-        self.camera_from_body = geometry.inverse(rig.body_from_camera)
         self.rig, self.noise = rig, noise
-
-    def predict(self, a_from_b: Array, cov: Array) -> None:
-        """Composes a relative motion with its covariance, eqs. (3) to (5)."""
-        self.world_from_camera = self.world_from_camera @ a_from_b
-        self.cov = carried(self.cov, a_from_b) + cov
+        self.level = Level(geometry.inverse(rig.body_from_camera), noise.pressure_m**2, _sigmas(noise))
 
     def correct_pose(self, measured: Array, cov: Array, since: Array) -> Array | None:
         """Fuses a pose measured against something laid earlier.
@@ -51,17 +48,6 @@ class PoseFilter:
         learnt = np.asarray(gain @ moved, np.float64)
         self.reset(self.world_from_camera @ geometry.exp(gain @ residual), self.cov - learnt)
         return learnt
-
-    def aid(self, readings: Readings) -> None:
-        """Fuses what the navigation sensors said of height and attitude."""
-        if readings.pressure_z_m is not None:
-            jacobian = np.concatenate([np.zeros(3), self.world_from_camera[2, :3]])[None]
-            residual = np.array([readings.pressure_z_m - self.world_from_camera[2, 3]])
-            self._update(residual, jacobian, np.array([[self.noise.pressure_m**2]]))
-        if readings.ahrs_rpy_rad is not None:
-            measured, cov = attitude(readings.ahrs_rpy_rad, self.camera_from_body, self.noise)
-            residual = geometry.so3_log(self.world_from_camera[:3, :3].T @ measured)
-            self._update(residual, np.eye(3, 6), cov)
 
     def fix(self, readings: Readings) -> None:
         """Fuses what tells the position at key points: an acoustic fix, beacons in view."""
@@ -90,6 +76,35 @@ class PoseFilter:
         self.world_from_camera, self.cov = _updated(self.world_from_camera, self.cov, residual, jacobian, cov)
 
 
+class Level(NamedTuple):
+    """What is believed of the sensors of height and attitude: (4, 4) of the body, variance [m2], deviations (3,)."""
+
+    camera_from_body: Array
+    pressure_m2: float
+    attitude_rad: Array
+
+
+@njit(cache=True, nogil=True)
+def aided(world_from_camera, cov, level, height_m, rpy_rad):
+    """Pose and covariance after what the sensors said of height and attitude; NaN: nothing."""
+    pose = world_from_camera
+    if not np.isnan(height_m):
+        by_pose, off, spread = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
+        by_pose[0, 3:], off[0], spread[0, 0] = pose[2, :3], height_m - pose[2, 3], level.pressure_m2
+        pose, cov = _updated(pose, cov, off, by_pose, spread)
+    if not np.isnan(rpy_rad[0]):
+        measured, spread = _attitude(rpy_rad, level.camera_from_body[:3, :3], level.attitude_rad)
+        off = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
+        pose, cov = _updated(pose, cov, off, np.eye(3, 6), spread)
+    return pose, cov
+
+
+@njit(cache=True, nogil=True)
+def predicted(world_from_camera, cov, a_from_b, motion_cov):
+    """Composes a relative motion with its covariance, eqs. (3) to (5)."""
+    return world_from_camera @ a_from_b, carried(cov, a_from_b) + motion_cov
+
+
 def clipped(cov: Array, other: Array, least: float = 0.0, most: float = np.inf) -> Array:
     """A covariance (n, n), cut to between `least` and `most` times another, in the axes that both have in common."""
     root = np.linalg.cholesky(other)
@@ -116,8 +131,12 @@ def _updated(world_from_camera, prior, residual, jacobian, cov):
 
 def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
     """Rotation of the camera in the world by an AHRS reading, with its covariance (3, 3) in the camera."""
-    sigmas = np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
-    return _attitude(rpy_rad, camera_from_body[:3, :3], sigmas)
+    return _attitude(rpy_rad, camera_from_body[:3, :3], _sigmas(noise))
+
+
+def _sigmas(noise: SensorNoise) -> Array:
+    """Deviations of roll, pitch and yaw (3,) [rad]."""
+    return np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
 
 
 @njit(cache=True, nogil=True)

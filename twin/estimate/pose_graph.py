@@ -20,6 +20,7 @@ from twin.records import Link
 #: A step that lowers F by less ends the search: it moved no pose by more than 0.05 of its standard deviation, and the
 #: next one, quadratically less, is not taken.
 _LEAST_GAIN = 1e-3
+_MANY = 2500  # poses from which on nested dissection saves more than it costs
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 
 
@@ -80,6 +81,8 @@ def optimise(
     parameters.setRelativeErrorTol(0)
     parameters.setAbsoluteErrorTol(_LEAST_GAIN)
     parameters.setMaxIterations(iterations)
+    if start.size() > _MANY:
+        parameters.setOrderingType("METIS")
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
     return optimizer.optimize(), optimizer.iterations() < iterations
 
@@ -97,7 +100,11 @@ def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, numbers: 
     letter for its name (a beacon, a scale error): eliminated first, it would join all poses that share it.
     """
     shared = [key for key in values.keys() if gtsam.symbolChr(key)]
-    order = gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*numbers, *shared])
+    order = (
+        gtsam.Ordering.MetisNonlinearFactorGraph(graph)
+        if _MANY < len(numbers) == values.size()
+        else gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*numbers, *shared])
+    )
     covs = selected.marginals(graph.linearize(values), order, frozenset(numbers))
     return np.array([covs[number] for number in numbers]).reshape(-1, 6, 6)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
@@ -27,12 +28,18 @@ def interpolate_between_keys(f2f: Array, rows: NDArray[np.int64], key_poses: Arr
     result[: rows[0]] = first @ f2f[: rows[0]]
     for k, row in enumerate(rows):
         end = rows[k + 1] if k + 1 < len(rows) else len(f2f)
-        walked = key_poses[k] @ geometry.inverse(f2f[row]) @ f2f[row:end]
+        there = key_poses[k] @ geometry.inverse(f2f[row])
         if k + 1 < len(rows):
-            arrival = key_poses[k] @ geometry.inverse(f2f[row]) @ f2f[end]
-            gap = geometry.log(geometry.inverse(arrival) @ key_poses[k + 1])
-            walked = np.stack(
-                [w @ geometry.exp(gap * s) for w, s in zip(walked, np.linspace(0, 1, end - row + 1), strict=False)]
-            )
-        result[row:end] = walked
+            gap = geometry.log(geometry.inverse(there @ f2f[end]) @ key_poses[k + 1])
+            _spread(there, f2f[row:end], gap, result[row:end])
+        else:
+            result[row:] = there @ f2f[row:]
     return result
+
+
+@njit(cache=True, nogil=True)
+def _spread(there, f2f, gap, out):
+    """Poses (n, 4, 4) moved by `there`, each with its even share of the gap (6,) behind the last."""
+    step = 1 / len(f2f)
+    for k in range(len(f2f)):
+        out[k] = there @ f2f[k] @ geometry.exp(gap * (k * step))

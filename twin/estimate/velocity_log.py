@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from twin import geometry
-from twin.estimate.motion import Motion
 from twin.geometry import Array
 from twin.records import SensorNoise, StereoRig
 
@@ -26,6 +27,36 @@ class Displacement(NamedTuple):
     cov: Array
 
 
+class Beams(NamedTuple):
+    """What is believed of the log: its mount, time between readings, variance of a frame's way by white noise [m2],
+    and that of its scale error."""
+
+    body_from_camera: Array
+    step_s: float
+    white_m2: float
+    scale2: float
+
+
+class Way(NamedTuple):
+    """What the log has said since the last node; all arrays are changed in place.
+
+    Args:
+        velocity: (3,) the last reading [m/s]; NaN: none.
+        turn, turn_cov: (3, 3) of the body since the node, and its covariance.
+        metres, cov: (3,), (3, 3) displacement in the body at the node, and what white noise makes it err by.
+        path_m: (1,) length of the way.
+        whole: (1,) whether every reading was there.
+    """
+
+    velocity: Array
+    turn: Array
+    turn_cov: Array
+    metres: Array
+    cov: Array
+    path_m: Array
+    whole: NDArray[np.bool_]
+
+
 class VelocityLog:
     """Sums velocities by the trapezoidal rule, turned by the attitude since the last node.
 
@@ -34,78 +65,103 @@ class VelocityLog:
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
-        self._body_from_camera, self._step_s = rig.body_from_camera, 1 / rig.frame_rate_hz
-        self._noise = noise
-        self._velocity: Array | None = None
-        self._start(0)
-
-    def _start(self, node: int) -> None:
-        self._node = node
-        self._turn, self._turn_cov = np.eye(3), np.zeros((3, 3))
-        self._metres, self._cov, self._path_m, self._whole = np.zeros(3), np.zeros((3, 3)), 0.0, True
-
-    def aid(self, motion: Motion, velocity_mps: Array | None) -> Motion:
-        """The camera's motion of this frame with what the log says of it fused in; unchanged without two readings.
-
-        Args:
-            motion: of the frame, by vision.
-            velocity_mps: (3,) reading at the frame's end, in the body.
-        """
-        last, self._velocity = self._velocity, velocity_mps
-        if last is None or velocity_mps is None:
-            self._whole = False
-            return motion
-        turn = self._body_from_camera[:3, :3] @ motion.a_from_b[:3, :3] @ self._body_from_camera[:3, :3].T
-        step = (last + turn @ velocity_mps) / 2 * self._step_s
-        fused = fuse(motion, step, self._step_cov(step), self._body_from_camera)
-        self._sum(step, fused)
-        return fused
-
-    def _step_cov(self, step: Array) -> Array:
-        """Covariance of a frame's displacement. The scale error adds up along the path L since the node: the frames'
-        shares s^2 ((L + l)^2 - L^2) have the sum s^2 L^2."""
-        length = max(float(np.linalg.norm(step)), 1e-12)
-        grown = (2 * self._path_m + length) / length
-        white = np.eye(3) * (self._noise.dvl_mps * self._step_s) ** 2
-        return white + self._noise.dvl_scale**2 * grown * np.outer(step, step)
-
-    def _sum(self, step: Array, motion: Motion) -> None:
-        """Adds a frame to the displacement since the node."""
-        self._metres = self._metres + self._turn @ step
-        self._path_m += float(np.linalg.norm(step))
-        self._cov = self._cov + np.eye(3) * (self._noise.dvl_mps * self._step_s) ** 2
-        camera = self._body_from_camera[:3, :3]
-        self._turn = self._turn @ camera @ motion.a_from_b[:3, :3] @ camera.T
-        to_node = self._turn @ camera
-        self._turn_cov = self._turn_cov + to_node @ motion.cov[:3, :3] @ to_node.T
+        step_s = 1 / rig.frame_rate_hz
+        self.beams = Beams(rig.body_from_camera, step_s, (noise.dvl_mps * step_s) ** 2, noise.dvl_scale**2)
+        square = (3, 3)
+        self.way = Way(
+            np.full(3, np.nan), np.eye(3), np.zeros(square), np.zeros(3), np.zeros(square), np.zeros(1),
+            np.ones(1, np.bool_),
+        )  # fmt: skip
+        self._node = 0
 
     def at_node(self, number: int) -> Displacement | None:
         """The displacement from the last node to this one, where the next one starts; None where a reading lacks."""
-        lever = geometry.skew(self._metres)  # the attitude's error at the end bounds the one on the way
-        cov = self._cov + lever @ self._turn_cov @ lever.T
-        walked = Displacement(self._node, self._metres, cov) if self._whole else None
-        self._start(number)
+        node, self._node, way = self._node, number, self.way
+        walked = Displacement(node, way.metres.copy(), _walked_cov(way)) if way.whole[0] else None
+        _start(way)
         return walked
 
 
-def fuse(motion: Motion, step: Array, step_cov: Array, body_from_camera: Array) -> Motion:
+@njit(cache=True, nogil=True)
+def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
+    """Way (3,) of the body's origin in the earlier body for a motion of the camera, and its derivative (3, 6) by it."""
+    origin = geometry.inverse(body_from_camera)[:3, 3].copy()  # of the body, in the camera
+    mount = np.ascontiguousarray(body_from_camera[:3, :3])
+    turn = mount @ np.ascontiguousarray(a_from_b[:3, :3])
+    joint = body_from_camera @ a_from_b
+    moved = np.ascontiguousarray(joint[:3, :3]) @ origin + joint[:3, 3]
+    by_motion = np.empty((3, 6))
+    by_motion[:, :3], by_motion[:, 3:] = turn @ -geometry.skew(origin), turn
+    return moved, by_motion
+
+
+@njit(cache=True, nogil=True)
+def logged(way, beams, a_from_b, cov, velocity):
+    """The camera's motion (4, 4) of a frame, with covariance (6, 6), and what the log says of it fused in.
+
+    Args:
+        way: since the last node, which goes on.
+        a_from_b, cov: by vision; unchanged without two readings.
+        velocity: (3,) reading at the frame's end, in the body; NaN: none.
+    """
+    last = way.velocity.copy()
+    way.velocity[:] = velocity
+    if np.isnan(last[0]) or np.isnan(velocity[0]):
+        way.whole[0] = False
+        return a_from_b, cov
+    mount = np.ascontiguousarray(beams.body_from_camera[:3, :3])
+    turn = mount @ np.ascontiguousarray(a_from_b[:3, :3]) @ np.ascontiguousarray(mount.T)
+    step = (last + turn @ velocity) / 2 * beams.step_s
+    fused, fused_cov = fuse(a_from_b, cov, step, _step_cov(way, beams, step), beams.body_from_camera)
+    _sum(way, beams, mount, step, fused, fused_cov)
+    return fused, fused_cov
+
+
+@njit(cache=True, nogil=True)
+def _step_cov(way, beams, step):
+    """Covariance of a frame's displacement. The scale error adds up along the path L since the node: the frames'
+    shares s^2 ((L + l)^2 - L^2) have the sum s^2 L^2."""
+    length = max(np.sqrt(np.dot(step, step)), 1e-12)
+    grown = (2 * way.path_m[0] + length) / length
+    return np.eye(3) * beams.white_m2 + beams.scale2 * grown * np.outer(step, step)
+
+
+@njit(cache=True, nogil=True)
+def _sum(way, beams, mount, step, a_from_b, cov):
+    """Adds a frame to the displacement since the node."""
+    way.metres[:] = way.metres + way.turn @ step
+    way.path_m[0] += np.sqrt(np.dot(step, step))
+    way.cov[:] = way.cov + np.eye(3) * beams.white_m2
+    way.turn[:] = way.turn @ mount @ np.ascontiguousarray(a_from_b[:3, :3]) @ np.ascontiguousarray(mount.T)
+    to_node = way.turn @ mount
+    way.turn_cov[:] = way.turn_cov + to_node @ np.ascontiguousarray(cov[:3, :3]) @ np.ascontiguousarray(to_node.T)
+
+
+@njit(cache=True, nogil=True)
+def _walked_cov(way):
+    lever = geometry.skew(way.metres)  # the attitude's error at the end bounds the one on the way
+    return way.cov + lever @ way.turn_cov @ np.ascontiguousarray(lever.T)
+
+
+@njit(cache=True, nogil=True)
+def _start(way):
+    """Starts anew at a node; the last reading is kept."""
+    way.turn[:], way.turn_cov[:] = np.eye(3), 0.0
+    way.metres[:], way.cov[:], way.path_m[:], way.whole[:] = 0.0, 0.0, 0.0, True
+
+
+@njit(cache=True, nogil=True)
+def fuse(a_from_b, cov, step, step_cov, body_from_camera):
     """Kalman update of a camera's motion by a measured displacement of the body's origin.
 
     Args:
+        a_from_b, cov: (4, 4), (6, 6).
         step, step_cov: (3,), (3, 3) in the body before the motion [m].
     """
-    predicted, by_motion = body_displacement(motion.a_from_b, body_from_camera)
-    gain = np.linalg.solve(by_motion @ motion.cov @ by_motion.T + step_cov, by_motion @ motion.cov).T
+    predicted, by_motion = body_displacement(a_from_b, body_from_camera)
+    spread = by_motion @ cov
+    gain = np.linalg.solve(spread @ np.ascontiguousarray(by_motion.T) + step_cov, spread).T
     keep = np.eye(6) - gain @ by_motion
-    return motion._replace(
-        a_from_b=motion.a_from_b @ geometry.exp(gain @ (step - predicted)),
-        cov=keep @ motion.cov @ keep.T + gain @ step_cov @ gain.T,
-    )
-
-
-def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Way (3,) of the body's origin in the earlier body for a motion of the camera, and its derivative (3, 6) by it."""
-    origin = geometry.inverse(body_from_camera)[:3, 3]  # of the body, in the camera
-    turn = body_from_camera[:3, :3] @ a_from_b[:3, :3]
-    moved = geometry.transform(body_from_camera @ a_from_b, origin[None])[0]
-    return moved, turn @ np.hstack([-geometry.skew(origin), np.eye(3)])
+    moved = a_from_b @ geometry.exp(gain @ (step - predicted))
+    fused = keep @ cov @ np.ascontiguousarray(keep.T) + gain @ step_cov @ gain.T
+    return moved, fused

@@ -24,13 +24,19 @@ from twin.estimate.motion import Motion
 from twin.estimate.network import PairMatch
 from twin.estimate.stereo import StereoPoints
 from twin.geometry import Array
-from twin.records import ElevationMap, Frame, MapGrid, StereoRig, SurveyResult
+from twin.records import ElevationMap, Frame, Look, MapGrid, StereoRig, SurveyResult
 
 _LEAST_POINTS = 12  # of a key point
 
 
 class Vision(Protocol):
-    """The stereo camera as the method uses it. Poses are (4, 4) of the left camera, motions as of `Motion`."""
+    """The stereo camera as the method uses it. Poses are (4, 4) of the left camera, motions as of `Motion`.
+
+    Args:
+        looks: so far, with both eyes.
+    """
+
+    looks: list[Look]
 
     def step(self, frame: Frame) -> tuple[Motion, str]:
         """F2F: the motion since the last frame, and "ok" or why it failed."""
@@ -90,6 +96,7 @@ class StereoVision:
         self._cell_m, self._folder = cell_m, folder
         self._use(binning=1)
         self._looked = False
+        self.looks: list[Look] = []
         self._depth_of_key: dict[int, NDArray[np.float16]] = {}
         self._points: StereoPoints | None = None
 
@@ -121,6 +128,7 @@ class StereoVision:
             points = stereo.points_of_pair(
                 self._image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
+        self.looks.append(Look(row, len(points.xyz), matching.contrast(frame.left, self.binning)))
         if len(points.xyz) < _LEAST_POINTS:
             return None
         self._points, self._depth_m = points, _depth(dense_px, self.rig)

@@ -23,29 +23,31 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     moving window), anchored at the first true pose like the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
-    return [_row(alignment, before, after, result, truth) for alignment, before, after in rows]
+    error_m = path_errors(result.final, truth.trajectory).distance_m
+    return [_row(alignment, before, after, result, truth, error_m) for alignment, before, after in rows]
 
 
-def _row(alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth) -> dict[str, Any]:
+def _row(
+    alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth, error_m: Array
+) -> dict[str, Any]:
     frames = result.key_frames[result.track_of_key <= alignment.track]
     return {
         "track": int(alignment.track),
         "before_ga_rmse_m": _key_point_rmse(before, frames, result, truth),
         "after_ga_rmse_m": _key_point_rmse(after, frames, result, truth),
-        "farthest_error_m": farthest_error_m(alignment.track, result, truth),
+        "farthest_error_m": farthest_error_m(alignment.track, error_m, truth),
         "ga_ms": number(alignment.ms),
         "nodes": int(alignment.nodes),
         "edges": int(alignment.edges),
     }
 
 
-def farthest_error_m(track: int, result: SurveyResult, truth: Truth) -> float | None:
-    """RMS error of the final trajectory at a track's far end [m]: the last tenth of its distance from the start.
+def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
+    """RMS of the final errors (n,) at a track's far end [m]: the last tenth of its distance from the start.
 
     There drift is greatest (Negahdaripour & Madjidi 2003, section III). A single frame would tell the noise of its
     frame-to-frame motion instead.
     """
-    error_m = path_errors(result.final, truth.trajectory).distance_m
     frames = np.flatnonzero(truth.track[: len(error_m)] == track)
     if len(frames) == 0:
         return None

@@ -15,6 +15,7 @@ from twin.records import Array, MapGrid, StereoRig
 EDGE_SHARE = 0.05
 #: Slack of the agreement of left and right depth, as a share of depth.
 AGREE_SHARE = 0.005
+_ROWS = 64
 
 
 class Coverage:
@@ -37,7 +38,10 @@ class Coverage:
 def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
     """(rows, cols) true height at the cell centres [m]; `height_at(x, y)` takes and gives arrays of one shape."""
     x, y = grid.centres()
-    return np.asarray(height_at(*np.meshgrid(x, y)), dtype=np.float32)
+    height = np.empty((grid.rows, grid.cols), np.float32)
+    for row in range(0, grid.rows, _ROWS):  # a large grid at once would take many times its memory
+        height[row : row + _ROWS] = height_at(*np.meshgrid(x, y[row : row + _ROWS]))
+    return height
 
 
 @njit(cache=True, nogil=True)

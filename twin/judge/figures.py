@@ -39,6 +39,7 @@ def draw_all(run: Run) -> dict[str, str]:
         "path_errors": path_error_curves,
         "stages": stage_bars,
         "tracks": track_bars,
+        "looks": look_curves,
         "elevation": elevation_maps,
         "error": error_maps,
         "histogram": error_histogram,
@@ -159,6 +160,25 @@ def track_bars(run: Run) -> Figure | None:
     axes.set(xlabel="track", ylabel="key-point RMSE [m]")
     axes.grid(visible=False, axis="x")
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
+
+
+def look_curves(run: Run) -> Figure | None:
+    """Matched points and contrast of every look with both eyes, by the time of its frame; red: too few points."""
+    looks, path = run.key_points.looks, run.trajectories.get("online")
+    if path is None or not len(looks) or looks[:, 0].max() >= len(path):
+        return None
+    times_s, blind = path.times_s[looks[:, 0].astype(int)], ~np.isin(looks[:, 0], run.key_points.frames)
+    shown = [(looks[:, 1], "matched points"), (looks[:, 2], "contrast of the image")]
+    shown = [(values, label) for values, label in shown if np.isfinite(values).any()]
+    figure = Figure(figsize=(WIDTH_IN, 1.9 * len(shown)))
+    for (values, label), axes in zip(
+        shown, figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0], strict=True
+    ):
+        axes.plot(times_s, values, ".-", color=COLOURS["online"], markersize=3, linewidth=0.8)
+        axes.plot(times_s[blind], values[blind], ".", color=COLOURS["limit"], markersize=6)
+        axes.set(ylabel=label, ylim=(0, 1.08 * np.nanmax(values) or None))
+    figure.axes[-1].set_xlabel("time [s]")
     return figure
 
 

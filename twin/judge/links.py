@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
@@ -48,11 +49,17 @@ def motion_errors(links: Sequence[Link], estimates: Sequence[Array], world_from_
         estimates: (4, 4) of each link.
         world_from_key: (n_keys, 4, 4) true poses of the key points.
     """
-    errors = [
-        geometry.log(geometry.inverse(world_from_key[link.j]) @ world_from_key[link.i] @ i_from_j)
-        for link, i_from_j in zip(links, estimates, strict=True)
-    ]
-    return np.array(errors).reshape(-1, 6)
+    ends = np.array([(link.i, link.j) for link in links], dtype=np.int64).reshape(-1, 2)
+    return _motion_errors(ends, np.array(estimates).reshape(-1, 4, 4), np.ascontiguousarray(world_from_key))
+
+
+@njit(cache=True, nogil=True)
+def _motion_errors(ends, estimates, world_from_key):
+    errors = np.empty((len(ends), 6))
+    for k in range(len(ends)):
+        i, j = ends[k]
+        errors[k] = geometry.log(geometry.inverse(world_from_key[j]) @ world_from_key[i] @ estimates[k])
+    return errors
 
 
 def _figures(links: Sequence[Link], world_from_key: Array) -> dict[str, float | int | None]:

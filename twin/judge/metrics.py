@@ -12,6 +12,7 @@ from twin.judge.alignment import track_metrics
 from twin.judge.consistency import consistency_metrics
 from twin.judge.control import control_metrics
 from twin.judge.links import link_metrics
+from twin.judge.looks import look_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.numbers import finite_tree, number
 from twin.judge.overlap import overlap_metrics
@@ -56,6 +57,7 @@ def evaluate(
         "map": map_metrics(elevation, truth),
         "consistency": consistency_metrics(result, elevation, truth),
         "links": link_metrics(result, truth),
+        "vision": look_metrics(result),
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth),
         "overlap": overlap_metrics(result, truth, rig, grid, dict(plan_numbers)),
@@ -75,6 +77,7 @@ def _flown(result: SurveyResult, truth: Truth) -> SurveyResult:
         track_of_key=result.track_of_key[:n],
         node_cov=result.node_cov[:n],
         links=[link for link in result.links if link.j < n],
+        looks=[look for look in result.looks if look.row < n_frames],
     )
 
 

@@ -63,20 +63,23 @@ def footprints(
     pose = truth.trajectory.world_from_camera[key_frames]
     heading = geometry.heading_of_camera(pose)
     bow = np.column_stack([np.cos(heading), np.sin(heading)])
-    depth = np.array([mean_depth(p[:3, 3], truth.height_m, grid, rig) for p in pose])
+    whole = float(np.nanmean(truth.height_m)) if np.isfinite(truth.height_m).any() else np.nan
+    depth = np.array([mean_depth(p[:3, 3], truth.height_m, whole, grid, rig) for p in pose])
     travel, swath = travel_direction(truth.reference)[key_frames], swath_numbers(truth, pattern)[key_frames]
     scale = depth / rig.focal_px
     return Footprints(pose[:, :2, 3], bow, travel, rig.width_px * scale, rig.height_px * scale, swath)
 
 
-def mean_depth(position: Array, height_m: NDArray[np.float32], grid: MapGrid | None, rig: StereoRig) -> float:
-    """Height of a camera (3,) above the mean floor in the square it sees [m]; without a grid above the whole floor."""
-    whole = float(np.nanmean(height_m)) if np.isfinite(height_m).any() else np.nan
+def mean_depth(
+    position: Array, height_m: NDArray[np.float32], whole_m: float, grid: MapGrid | None, rig: StereoRig
+) -> float:
+    """Height of a camera (3,) above the mean floor in the square it sees [m]; without a grid above the whole floor's
+    mean."""
     if grid is None:
-        return float(position[2]) - whole
-    half = (float(position[2]) - whole) * (rig.width_px + rig.height_px) / (4 * rig.focal_px)
+        return float(position[2]) - whole_m
+    half = (float(position[2]) - whole_m) * (rig.width_px + rig.height_px) / (4 * rig.focal_px)
     cells = _window(height_m, grid, position, half)
-    return float(position[2]) - (float(np.nanmean(cells)) if np.isfinite(cells).any() else whole)
+    return float(position[2]) - (float(np.nanmean(cells)) if np.isfinite(cells).any() else whole_m)
 
 
 def _window(height_m: NDArray[np.float32], grid: MapGrid, position: Array, half_m: float) -> NDArray[np.float32]:

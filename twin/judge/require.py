@@ -9,7 +9,14 @@ from typing import Any
 from twin.errors import TwinError
 
 #: Metrics of which more is better: their limit is a lower bound. All others are errors, times or sizes.
-MORE_IS_BETTER = ("map.completeness", "timing.real_time_factor", "overlap.", "consistency.within_")
+MORE_IS_BETTER = (
+    "map.completeness",
+    "timing.real_time_factor",
+    "overlap.",
+    "consistency.within_",
+    "vision.points_",
+    "vision.contrast_",
+)
 
 
 def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
 from twin.errors import TwinError
-from twin.records import Array, MapGrid, Trajectory
+from twin.records import Array, Look, MapGrid, Trajectory
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
 SCENARIO_FILE = "scenario.resolved.toml"
@@ -36,12 +36,17 @@ class Network(NamedTuple):
 
 
 class KeyPoints(NamedTuple):
-    """Key points as spooled: frame rows, tracks, frames per key point; durations [ms] of stages, call by call."""
+    """Key points as spooled: frame rows, tracks, frames per key point; durations [ms] of stages, call by call.
+
+    Args:
+        looks: (n, 3) frame row, matched points and contrast (NaN without images) of every look with both eyes.
+    """
 
     frames: NDArray[np.int64]
     tracks: NDArray[np.int64]
     n_per_key: int | None
     timing_ms: dict[str, Array]
+    looks: Array
 
 
 @dataclass(frozen=True)
@@ -125,7 +130,8 @@ def _read_key_points(file: Path) -> KeyPoints:
     index = _read_json(file) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
-    return KeyPoints(frames, tracks, index.get("n_per_key"), timing_ms)
+    looks = [[look[key] for key in Look._fields] for look in index.get("looks", [])]
+    return KeyPoints(frames, tracks, index.get("n_per_key"), timing_ms, np.array(looks, float).reshape(-1, 3))
 
 
 def _read_json(file: Path) -> Any:

@@ -6,6 +6,8 @@ nothing to collide with, nothing of it is left out here. `vehicle.Vehicle` and t
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -13,11 +15,34 @@ from numpy.typing import NDArray
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin import config, geometry
 from twin.errors import SurveyAborted
-from twin.simulate.hydrodynamics import free_joint_acceleration, twist_of_free_joint
-from twin.simulate.thrusters import LaggedThrusters
+from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_of_free_joint
+from twin.simulate.thrusters import LaggedThrusters, Thrusters, pass_step, set_command
 from twin.simulate.vehicle import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 
 Array = NDArray[np.float64]
+
+
+class Body(NamedTuple):
+    """A body in water; arrays of its state are changed in place.
+
+    Args:
+        pose: (4, 4) true pose.
+        velocity: (6,) of the free joint, half a step before the pose.
+        acceleration: (6,) of the last step.
+        kick: (1,) steps by which the next one moves the velocity: the first brings it to the half step only.
+        thrusters, hull: of the vehicle.
+        current: (3,) [m/s].
+        timestep_s: of the physics.
+    """
+
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    kick: Array
+    thrusters: Thrusters
+    hull: Hull
+    current: Array
+    timestep_s: float
 
 
 class FreeBody:
@@ -31,24 +56,22 @@ class FreeBody:
     """
 
     def __init__(self, vehicle: config.Vehicle, current_mps: Array, world_from_body: Array, timestep_s: float):
-        self._hull, self._current, self._timestep_s = hull_of(vehicle), np.array(current_mps, float), timestep_s
-        self._thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s)
-        self._pose = np.array(world_from_body, float)
-        self._velocity = np.zeros(6)  # of the free joint, half a step before the pose
-        self._acceleration = np.zeros(6)
-        self._kick = 0.5  # the first one brings the velocity to the half step only
-        self._steps = 0
+        thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s).parts
+        self.body = Body(
+            np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters, hull_of(vehicle),
+            np.array(current_mps, float), timestep_s,
+        )  # fmt: skip
+        self._time_s = 0.0
 
     @property
     def world_from_body(self) -> Array:
         """True pose (4, 4)."""
-        return self._pose.copy()
+        return self.body.pose.copy()
 
     @property
     def twist_body(self) -> Array:
         """True [angular, linear] velocity in the body (6,) [rad/s, m/s], at the instant of the pose."""
-        velocity = self._velocity + 0.5 * self._timestep_s * self._acceleration
-        return twist_of_free_joint(self._pose[:3, :3], velocity)
+        return twist_of(self.body)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
         """Holds thruster commands (8,) in [-1, 1] for a whole number of physics steps.
@@ -56,28 +79,42 @@ class FreeBody:
         Raises:
             SurveyAborted: the motion is not finite or absurdly fast.
         """
-        n_steps = round(duration_s / self._timestep_s)
-        self._thrusters.command(thruster_u)
-        wrenches = self._thrusters.wrenches(n_steps)
-        self._kick = _advance(
-            self._pose, self._velocity, self._acceleration, self._kick, wrenches, self._hull, self._current,
-            self._timestep_s,
-        )  # fmt: skip
-        self._steps += n_steps
-        speeds = np.abs(self._velocity)
-        if not (speeds[:3].max() < SPEED_LIMIT_MPS and speeds[3:].max() < RATE_LIMIT_RADPS):
-            raise SurveyAborted(f"the physics diverged at {self._steps * self._timestep_s:.3f} s")
+        advance(self.body, thruster_u, round(duration_s / self.body.timestep_s))
+        self.passed(duration_s)
+
+    def passed(self, duration_s: float) -> None:
+        """Notes that the body was moved for so long. Raises SurveyAborted."""
+        self._time_s += duration_s
+        if is_lost(self.body):
+            raise SurveyAborted(f"the physics diverged at {self._time_s:.3f} s")
 
 
 @njit(cache=True, nogil=True)
-def _advance(pose, velocity, acceleration, kick, wrenches, hull, current, timestep):
-    """Steps pose (4, 4), velocity (6,) and acceleration (6,) in place, a wrench (6,) each; returns the next kick."""
-    for wrench in wrenches:
-        now = velocity + 0.5 * timestep * acceleration
+def twist_of(body):
+    """As `FreeBody.twist_body`."""
+    velocity = body.velocity + 0.5 * body.timestep_s * body.acceleration
+    return twist_of_free_joint(body.pose[:3, :3], velocity)
+
+
+@njit(cache=True, nogil=True)
+def is_lost(body):
+    """Whether the motion is not finite or absurdly fast."""
+    speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
+    return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
+
+
+@njit(cache=True, nogil=True)
+def advance(body, command, n_steps):
+    """So many steps under commands (8,)."""
+    thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
+    set_command(thrusters, command)
+    for _ in range(n_steps):
+        wrench = thrusters.effects @ (thrusters.c @ thrusters.state)
+        now = velocity + 0.5 * body.timestep_s * acceleration
         rotation = pose[:3, :3].copy()
-        acceleration[:] = free_joint_acceleration(hull, rotation, now, current, wrench)
-        velocity += kick * timestep * acceleration
-        kick = 1.0
-        pose[:3, 3] += timestep * velocity[:3]
-        pose[:3, :3] = rotation @ geometry.so3_exp(timestep * velocity[3:])
-    return kick
+        acceleration[:] = free_joint_acceleration(body.hull, rotation, now, body.current, wrench)
+        velocity += body.kick[0] * body.timestep_s * acceleration
+        body.kick[0] = 1.0
+        pose[:3, 3] += body.timestep_s * velocity[:3]
+        pose[:3, :3] = rotation @ geometry.so3_exp(body.timestep_s * velocity[3:])
+        pass_step(thrusters)

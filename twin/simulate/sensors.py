@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
@@ -51,13 +53,13 @@ class NavigationSensors:
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
             depth_m: gives the true depth (height, width) of the left image at a key point; else None.
         """
-        world_from_camera = world_from_body @ self._rig.body_from_camera
         readings = read_sensors(
             world_from_body, self._rig.body_from_camera, self._noise, self._aiding, self._rng["navigation"]
         )
         velocity = self._dvl.read(twist_body[3:])
         fix = sightings = None
         if depth_m is not None:
+            world_from_camera = world_from_body @ self._rig.body_from_camera
             fix = self._usbl.read(time_s, world_from_camera[:3, 3])
             if "beacons" in self._aiding:
                 sightings = sight_beacons(
@@ -69,6 +71,44 @@ class NavigationSensors:
             usbl_m=fix if "usbl" in self._aiding else None,
             beacons=sightings,
         )
+
+    def gauges(self) -> Gauges:
+        """Those that say something at every frame, as compiled loops read them."""
+        level, attitude, velocity = (name in self._aiding for name in ("pressure", "ahrs", "dvl"))
+        return Gauges(
+            self._rig.body_from_camera, self._noise.pressure_m, attitude_sigmas(self._noise), self._dvl.gain,
+            self._noise.dvl_mps, level, attitude, velocity,
+        )  # fmt: skip
+
+    def noise(self, n_frames: int) -> tuple[Array, Array]:
+        """Standard normal numbers of these (n_frames, 4) and (n_frames, 3), as `read` would draw them."""
+        return self._rng["navigation"].standard_normal((n_frames, 4)), self._rng["dvl"].standard_normal((n_frames, 3))
+
+
+class Gauges(NamedTuple):
+    """The sensors that say something at every frame, their deviations, and which of them are fitted."""
+
+    body_from_camera: Array
+    pressure_m: float
+    attitude_rad: Array
+    dvl_gain: float
+    dvl_mps: float
+    tells_height: bool
+    tells_attitude: bool
+    tells_velocity: bool
+
+
+@njit(cache=True, nogil=True)
+def read_gauges(gauges, world_from_body, twist_body, numbers, dvl_numbers):
+    """Height [m], attitude (3,) [rad] and velocity (3,) [m/s] as read; NaN where a sensor is not fitted."""
+    height, angles = _level(world_from_body, gauges.body_from_camera, gauges.pressure_m, gauges.attitude_rad, numbers)
+    velocity = _logged(twist_body[3:], gauges.dvl_gain, gauges.dvl_mps, dvl_numbers)
+    nothing = np.full(3, np.nan)
+    return (
+        height if gauges.tells_height else np.nan,
+        angles if gauges.tells_attitude else nothing,
+        velocity if gauges.tells_velocity else nothing,
+    )
 
 
 def read_sensors(
@@ -87,14 +127,26 @@ def read_sensors(
         world_from_body, body_from_camera: (4, 4) true poses.
         rng: a stream that serves these sensors alone.
     """
-    pressure_noise, *attitude_noise = rng.standard_normal(4)
-    height = float(world_from_body[2] @ body_from_camera[:, 3])
-    sigmas = np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
-    angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + sigmas * attitude_noise
-    return Readings(
-        pressure_z_m=height + noise.pressure_m * float(pressure_noise) if "pressure" in aiding else None,
-        ahrs_rpy_rad=geometry.wrap_angle(angles) if "ahrs" in aiding else None,
+    height, angles = _level(
+        world_from_body, body_from_camera, noise.pressure_m, attitude_sigmas(noise), rng.standard_normal(4)
     )
+    return Readings(
+        pressure_z_m=height if "pressure" in aiding else None, ahrs_rpy_rad=angles if "ahrs" in aiding else None
+    )
+
+
+def attitude_sigmas(noise: SensorNoise) -> Array:
+    """Deviations of roll, pitch and yaw (3,) [rad]."""
+    return np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
+
+
+@njit(cache=True, nogil=True)
+def _level(world_from_body, body_from_camera, pressure_m, attitude_rad, numbers):
+    """Height [m] and attitude (3,) [rad] by the gauge and the AHRS whose noise is these standard normal numbers."""
+    up, arm = world_from_body[2], body_from_camera[:3, 3]
+    height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
+    angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_rad * numbers[1:]
+    return height + pressure_m * numbers[0], geometry.wrap_angle(angles)
 
 
 class DopplerLog:
@@ -102,11 +154,16 @@ class DopplerLog:
 
     def __init__(self, noise: SensorNoise, rng: np.random.Generator):
         self._sigma_mps, self._rng = noise.dvl_mps, rng
-        self._gain = 1 + noise.dvl_scale * float(rng.standard_normal())
+        self.gain = 1 + noise.dvl_scale * float(rng.standard_normal())
 
     def read(self, velocity_mps: Array) -> Array:
         """The reading (3,) of a true velocity (3,) of the body's origin, in the body [m/s]."""
-        return self._gain * velocity_mps + self._sigma_mps * self._rng.standard_normal(3)
+        return _logged(velocity_mps, self.gain, self._sigma_mps, self._rng.standard_normal(3))
+
+
+@njit(cache=True, nogil=True)
+def _logged(velocity_mps, gain, sigma_mps, numbers):
+    return gain * velocity_mps + sigma_mps * numbers
 
 
 class AcousticFix:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -22,6 +24,26 @@ def steady_thrust_n(command: Array, coefficients: Array) -> Array:
     return thrust * command
 
 
+class Thrusters(NamedTuple):
+    """Thrusters that follow their commands with a linear lag, for a fixed step.
+
+    Args:
+        a, b, c: (m, m), (m, 1), (m,) step of the lag, its input and its output.
+        effects: (6, n) wrench [moment, force] in the body per newton of each.
+        coefficients: of the thrust curve.
+        state: (m, n) of the lag, changed in place.
+        steady_n: (n,) thrust that the last command leads to, changed in place.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    effects: Array
+    coefficients: Array
+    state: Array
+    steady_n: Array
+
+
 class LaggedThrusters:
     """The thrusters of a vessel: each follows its commanded steady thrust with the vessel's linear lag.
 
@@ -34,44 +56,43 @@ class LaggedThrusters:
 
     def __init__(self, vessel: Vessel, timestep_s: float):
         numerator, denominator = vessel.thruster_lag
-        self._a, self._b = _held(denominator, timestep_s)
-        self._c = np.zeros(len(self._a))
-        self._c[-len(numerator) :] = numerator
-        self._effects = angular_first(vessel.allocation)
-        self._coefficients = vessel.thrust_coefficients
-        self._state = np.zeros((len(self._a), self._effects.shape[1]))
-        self._steady_n = np.zeros(self._effects.shape[1])
+        a, b = _held(denominator, timestep_s)
+        c = np.zeros(len(a))
+        c[-len(numerator) :] = numerator
+        effects = angular_first(vessel.allocation)
+        n = effects.shape[1]
+        self.parts = Thrusters(
+            a, b, c, effects, np.array(vessel.thrust_coefficients, float), np.zeros((len(a), n)), np.zeros(n)
+        )
 
     def thrust_n(self) -> Array:
         """Thrust of each at this instant (n,)."""
-        return self._c @ self._state
+        return self.parts.c @ self.parts.state
 
     def wrench(self) -> Array:
         """Their wrench on the body at this instant, [moment, force] in the body (6,) [N m, N]."""
-        return self._effects @ self.thrust_n()
+        return self.parts.effects @ self.thrust_n()
 
     def command(self, command: Array) -> None:
         """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
-        self._steady_n = steady_thrust_n(np.minimum(np.maximum(command, -1.0), 1.0), self._coefficients)
-
-    def wrenches(self, n_steps: int) -> Array:
-        """Their wrench at the beginning of each of the next steps (n_steps, 6), which are then over."""
-        thrusts, self._state = _thrusts(self._a, self._b, self._c, self._state, self._steady_n, n_steps)
-        return thrusts @ self._effects.T
+        set_command(self.parts, command)
 
     def step(self) -> None:
         """One step under the last commands."""
-        self._state = self._a @ self._state + self._b * self._steady_n
+        pass_step(self.parts)
 
 
 @njit(cache=True, nogil=True)
-def _thrusts(a, b, c, state, steady, n_steps):
-    """Thrusts (n_steps, n) at the beginning of each step, and the state after them."""
-    thrusts = np.empty((n_steps, state.shape[1]))
-    for k in range(n_steps):
-        thrusts[k] = c @ state
-        state = a @ state + b * steady
-    return thrusts, state
+def set_command(thrusters, command):
+    """As `LaggedThrusters.command`."""
+    cut = np.minimum(np.maximum(command, -1.0), 1.0)
+    thrusters.steady_n[:] = steady_thrust_n(cut, thrusters.coefficients)
+
+
+@njit(cache=True, nogil=True)
+def pass_step(thrusters):
+    """As `LaggedThrusters.step`."""
+    thrusters.state[:] = thrusters.a @ thrusters.state + thrusters.b * thrusters.steady_n
 
 
 def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:

@@ -7,7 +7,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.stats import qmc
 
 from twin.study.spread import Array, equal_parts
 from twin.study.study_file import METHODS, Study, Together
@@ -50,6 +49,8 @@ def seeds(study: Study, sample: Sample) -> list[int]:
 
 def points(method: METHODS, n_points: int, n_axes: int, seed: int) -> Array:
     """(n, n_axes) points in the unit cube; n is n_points, of "saltelli" n_points (n_axes + 2)."""
+    from scipy.stats import qmc  # takes a second, and workers never need it
+
     rng = np.random.default_rng([seed, _DESIGN_STREAM])
     if n_axes == 0 or method in ("random", "grid"):
         return rng.random((n_points, n_axes))

@@ -112,7 +112,7 @@ def distributions(found: Findings, levels: list[Level]) -> Figure | None:
     figure, panels = make_panels(len(levels))
     for level, axes in zip(levels, panels, strict=True):
         values = found.numbers(level.name)
-        values = values[found.complete & np.isfinite(values)]
+        values = values[found.counted(level.name)]
         log = spans_decades(values)
         edges = _edges(values, log)
         axes.hist(values, list(edges), color=COLOURS["online"], alpha=0.75)
@@ -158,8 +158,7 @@ def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
 
 def curves(found: Findings, metric: str) -> Figure | None:
     """A metric against each key: every survey a dot, and the median of each group with its interval."""
-    y = found.numbers(metric)
-    chosen = found.complete & np.isfinite(y)
+    y, chosen = found.numbers(metric), found.counted(metric)
     if not found.keys or chosen.sum() < 2:
         return None
     figure, panels = make_panels(len(found.keys))

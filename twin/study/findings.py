@@ -21,7 +21,7 @@ _MOST_GROUPS = 12  # reasons shown
 
 
 class Level(NamedTuple):
-    """A metric over the surveys that ended complete; `bound` is what 95 % of them keep."""
+    """A metric over the surveys that it counts in; `bound` is what 95 % of them keep."""
 
     name: str
     surveys: int
@@ -66,7 +66,7 @@ class Findings:
         self.complete = self.status == "complete"
         self.keys = [key for key in study.varied if f"vary.{key}" in rows.column_names]
         self.limits = self._limits()
-        self.metrics = [name for name in dict.fromkeys([*self.limits, *study.show]) if name in rows.column_names]
+        self.metrics = [name for name in dict.fromkeys([*self.limits, *study.show]) if self._known(name)]
         self.passed = self._passed()
 
     def _texts(self, name: str) -> NDArray:
@@ -78,6 +78,16 @@ class Findings:
         if name not in self.rows.column_names:
             return np.full(self.rows.num_rows, np.nan)
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
+
+    def _known(self, metric: str) -> bool:
+        """Whether any survey has it, or must: contrast has none where no image is rendered."""
+        needed = metric in self.limits and metric in self.rows.column_names
+        return needed or bool(np.isfinite(self.numbers(metric)).any())
+
+    def counted(self, metric: str) -> NDArray[np.bool_]:
+        """Surveys whose figure counts: those complete; of what the cameras saw, those that broke off too."""
+        flown = self.ended if metric.startswith("vision.") else self.complete
+        return flown & np.isfinite(self.numbers(metric))
 
     def _limits(self) -> dict[str, float]:
         found = {}
@@ -136,8 +146,7 @@ class Findings:
         return [self._level(name) for name in self.metrics]
 
     def _level(self, name: str) -> Level:
-        values = self.numbers(name)
-        chosen = self.complete & np.isfinite(values)
+        values, chosen = self.numbers(name), self.counted(name)
         data, units = values[chosen], self.units[chosen]
         worst = 5.0 if more_is_better(name) else 95.0
         return Level(
@@ -156,8 +165,7 @@ class Findings:
         return sorted(found, key=lambda f: (order[f.metric], -_size(f)))
 
     def _influence(self, key: str, metric: str) -> Influence:
-        y = self.numbers(metric)
-        chosen = self.complete & np.isfinite(y)
+        y, chosen = self.numbers(metric), self.counted(metric)
         x = self.key_numbers(key)
         nothing = Interval(np.nan, np.nan, np.nan)
         correlation = nothing if x is None else statistics.rank_correlation(x[chosen], y[chosen])

@@ -17,7 +17,7 @@ from twin.study.surveys import Survey
 Row = dict[str, Any]
 #: What stays of a run's folder; what does not stay is not even drawn.
 KEPT = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
-SHOWN = {"none": (), "metrics": (), "report": ("report",), "all": ("report", "recording")}
+SHOWN = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
 
 
 def check(scenario: Scenario) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
-from scipy import stats
+from scipy.special import ndtri
 
 from twin.config import Section
 
@@ -82,13 +82,15 @@ _RULES = {
 
 def _truncated_normal(share: Array, mean: float, deviation: float, low: float, high: float) -> Array:
     ends = (low - mean) / deviation, (high - mean) / deviation
+    from scipy import stats  # takes a second, and workers never need it
+
     return np.clip(stats.truncnorm.ppf(share, *ends, loc=mean, scale=deviation), low, high)
 
 
 _QUANTILES = {
     "uniform": lambda share, low, high: low + (high - low) * share,
     "log_uniform": lambda share, low, high: np.exp(np.log(low) + np.log(high / low) * share),
-    "normal": lambda share, mean, deviation: stats.norm.ppf(share, mean, deviation),
+    "normal": lambda share, mean, deviation: mean + deviation * ndtri(share),
     "truncated_normal": _truncated_normal,
 }
 

@@ -17,7 +17,9 @@ from twin.study.spread import KINDS, Spread
 
 METHODS = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KEEP = Literal["all", "report", "metrics", "none"]
-SHOWN = ("trajectory.final.ate_rmse_m", "map.le90_m", "map.completeness")
+SHOWN = (
+    "trajectory.final.ate_rmse_m", "map.le90_m", "map.completeness", "vision.points_median", "vision.contrast_median",
+)  # fmt: skip
 
 
 class Together(Section):

@@ -19,6 +19,9 @@ _NAMES = {
     "map.rmse_m": "map error (RMS)",
     "map.nmad_m": "map error (NMAD)",
     "timing.simulated_s": "survey time",
+    "vision.points_median": "matched points",
+    "vision.points_p10": "matched points of the worst tenth",
+    "vision.contrast_median": "contrast of the images",
 }
 
 

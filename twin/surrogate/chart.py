@@ -109,19 +109,30 @@ class Chart:
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
         """Rows and columns (first, end) that the view reaches on the lowest floor."""
-        rig, grid = self._rig, self.grid
-        u, v = rig.cx_px / rig.focal_px, rig.cy_px / rig.focal_px
-        rays = np.array([[-u, -v, 1], [u, -v, 1], [-u, v, 1], [u, v, 1.0]]) @ world_from_camera[:3, :3].T
-        eye = world_from_camera[:3, 3]
-        if rays[:, 2].max() >= -0.1:  # the horizon is in view: look at everything
-            return 0, grid.rows, 0, grid.cols
-        at = eye[:2] + rays[:, :2] * ((self._lowest_m - eye[2]) / rays[:, 2:])
-        at = np.vstack([at, eye[:2]])
-        west, north, cell = self._place
-        cols, rows = (at[:, 0] - west) / cell, (north - at[:, 1]) / cell
-        first_row, end_row = max(int(rows.min()) - 1, 0), min(int(rows.max()) + 2, grid.rows)
-        first_col, end_col = max(int(cols.min()) - 1, 0), min(int(cols.max()) + 2, grid.cols)
-        return first_row, end_row, first_col, end_col
+        size = (self.grid.rows, self.grid.cols)
+        return _window(world_from_camera, self._camera, self._place, self._lowest_m, size)
+
+
+@njit(cache=True, nogil=True)
+def _window(pose, camera, place, lowest, size):
+    focal, cx, cy, _, _, _ = camera
+    west, north, cell = place
+    rows, cols = size
+    x_low = x_high = pose[0, 3]
+    y_low = y_high = pose[1, 3]
+    for u, v in ((-cx, -cy), (cx, -cy), (-cx, cy), (cx, cy)):
+        a, b = u / focal, v / focal
+        dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
+        dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
+        dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
+        if dz >= -0.1:  # the horizon is in view: look at everything
+            return 0, rows, 0, cols
+        far = (lowest - pose[2, 3]) / dz
+        x_low, x_high = min(x_low, pose[0, 3] + far * dx), max(x_high, pose[0, 3] + far * dx)
+        y_low, y_high = min(y_low, pose[1, 3] + far * dy), max(y_high, pose[1, 3] + far * dy)
+    first_row, end_row = max(int((north - y_high) / cell) - 1, 0), min(int((north - y_low) / cell) + 2, rows)
+    first_col, end_col = max(int((x_low - west) / cell) - 1, 0), min(int((x_high - west) / cell) + 2, cols)
+    return first_row, end_row, first_col, end_col
 
 
 @njit(cache=True, nogil=True, inline="always")

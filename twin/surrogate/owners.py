@@ -5,43 +5,52 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-from twin import geometry
 from twin.geometry import Array
-from twin.records import StereoRig
 
 _CELL_M = 0.1
 _LEAST_SHARE = 0.1  # of the view that must have been laid before
+
+Cells = NDArray[np.int64]  #: of the floor: column and row in one number
+
+
+@njit(cache=True, nogil=True)
+def cells_of(pose, points, baseline):
+    """The cell (n,) of each of points (n, 3), normalised (x, y, disparity), of a camera at (4, 4)."""
+    cells = np.empty(len(points), np.int64)
+    for k in range(len(points)):
+        x, y, d = points[k]
+        depth = baseline / d
+        col = np.floor((depth * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3]) / _CELL_M)
+        row = np.floor((depth * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) + pose[1, 3]) / _CELL_M)
+        cells[k] = (np.int64(row) << 32) + np.int64(col)
+    return cells
 
 
 class Owners:
     """Key points by the cells of floor that they laid first."""
 
-    def __init__(self, rig: StereoRig):
-        self._baseline_m = rig.baseline_m
-        self._owner: dict[tuple[int, int], int] = {}
+    def __init__(self) -> None:
+        self._owner: dict[int, int] = {}
         self._believed: dict[int, Array] = {}
 
     def clear(self) -> None:
         self._owner.clear()
         self._believed.clear()
 
-    def lay(self, number: int, believed: Array, true: Array, points: Array) -> None:
-        """Lays a key point's points (n, 3), normalised (x, y, disparity), where nothing is yet."""
+    def lay(self, number: int, believed: Array, cells: Cells) -> None:
+        """Lays a key point where nothing is yet, at its believed pose (4, 4)."""
         self._believed[number] = believed
-        for cell in self._cells(true, points):
+        for cell in cells.tolist():
             self._owner.setdefault(cell, number)
 
-    def shares(self, true: Array, points: Array) -> list[tuple[int, Array, float]] | None:
+    def shares(self, cells: Cells) -> list[tuple[int, Array, float]] | None:
         """Number, believed pose and share of each key point that laid what is in view; None where too little is."""
-        counts = Counter(self._owner.get(cell) for cell in self._cells(true, points))
+        counts = Counter(map(self._owner.get, cells.tolist()))
         counts.pop(None, None)
         total = sum(counts.values())
-        if total < _LEAST_SHARE * len(points):
+        if total < _LEAST_SHARE * len(cells):
             return None
         return [(number, self._believed[number], n / total) for number, n in counts.items() if number is not None]
-
-    def _cells(self, true: Array, points: Array) -> list[tuple[int, int]]:
-        xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * (self._baseline_m / points[:, 2:])
-        cells = np.floor(geometry.transform(true, xyz)[:, :2] / _CELL_M).astype(np.int64)
-        return [(x, y) for x, y in cells.tolist()]

@@ -7,10 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.estimate.pipeline import Navigator
 from twin.geometry import Array
 from twin.judge.coverage import true_heights
 from twin.mission import Mission, Step
-from twin.sea import Sea, Sight, Watch, streams
+from twin.pilot import PilotOfEstimates, RovPilot
+from twin.sea import Glide, Sea, Sight, Watch, streams
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
 from twin.simulate.sensors import NavigationSensors
@@ -19,6 +21,7 @@ from twin.surrogate.calibration import Calibration
 from twin.surrogate.chart import Chart
 from twin.surrogate.conditions import Conditions
 from twin.surrogate.floor import Floor
+from twin.surrogate.glide import compiled
 from twin.surrogate.model import ErrorModel
 from twin.surrogate.vision import SurrogateVision
 
@@ -52,6 +55,11 @@ class SurrogateSea(Sea):
     def look(self, step: Step) -> Sight:
         pose, rig = self.world_from_camera, self.mission.rig
         return Sight(_BLANK, _BLANK if step.key_point else None, lambda: self._told.floor.depth(pose, rig))
+
+    def glide(self, navigator: Navigator, pilot: PilotOfEstimates) -> Glide | None:
+        if isinstance(self.vehicle, FreeBody) and isinstance(pilot, RovPilot) and navigator.vision is self.vision:
+            return compiled(self, self.vehicle, self._told, navigator, pilot)
+        return None
 
     def seen(self) -> NDArray[np.bool_]:
         return self._told.chart.seen

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -26,12 +27,12 @@ from twin.estimate.mosaic import Registration
 from twin.estimate.motion import Motion
 from twin.estimate.stereo import StereoPoints
 from twin.geometry import Array
-from twin.records import ElevationMap, Frame, MapGrid, StereoRig, SurveyResult
+from twin.records import ElevationMap, Frame, Look, MapGrid, StereoRig, SurveyResult
 from twin.surrogate.chart import CellErrors, Chart
 from twin.surrogate.conditions import Conditions
 from twin.surrogate.floor import Floor
 from twin.surrogate.model import ErrorModel
-from twin.surrogate.owners import Owners
+from twin.surrogate.owners import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
 _LEAST_POINTS = 12  # of these, and of those they stand for
@@ -49,6 +50,9 @@ class _Seen(NamedTuple):
         noise: (rows, cols, 3) standard normal numbers of the images there.
         bound_px: Cramer-Rao bound of a patch's place.
         n_points: matched points that they stand for.
+        unit_cov, unit_root: (6, 6) covariance of a motion against known depths by eq. (2), and its root, where
+            normalised points err by one.
+        cells: of the floor that the points lie in.
     """
 
     pose: Array
@@ -57,6 +61,17 @@ class _Seen(NamedTuple):
     noise: Array
     bound_px: float
     n_points: float
+    unit_cov: Array
+    unit_root: Array
+    cells: Cells
+
+
+class FrameErrors(NamedTuple):
+    """What motions from frame to frame err by: root of the true covariance, claimed one (6, 6), lasting error (6,)."""
+
+    root: Array
+    cov: Array
+    lasting: Array
 
 
 class SurrogateVision:
@@ -91,13 +106,15 @@ class SurrogateVision:
         self._camera = (rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), rig.baseline_m)
         self._pixels = _raster(rig)
         self._rays = stereo.normalised(self._pixels, rig)
-        self._last: Array | None = None
+        self.last_pose: Array | None = None  # true one of the last frame
         self._seen: dict[int, _Seen] = {}
         self._now: _Seen | None = None
-        self._f2f: tuple[Array, Array, Array] | None = None  # root of the true covariance, claimed one, lasting error
+        self.looks: list[Look] = []
+        self._f2f: FrameErrors | None = None
         self._last_motion = np.eye(4)
-        self._owners = Owners(rig)
-        self._key = int(rng.integers(2**63))
+        self._owners = Owners()
+        self._key, self._bits, self._drawing = int(rng.integers(2**63)), np.random.Philox(key=0), Lock()
+        self._begin = self._bits.state
         self._drawn, self._used = np.zeros((0, 6)), 0
         one = np.zeros((1, 2))
         self._unit_cov = stereo.fuse(one, one, np.eye(2)[None], rig)[1][0]  # of a point whose place errs by a pixel
@@ -122,14 +139,18 @@ class SurrogateVision:
 
     def step(self, frame: Frame) -> tuple[Motion, str]:
         now = self._truth()
-        last, self._last = self._last, now
+        last, self.last_pose = self.last_pose, now
         if last is None:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         if self._f2f is None:
             return coast(self._last_motion)
-        root, cov, lasting = self._f2f
-        self._last_motion = _moved(last, now, root, self._draw(), lasting)
-        return Motion(self._last_motion, cov, F2F_POINTS, 0.0), "ok"
+        self._last_motion = moved(self._f2f, last, now, self.draw(1)[0])
+        return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
+
+    @property
+    def following(self) -> FrameErrors | None:
+        """What frames err by since the last key point; None where nothing can be followed."""
+        return self._f2f
 
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
         self._f2f = None  # until `restart`: where stereo finds nothing, there is nothing to follow
@@ -139,17 +160,21 @@ class SurrogateVision:
             depth_m = self.floor.depth_at(self._pixels, pose, self.rig)
             met = np.flatnonzero(depth_m < np.inf)
             if len(met) < _LEAST_POINTS:
+                self.looks.append(Look(row, 0, None))
                 return None
             depth_m = depth_m[met]
             bound_px = self._conditions.bound_px(float(depth_m.mean()))
             n_points = len(met) / len(self._rays) * model.points(bound_px) * self.settings.points
+            self.looks.append(Look(row, int(n_points), None))
             if n_points < _LEAST_POINTS:
                 return None
             truth = np.column_stack([self._rays[met], self.rig.baseline_m / depth_m])
             n = len(truth)
             place = model.place_px(bound_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
-            self._now = _Seen(pose, truth, met, noise, bound_px, n_points)
+            unit = _unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
+            cells = cells_of(pose, truth, self.rig.baseline_m)
+            self._now = _Seen(pose, truth, met, noise, bound_px, n_points, *unit, cells)
             measured = truth + noise.reshape(-1, 3)[met] @ (self._unit_root.T * place * model.place_excess)
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * place**2, (n, 3, 3))
@@ -159,31 +184,26 @@ class SurrogateVision:
         assert self._now is not None
         model = self.model
         root, cov = self._motion_errors(model.f2f_px(self._now.bound_px))
-        lasting = model.f2f_excess * model.f2f_lasting * (root @ self._draw())
-        self._f2f = (model.f2f_excess * np.sqrt(1 - model.f2f_lasting**2) * root, cov, lasting)
+        lasting = model.f2f_excess * model.f2f_lasting * (root @ self.draw(1)[0])
+        self._f2f = FrameErrors(model.f2f_excess * np.sqrt(1 - model.f2f_lasting**2) * root, cov, lasting)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
         """Root and covariance (6, 6) of a motion against known depths by eq. (2), where points err by so much."""
         assert self._now is not None
-        points = self._now.points
-        weight = np.full(len(points), F2F_POINTS / len(points))
-        rows = observation.image_motion(points[:, 0], points[:, 1], self.rig.baseline_m / points[:, 2])
-        normal, _ = observation.normal_equations(rows, weight, np.zeros((len(points), 2)))
-        cov = np.asarray(np.linalg.inv(normal) * (sigma_px / self.rig.focal_px) ** 2, np.float64)
-        return np.asarray(np.linalg.cholesky(cov), np.float64), cov
+        sigma = sigma_px / self.rig.focal_px
+        return self._now.unit_root * sigma, self._now.unit_cov * sigma**2
 
     def register(self, world_from_camera: Array) -> Registration | None:
         assert self._now is not None
         now = self._now.pose
-        shares = self._owners.shares(now, self._now.points)
+        shares = self._owners.shares(self._now.cells)
         if shares is None:
             return None
-        predicted_from_world, offset = geometry.inverse(world_from_camera), np.zeros(6)
-        for number, believed, share in shares:
-            told = believed @ geometry.inverse(self._seen[number].pose) @ now
-            offset += share * geometry.log(predicted_from_world @ told)
+        told = [believed for _, believed, _ in shares]
+        true = [self._seen[number].pose for number, _, _ in shares]
+        offset = _offset(np.stack(told), np.stack(true), np.array([s for *_, s in shares]), now, world_from_camera)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
-        error = root @ self._draw() * self.model.mosaic_excess
+        error = root @ self.draw(1)[0] * self.model.mosaic_excess
         found = Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
         older = np.cumsum([share for _, _, share in sorted(shares, key=lambda s: s[0])])
         return Registration(found, sorted(number for number, _, _ in shares)[int(np.searchsorted(older, 0.5))])
@@ -191,13 +211,12 @@ class SurrogateVision:
     def lay(self, number: int, world_from_camera: Array) -> None:
         assert self._now is not None
         self._seen[number] = self._now
-        self._owners.lay(number, world_from_camera, self._now.pose, self._now.points)
+        self._owners.lay(number, world_from_camera, self._now.cells)
 
     def relay(self, keys: Sequence[KeyPoint]) -> None:
         self._owners.clear()
         for key in keys:
-            seen = self._seen[key.number]
-            self._owners.lay(key.number, key.world_from_camera, seen.pose, seen.points)
+            self._owners.lay(key.number, key.world_from_camera, self._seen[key.number].cells)
 
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
         with self.watch("network"):
@@ -211,23 +230,26 @@ class SurrogateVision:
         Its numbers are its own, whichever link is measured first.
         """
         model = self.model
-        rng = np.random.Generator(np.random.Philox(key=self._key, counter=[0, 0, number, other]))
-        there_from_here = geometry.inverse(there.pose) @ here.pose
         bound_px = max(here.bound_px, there.bound_px)
         n = len(here.points)
         place = model.place_px(bound_px) * np.sqrt(n / (here.n_points * model.matched(bound_px)))
-        fresh, common = rng.standard_normal((n, 3)), rng.standard_normal(3) * model.common_px / self.rig.focal_px
-        error, normal, by_common, in_view = _solve(
-            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, fresh, model.steady, common, there_from_here,
-            self._camera, self._unit_cov * place**2, self._unit_root * (place * model.place_excess),
+        numbers = self._numbers_of(number, other, n + 1)
+        in_view, motion, cov = _link(
+            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, numbers, model.steady,
+            model.common_px / self.rig.focal_px, there.pose, here.pose, self._camera, self._unit_cov * place**2,
+            self._unit_root * (place * model.place_excess), network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
         n_matched = int(in_view / n * here.n_points * model.matched(bound_px))
         if in_view < _LEAST_POINTS or n_matched < max(_LEAST_POINTS, _LEAST_SHARE * here.n_points):
             return None
-        inverse = np.linalg.inv(normal)
-        shared = inverse @ by_common * network.COMMON_PX / self.rig.focal_px
-        claimed = inverse * model.correlation + shared @ shared.T
-        return Motion(there_from_here @ geometry.exp(inverse @ error), claimed, n_matched, 1.0)
+        return Motion(motion, cov, n_matched, 1.0)
+
+    def _numbers_of(self, number: int, other: int, n: int) -> Array:
+        """Standard normal numbers (n, 3) of a link."""
+        begin = self._begin | {"state": {"key": [self._key, 0], "counter": [0, 0, number, other]}}
+        with self._drawing:  # links are measured by other threads
+            self._bits.state = begin  # pyright: ignore[reportAttributeAccessIssue]
+            return np.random.Generator(self._bits).standard_normal((n, 3))
 
     def map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
@@ -247,12 +269,13 @@ class SurrogateVision:
             progress(k + 1)
         return mapper.result()
 
-    def _draw(self) -> Array:
-        """Six standard normal numbers, drawn by the block."""
-        if self._used == len(self._drawn):
-            self._drawn, self._used = self._rng.standard_normal((_BLOCK, 6)), 0
-        self._used += 1
-        return self._drawn[self._used - 1]
+    def draw(self, n: int) -> Array:
+        """Six standard normal numbers, n times (n, 6); drawn by the block."""
+        while self._used + n > len(self._drawn):
+            fresh = self._rng.standard_normal((_BLOCK, 6))
+            self._drawn, self._used = np.concatenate([self._drawn[self._used :], fresh]), 0
+        self._used += n
+        return self._drawn[self._used - n : self._used]
 
 
 def _raster(rig: StereoRig) -> Array:
@@ -263,24 +286,29 @@ def _raster(rig: StereoRig) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _moved(last, now, root, numbers, lasting):
-    """The motion (4, 4) from one pose to the next, with an error."""
-    return geometry.inverse(last) @ now @ geometry.exp(root @ numbers + lasting)
+def moved(errors, last, now, numbers):
+    """The motion (4, 4) from one true pose to the next as F2F tells it, with an error by standard normal numbers."""
+    return geometry.inverse(last) @ now @ geometry.exp(errors.root @ numbers + errors.lasting)
 
 
 @njit(cache=True, nogil=True)
-def _solve(points, here, there, fresh, steady, common, there_from_here, camera, cov, root):
-    """Right side (6,), normal matrix (6, 6), effect of a shared error (6, 3), and how many points both see.
+def _link(
+    points, here, there, numbers, steady, common, there_pose, here_pose, camera, cov, root, common_claim, correlation
+):
+    """How many points two key points both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
 
     Args:
         points: (n, 3) of the later key point.
         here: (n, 3) standard normal: what the later pair errs by at these points.
         there: (rows, cols, 3) the same of the earlier pair, over its image.
-        fresh: (n, 3) what it errs by in this match alone; `steady` is the other's share.
-        common: (3,) bias that all points share, normalised.
+        numbers: (n + 1, 3) standard normal: what it errs by in this match alone (`steady` is the other's share), and a
+            bias that all points share.
+        common, common_claim: deviation of that bias, and the one claimed, normalised.
+        there_pose, here_pose: (4, 4) true poses.
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
     """
     focal, cx, cy, width, height, baseline = camera
+    there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
     n, margin, passing = 0, 5.0, np.sqrt(1 - steady * steady)
     a, b = np.empty_like(points), np.empty_like(points)
@@ -289,10 +317,10 @@ def _solve(points, here, there, fresh, steady, common, there_from_here, camera, 
         if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
             cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
             for r in range(3):
-                a[n, r] = seen[k, r] + common[r]
+                a[n, r] = seen[k, r] + bias[r]
                 b[n, r] = points[k, r]
                 for c in range(r + 1):
-                    a[n, r] += root[r, c] * (steady * cell[c] + passing * fresh[k, c])
+                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
                     b[n, r] += root[r, c] * here[k, c]
             n += 1
     a, b = a[:n], b[:n]
@@ -301,4 +329,28 @@ def _solve(points, here, there, fresh, steady, common, there_from_here, camera, 
         covs[k] = cov
     error, _, by_motion, information, _ = observation.linearised(a, b, b, covs, covs, there_from_here, baseline)
     normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
-    return right, normal, by_common, n
+    if n < _LEAST_POINTS:
+        return n, there_from_here, normal
+    inverse = np.linalg.inv(normal)
+    shared = inverse @ by_common * common_claim
+    return n, there_from_here @ geometry.exp(inverse @ right), inverse * correlation + shared @ shared.T
+
+
+@njit(cache=True, nogil=True)
+def _unit_motion(points: Array, baseline: float, n_weight: float) -> tuple[Array, Array]:
+    """Covariance (6, 6), and its root, of a motion by eq. (2) where so many points like these (n, 3) err by one."""
+    n = len(points)
+    rows = observation.image_motion(points[:, 0], points[:, 1], baseline / points[:, 2])
+    normal, _ = observation.normal_equations(rows, np.full(n, n_weight / n), np.zeros((n, 2)))
+    cov = np.linalg.inv(normal)
+    return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
+
+
+@njit(cache=True, nogil=True)
+def _offset(believed, true, shares, now, world_from_camera):
+    """What a mosaic of key points at poses (n, 4, 4), laid where they were believed to be, says of a predicted pose."""
+    predicted_from_world, offset = geometry.inverse(world_from_camera), np.zeros(6)
+    for k in range(len(shares)):
+        told = believed[k] @ geometry.inverse(true[k]) @ now
+        offset += shares[k] * geometry.log(predicted_from_world @ told)
+    return offset

@@ -38,6 +38,7 @@ class Witness:
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, truth: Callable[[], Array]):
         self.images, self.surrogate, self._truth = images, surrogate, truth
+        self.looks = images.looks
         self.notes: dict[str, list[float]] = defaultdict(list)
         self._poses: dict[int, Array] = {}
         self._errors: dict[tuple[int, int], list[Array]] = {}

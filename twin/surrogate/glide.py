@@ -1,0 +1,75 @@
+"""The closed loop between two key points, compiled: frames of which only motion and readings are told."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from twin import geometry
+from twin.estimate.pipeline import Navigator
+from twin.estimate.reckoning import reckon
+from twin.mission import Course
+from twin.pilot import RovPilot, steer
+from twin.simulate.free_body import FreeBody, advance, is_lost, twist_of
+from twin.simulate.sensors import read_gauges
+from twin.surrogate.vision import SurrogateVision, moved
+
+if TYPE_CHECKING:
+    from twin.sea import Glide
+    from twin.surrogate.sea import SurrogateSea
+
+
+def compiled(
+    sea: SurrogateSea, vehicle: FreeBody, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
+) -> Glide:
+    """What `survey.fly` does with each frame, for all frames up to the next key point, where F2F can follow them.
+
+    Every step is the one that a single frame takes, and so are the numbers drawn for it.
+    """
+    rate_hz = sea.mission.rig.frame_rate_hz
+    gauges, n_steps = sea.sensors.gauges(), round(1 / rate_hz / vehicle.body.timestep_s)
+
+    def glide(course: Course, first: int, track: int) -> int:
+        errors = vision.following
+        end = first + int(np.argmax(np.append(course.key_point[first:], True)))
+        if errors is None or end == first:
+            return first
+        n, reference = end - first, tuple(np.asarray(part)[first:end] for part in course.reference)
+        numbers = vision.draw(n), *sea.sensors.noise(n)
+        with sea.watch("physics"):
+            n, reckoned, true, f2f, online = _fly(
+                vision.last_pose, vehicle.body, gauges, errors, navigator.reckoning, navigator.instruments, pilot.helm,
+                reference, numbers, n_steps, rate_hz,
+            )  # fmt: skip
+        times_s = np.arange(len(sea), len(sea) + n) / rate_hz
+        sea.record(true[:n], reference[0][:n], course.holding, track)
+        vision.last_pose = true[n - 1]
+        navigator.go_on(reckoned)
+        navigator.record(times_s, f2f[:n], online[:n])
+        vehicle.passed(n / rate_hz)
+        return end
+
+    return glide
+
+
+@njit(cache=True, nogil=True)
+def _fly(last, body, gauges, errors, reckoned, instruments, helm, reference, numbers, n_steps, rate_hz):
+    """Frames flown (fewer where the physics diverged), reckoning after them, poses (n, 4, 4): true, f2f, online."""
+    positions, velocities, yaws, accelerations = reference
+    of_vision, of_gauges, of_log = numbers
+    n = len(positions)
+    true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
+    for k in range(n):
+        true[k] = body.pose @ gauges.body_from_camera
+        height, angles, velocity = read_gauges(gauges, body.pose, twist_of(body), of_gauges[k], of_log[k])
+        a_from_b = moved(errors, last, true[k], of_vision[k])
+        reckoned, aided = reckon(reckoned, instruments, a_from_b, errors.cov, height, angles, velocity)
+        f2f[k], online[k], last = reckoned.f2f, reckoned.online, true[k]
+        twist = geometry.log(aided) * rate_hz
+        command = steer(helm, reckoned.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
+        advance(body, command, n_steps)
+        if is_lost(body):
+            return k + 1, reckoned, true, f2f, online
+    return n, reckoned, true, f2f, online
