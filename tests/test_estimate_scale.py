@@ -58,3 +58,20 @@ def test_a_binned_rig_sees_a_point_where_the_binned_image_shows_it(by):
 def test_binning_by_four_halves_the_noise_twice():
     noise = np.random.default_rng(1).standard_normal((240, 320)).astype(np.float32)
     assert matching.binned(noise, 4).std() == pytest.approx(0.25, rel=0.02)
+
+
+def test_where_corners_are_few_a_grid_covers_the_image_best_places_first():
+    left, _ = pair(24.0, 12.0, noise=0.5)
+    image = matching.normalise(left, 2)
+    points = matching.corners(image, 500, 11)
+    assert len(points) > 250
+    strength = cv2.cornerMinEigenVal(image, 7)[tuple(points.astype(int).T[::-1])]
+    assert np.all(np.diff(strength) <= 0)
+    assert np.all((points >= 7) & (points < [160 - 7, 120 - 7]))
+    assert len(np.unique(points, axis=0)) == len(points)
+
+
+def test_where_corners_are_many_they_are_taken():
+    left, _ = pair(2.0, 12.0)
+    points = matching.corners(matching.normalise(left), 500, 11)
+    assert len(np.unique(np.diff(np.unique(points[:, 0])))) > 1  # no grid

@@ -103,8 +103,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         noise_variance = _noise_variance(residual, seen)
         noise = _local_noise(residual, seen, noise_variance)
         fit = _fit_planes(fitted, residual, slope, noise, _taper(spread_px), np.float32(SUPPORT_PX), _PRIORS)
-        left = residual - slope * (fit[0] - fitted)
-        shared = _shared(left, seen, noise_variance)
+        shared = _shared(np.asarray(residual - slope * (fit[0] - fitted), np.float32), seen, noise_variance)
         fitted, weight, gain, excess = fit
         sigma = np.sqrt(weight * np.maximum(excess, noise))
         spread_px = _spread(_own_sigma(sigma, gain), fitted, spread_px)
