@@ -297,15 +297,17 @@ class Navigator:
         self.dropped += aligned.dropped
         dropped = {(link.i, link.j) for link in aligned.dropped}
         self.links = [link for link in self.links if (link.i, link.j) not in dropped]
-        self._move_keys({k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)})
+        poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
+        self._move_keys({number: pose for number, pose in poses.items() if number in inside})
         return aligned
 
     def _move_keys(self, poses: dict[int, Array]) -> None:
-        """Gives the nodes their new poses; key points between them move along with the node before."""
-        shift = np.eye(4)
+        """Gives nodes their new poses; key points between them move along with the node before, if that moved."""
+        shift, numbers = np.eye(4), {node.number for node in self.nodes}
         for key in self.keys:
-            if key.number in poses:
-                shift = poses[key.number] @ geometry.inverse(key.world_from_camera)
+            if key.number in numbers:
+                new = poses.get(key.number, key.world_from_camera)
+                shift = new @ geometry.inverse(key.world_from_camera)
             key.world_from_camera = geometry.rigid(shift @ key.world_from_camera)  # else errors treble
         for k, node in enumerate(self.nodes):
             self.node_poses[k] = node.world_from_camera
