@@ -174,7 +174,7 @@ def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees
     for k, x in enumerate(np.arange(-1.0, 0.3, 0.3)):
         pose = scene.down_camera(x, 0, ALTITUDE_M)
         left, depth = diver.frame(pose)
-        mosaic.add(k, matching.normalise(left), depth.astype(np.float32), pose, RIG)
+        mosaic.add(100 * k, matching.normalise(left), depth.astype(np.float32), pose, RIG)
     errors = []
     for _ in range(10):
         rpy = tuple(diver.rng.normal(size=3) * 0.02)
@@ -183,7 +183,7 @@ def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees
         predicted = pose @ geometry.exp(diver.rng.normal(size=6) * [0.003, 0.003, 0.003, 0.01, 0.01, 0.01])
         found = mosaic.register(matching.normalise(left), depth.astype(np.float32), predicted, 1.9, RIG)
         assert found is not None
-        assert 0 <= found.laid_by <= 4
+        assert found.laid_by in range(0, 500, 100)  # never between two
         errors.append(error_of(pose, predicted @ found.correction.a_from_b))
     assert np.all(np.abs(np.mean(errors, axis=0)) < 1e-3)
     assert np.all(np.std(errors, axis=0) < 1.5e-3)
@@ -196,7 +196,7 @@ def test_an_empty_mosaic_gives_no_position(diver, tmp_path):
 
 
 def test_noise_of_depth_does_not_pull_the_registration_with_the_mosaic(diver, tmp_path):
-    """Least squares with the mosaic's own depth in its rows turn the camera by 10 mrad, always the same way."""
+    """Least squares with the mosaic's own depth in its rows turn the camera by 9 mrad, always the same way."""
     errors, claims = [], []
     for k in range(12):
         poses = [scene.down_camera(0.2 * k - 1.2, y, ALTITUDE_M) for y in (0.0, 0.8)]

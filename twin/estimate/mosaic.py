@@ -98,33 +98,23 @@ class Mosaic:
             return None
         points, brightness, laid_by = cells
         frame = image.astype(np.float32)
-        current, seen = world_from_camera, _Seen(np.eye(6), np.zeros(6), np.eye(6), 0.0, np.zeros(0, np.bool_))
+        camera, current = (rig.focal_px, rig.cx_px, rig.cy_px), world_from_camera
+        normal, scatter, sigma, n_used, used = np.eye(6), np.eye(6), 0.0, 0, np.zeros(0, np.bool_)
         for _ in range(_ITERATIONS):
-            camera_from_world = geometry.inverse(current)
-            seen = _Seen(
-                *_normal_equations(
-                    points,
-                    brightness,
-                    frame,
-                    depth_m,
-                    camera_from_world,
-                    rig.focal_px,
-                    rig.cx_px,
-                    rig.cy_px,
-                    _MAX_RESIDUAL,
-                )
-            )
-            if np.count_nonzero(seen.used) < _MIN_CELLS:
+            *told, used = _compare(points, brightness, frame, depth_m, geometry.inverse(current), camera, _MAX_RESIDUAL)
+            n_used = int(np.count_nonzero(used))
+            if n_used < _MIN_CELLS:
                 return None
-            step = np.asarray(np.linalg.solve(seen.normal, seen.right), np.float64)
+            normal, right, scatter, sigma = _normal_equations(*told)
+            step = np.asarray(np.linalg.solve(normal, right), np.float64)
             current = current @ geometry.exp(step)
             if np.abs(step).max() < 1e-6:
                 break
-        inverse = np.linalg.inv(seen.normal)
-        cov = np.asarray(inverse @ seen.scatter @ inverse.T, np.float64)
+        inverse = np.linalg.inv(normal)
+        cov = np.asarray(inverse @ scatter @ inverse.T, np.float64)
         correction = geometry.inverse(world_from_camera) @ current
-        found = motion.Motion(correction, cov, int(np.count_nonzero(seen.used)), seen.sigma)
-        return Registration(found, int(np.median(laid_by[seen.used])))
+        median = np.partition(laid_by[used], n_used // 2)[n_used // 2]  # a key point's number, not between two
+        return Registration(motion.Motion(correction, cov, n_used, sigma), int(median))
 
     def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
         """First row, first column and side of the square of cells around a place."""
@@ -149,16 +139,6 @@ class Mosaic:
         y = (row + rows + 0.5) * self.cell_m
         points = np.column_stack([x, y, height[rows, cols]])
         return np.asarray(points, np.float64), bright[rows, cols], number[rows, cols]
-
-
-class _Seen(NamedTuple):
-    """Normal matrix (6, 6), right side (6,) and its scatter (6, 6), robust deviation of brightness, cells used (n,)."""
-
-    normal: Array
-    right: Array
-    scatter: Array
-    sigma: float
-    used: NDArray[np.bool_]
 
 
 def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -201,23 +181,26 @@ def _lay(image, depth, pose, inverse, focal, cx, cy, west, south, cell, laid_by,
             i, j = int(np.floor(v)), int(np.floor(u))
             if i < 0 or j < 0 or i >= image.shape[0] - 1 or j >= image.shape[1] - 1:
                 continue
-            a, b = v - i, u - j
-            top = image[i, j] * (1 - b) + image[i, j + 1] * b
-            bottom = image[i + 1, j] * (1 - b) + image[i + 1, j + 1] * b
             height[row, col], number[row, col] = z, laid_by
-            brightness[row, col] = top * (1 - a) + bottom * a
+            brightness[row, col] = _between(image, i, j, v - i, u - j)
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(points, brightness, frame, depth, camera_from_world, focal, cx, cy, max_residual):
-    """Fills a `_Seen`; the scatter is that of the right side's parts, a part for each block of the image."""
-    n = len(points)
-    residuals = np.empty(n, np.float64)
-    rows, told = np.empty((n, 6)), np.empty((n, 6))
+def _compare(points, brightness, frame, depth, camera_from_world, camera, max_residual):
+    """What each cell that the frame shows says of the motion.
+
+    Args:
+        camera: focal length, column and row of the principal point [px].
+
+    Returns:
+        Rows (m, 6) of the motion; the same told by the frame's own depth; residuals (m,); blocks of the image (m,); and
+        which cells these are (n,).
+    """
+    focal, cx, cy = camera
+    n, m, (high, wide) = len(points), 0, _BLOCKS
+    rows, told, residuals, block = np.empty((n, 6)), np.empty((n, 6)), np.empty(n), np.empty(n, np.int64)
+    kept = np.zeros(n, np.bool_)
     rotation, translation = np.ascontiguousarray(camera_from_world[:3, :3]), camera_from_world[:3, 3].copy()
-    block = np.empty(n, np.int64)
-    used, kept = 0, np.zeros(n, np.bool_)
-    high, wide = _BLOCKS
     for k in range(n):
         p = rotation @ points[k] + translation
         if p[2] <= 0.05:
@@ -228,57 +211,53 @@ def _normal_equations(points, brightness, frame, depth, camera_from_world, focal
         if i < 1 or j < 1 or i >= frame.shape[0] - 2 or j >= frame.shape[1] - 2:
             continue
         a, b = v - i, u - j
-        top = frame[i, j] * (1 - b) + frame[i, j + 1] * b
-        bottom = frame[i + 1, j] * (1 - b) + frame[i + 1, j + 1] * b
-        residual = brightness[k] - (top * (1 - a) + bottom * a)
+        residual = brightness[k] - _between(frame, i, j, a, b)
         near = depth[int(v + 0.5), int(u + 0.5)]
         if abs(residual) > max_residual or not near > 0:
             continue
-        grad_u = (
-            focal
-            * (
-                (1 - a) * ((1 - b) * (frame[i, j + 1] - frame[i, j - 1]) + b * (frame[i, j + 2] - frame[i, j]))
-                + a
-                * ((1 - b) * (frame[i + 1, j + 1] - frame[i + 1, j - 1]) + b * (frame[i + 1, j + 2] - frame[i + 1, j]))
-            )
-            / 2
-        )
-        grad_v = (
-            focal
-            * (
-                (1 - b) * ((1 - a) * (frame[i + 1, j] - frame[i - 1, j]) + a * (frame[i + 2, j] - frame[i, j]))
-                + b
-                * ((1 - a) * (frame[i + 1, j + 1] - frame[i - 1, j + 1]) + a * (frame[i + 2, j + 1] - frame[i, j + 1]))
-            )
-            / 2
-        )
-        rows[used, 0] = grad_u * x * y + grad_v * (1 + y * y)
-        rows[used, 1] = -grad_u * (1 + x * x) - grad_v * x * y
-        rows[used, 2] = grad_u * y - grad_v * x
-        rows[used, 3] = -grad_u / p[2]
-        rows[used, 4] = -grad_v / p[2]
-        rows[used, 5] = (grad_u * x + grad_v * y) / p[2]
+        grad_u = focal * (_between(frame, i, j + 1, a, b) - _between(frame, i, j - 1, a, b)) / 2
+        grad_v = focal * (_between(frame, i + 1, j, a, b) - _between(frame, i - 1, j, a, b)) / 2
+        rows[m, 0] = grad_u * x * y + grad_v * (1 + y * y)
+        rows[m, 1] = -grad_u * (1 + x * x) - grad_v * x * y
+        rows[m, 2] = grad_u * y - grad_v * x
+        rows[m, 3] = -grad_u / p[2]
+        rows[m, 4] = -grad_v / p[2]
+        rows[m, 5] = (grad_u * x + grad_v * y) / p[2]
         for c in range(3):
-            told[used, c], told[used, 3 + c] = rows[used, c], rows[used, 3 + c] * p[2] / near
-        residuals[used] = residual
-        block[used] = i * high // frame.shape[0] * wide + j * wide // frame.shape[1]
-        kept[k] = True
-        used += 1
+            told[m, c], told[m, 3 + c] = rows[m, c], rows[m, 3 + c] * p[2] / near
+        residuals[m], kept[k] = residual, True
+        block[m] = i * high // frame.shape[0] * wide + j * wide // frame.shape[1]
+        m += 1
+    return rows[:m], told[:m], residuals[:m], block[:m], kept
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _between(image, i, j, a, b):
+    """Bilinear value at a share (a, b) of the way from pixel (i, j) to the next row and column."""
+    top = image[i, j] * (1 - b) + image[i, j + 1] * b
+    bottom = image[i + 1, j] * (1 - b) + image[i + 1, j + 1] * b
+    return top * (1 - a) + bottom * a
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(rows, told, residuals, block):
+    """Normal matrix (6, 6), right side (6,), its scatter (6, 6) by the blocks of the image, robust deviation."""
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
-    if used < 6:
-        return normal, right, scatter, 0.0, kept
-    parts, filled = np.zeros((high * wide, 6)), np.zeros(high * wide, np.bool_)
-    sigma = 1.4826 * np.median(np.abs(residuals[:used])) + 1e-3
-    for k in range(used):
+    if len(rows) < 6:
+        return normal, right, scatter, 0.0
+    n_parts = _BLOCKS[0] * _BLOCKS[1]
+    parts, filled = np.zeros((n_parts, 6)), np.zeros(n_parts, np.bool_)
+    sigma = 1.4826 * np.median(np.abs(residuals)) + 1e-3
+    for k in range(len(rows)):
         size = abs(residuals[k]) / sigma
         weight = 1.0 if size < 1.5 else 1.5 / size
         filled[block[k]] = True
         for i in range(6):
-            right[i] += weight * told[k, i] * residuals[k]
             parts[block[k], i] += weight * told[k, i] * residuals[k]
             for j in range(6):
                 normal[i, j] += weight * told[k, i] * rows[k, j]
     n_blocks = filled.sum()
     for part in parts:
+        right += part
         scatter += np.outer(part, part) * (n_blocks / max(n_blocks - 6, 1))
-    return normal, right, scatter, sigma, kept
+    return normal, right, scatter, sigma

@@ -1,9 +1,9 @@
 """The scale at which images are matched: pixels are binned where the floor's texture is coarser than their noise.
 
 Found over a floor whose texture resolves 7.6 cm (a texel is 12 pixels wide, its contrast twice the noise): of the
-corners of the full image 0.35 to 0.41 are found by the other eye, the others are corners of noise, and flow from frame
-to frame is lost within 18 s. With pixels binned by 2 or 4 it is 0.88 to 0.92, and the survey flies. Over all floors
-whose texture the full image resolves it is 0.95 to 0.99 at full size. A larger patch alone keeps the noise's corners.
+corners of the full image 0.35 to 0.6 are found by the other eye, the others are corners of noise, and flow from frame
+to frame is lost within 18 s. With pixels binned by 2 or 4 it is 0.88 to 0.96, and the survey flies. Over floors whose
+texture the full image resolves it is 0.95 to 0.99 at full size. A larger patch alone keeps the noise's corners.
 """
 
 from __future__ import annotations
