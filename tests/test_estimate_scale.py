@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import cv2
 import numpy as np
 import pytest
 
 from twin.config import Estimation
 from twin.estimate import matching, scale
-from twin.records import StereoRig
+from twin.estimate.vision import StereoVision
+from twin.records import Frame, Readings, StereoRig
 
 RIG = StereoRig(320, 240, 343.0, 0.3, 30.0, np.eye(4))
 DISPARITY_PX = 24
@@ -75,3 +78,15 @@ def test_where_corners_are_many_they_are_taken():
     left, _ = pair(2.0, 12.0)
     points = matching.corners(matching.normalise(left), 500, 11)
     assert len(np.unique(np.diff(np.unique(points[:, 0])))) > 1  # no grid
+
+
+def test_the_scale_is_that_of_the_first_pair_that_shows_something_and_until_then_no_motion_is_claimed(tmp_path):
+    vision = StereoVision(RIG, Estimation(), 0.01, tmp_path, lambda _: nullcontext())
+    dark, coarse, fine = (np.full((240, 320, 3), 90, np.uint8),) * 2, pair(12.0, 4.0), pair(2.0, 12.0)
+    seen = []
+    for k, images in enumerate((dark, dark, coarse, fine)):
+        frame = Frame(k, k / 30, *images, Readings())
+        status = vision.step(frame)[1]
+        seen.append((status, vision.look(frame, k) is not None, vision.binning))
+    blind = "too few points matched"
+    assert seen == [("ok", False, 1), (blind, False, 1), (blind, True, 2), (blind, True, 2)]

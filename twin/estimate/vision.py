@@ -24,7 +24,7 @@ from twin.estimate.motion import Motion
 from twin.estimate.network import PairMatch
 from twin.estimate.stereo import StereoPoints
 from twin.geometry import Array
-from twin.records import ElevationMap, Frame, Look, MapGrid, StereoRig, SurveyResult
+from twin.records import ElevationMap, Frame, Image, Look, MapGrid, StereoRig, SurveyResult
 
 _LEAST_POINTS = 12  # of a key point
 
@@ -95,7 +95,6 @@ class StereoVision:
         self.full_rig, self.settings, self.watch = rig, settings, watch
         self._cell_m, self._folder = cell_m, folder
         self._use(binning=1)
-        self._looked = False
         self.looks: list[Look] = []
         self._depth_of_key: dict[int, NDArray[np.float16]] = {}
         self._points: StereoPoints | None = None
@@ -111,6 +110,14 @@ class StereoVision:
         self._image = np.zeros((self.rig.height_px, self.rig.width_px), np.uint8)
         self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
 
+    def _settle_scale(self, left: Image, right: Image) -> None:
+        """Goes on at the scale that this pair asks for; nothing has been laid or kept yet."""
+        binning = scale.binning(left, right, self.full_rig, self.settings)
+        if binning != self.binning:
+            self._use(binning)
+            self._image = matching.normalise(left, binning)
+            self.f2f.step(self._image)
+
     def step(self, frame: Frame) -> tuple[Motion, str]:
         with self.watch("f2f"):
             self._image = matching.normalise(frame.left, self.binning)
@@ -119,9 +126,8 @@ class StereoVision:
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None
         with self.watch("stereo"):
-            if not self._looked:
-                self._use(scale.binning(frame.left, frame.right, self.full_rig, self.settings))
-                self._image, self._looked = matching.normalise(frame.left, self.binning), True
+            if self._points is None:
+                self._settle_scale(frame.left, frame.right)
             right = matching.normalise(frame.right, self.binning)
             dense_px = disparity.search(self._image, right, self.reach.max_disparity_px)
             self.reach.see(dense_px)
