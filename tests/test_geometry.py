@@ -133,4 +133,4 @@ def test_the_nearest_rigid_motion_mends_what_products_lose():
     mended = g.rigid(bent)
     np.testing.assert_allclose(mended[:3, :3].T @ mended[:3, :3], np.eye(3), atol=1e-14)
     np.testing.assert_allclose(mended, true, atol=5e-6)
-    np.testing.assert_allclose(g.rigid(true), true, atol=1e-14)
+    np.testing.assert_allclose(g.rigid(np.stack([true, bent])), [true, mended], atol=1e-14)

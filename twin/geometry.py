@@ -49,9 +49,15 @@ def inverse(a_from_b: Array) -> Array:
 
 
 def rigid(almost: Array) -> Array:
-    """The rigid motion nearest to a product of many: `inverse` doubles what a rotation lacks of orthogonality."""
-    u, _, vt = np.linalg.svd(almost[:3, :3])
-    return pose(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, almost[:3, 3])
+    """The rigid motion nearest to a product of many: `inverse` doubles what a rotation lacks of orthogonality.
+
+    (..., 4, 4) -> (..., 4, 4)
+    """
+    u, _, vt = np.linalg.svd(almost[..., :3, :3])
+    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    result = almost.copy()
+    result[..., :3, :3] = u @ vt
+    return result
 
 
 @njit(cache=True, nogil=True)

@@ -303,12 +303,14 @@ class Navigator:
 
     def _move_keys(self, poses: dict[int, Array]) -> None:
         """Gives nodes their new poses; key points between them move along with the node before, if that moved."""
-        shift, numbers = np.eye(4), {node.number for node in self.nodes}
-        for key in self.keys:
-            if key.number in numbers:
-                new = poses.get(key.number, key.world_from_camera)
-                shift = new @ geometry.inverse(key.world_from_camera)
-            key.world_from_camera = geometry.rigid(shift @ key.world_from_camera)  # else errors treble
+        moving = self.keys[min(poses) :]
+        old = np.array([key.world_from_camera for key in moving])
+        numbers = {node.number for node in self.nodes}
+        owner = np.maximum.accumulate([k if key.number in numbers else 0 for k, key in enumerate(moving)])
+        new = np.array([poses.get(key.number, pose) for key, pose in zip(moving, old, strict=True)])
+        shift = new[owner] @ np.linalg.inv(old[owner])
+        for key, pose in zip(moving, geometry.rigid(shift @ old), strict=True):  # else errors treble
+            key.world_from_camera = pose
         for k, node in enumerate(self.nodes):
             self.node_poses[k] = node.world_from_camera
 
