@@ -53,6 +53,16 @@ def test_surveys_that_failed_do_not_count(tmp_path):
     assert "6 more failed by the machine or the program and do not count" in wording.headline(study, half)
 
 
+def test_surveys_to_beware_of_are_counted_and_one_is_told(tmp_path):
+    study = study_of(tmp_path)
+    said = found_of(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too murky" if s.sample < 3 else ""})
+    assert wording.headline(study, said).endswith("Beware in 3 of 12: surrogate: too murky.")
+
+
+def test_where_nothing_is_to_beware_of_nothing_is_said(study, found):
+    assert "Beware" not in wording.headline(study, found)
+
+
 def test_where_all_failed_nothing_is_said(tmp_path):
     study = study_of(tmp_path)
     assert wording.headline(study, found_of(study, tmp_path, fail)).startswith("No survey ended")

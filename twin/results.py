@@ -18,6 +18,7 @@ from twin.judge.metrics import evaluate
 from twin.mission import Mission
 from twin.records import ElevationMap, SurveyResult, Truth
 from twin.run_writer import RunFolder
+from twin.sea import Sea
 from twin.timing import Stopwatch
 
 
@@ -33,7 +34,7 @@ def conclude(
     mission: Mission,
     folder: RunFolder,
     navigator: Navigator,
-    truth: Truth,
+    sea: Sea,
     watch: Stopwatch,
     begun: float,
     reason: str,
@@ -51,7 +52,8 @@ def conclude(
     with watch("map"):
         elevation = make_map(mission, navigator, result, lambda share: say("map", share))
     wall_s = time.perf_counter() - begun
-    metrics = _judge(mission, result, elevation, truth, watch, wall_s, reason)
+    truth, said = sea.truth(), {"reason": reason, "warning": "; ".join(sea.warnings)}
+    metrics = _judge(mission, result, elevation, truth, watch, wall_s, said)
     say("report", 0.0)
     metrics = folder.finish(mission, result, elevation, truth, watch, metrics)
     return RunResult(metrics["status"], metrics, folder.path)
@@ -83,7 +85,7 @@ def _judge(
     truth: Truth,
     watch: Stopwatch,
     wall_s: float,
-    reason: str,
+    said: dict[str, str],
 ) -> dict[str, Any]:
     scenario = mission.scenario
     timing = {
@@ -97,8 +99,8 @@ def _judge(
         "seed": scenario.seed,
         "version": version("seabed-twin"),
         "scenario_hash": scenario.fingerprint(),
-        "status": "aborted" if reason else "complete",
-        "reason": reason,
+        "status": "aborted" if said["reason"] else "complete",
+        **said,
     }
     plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
     return evaluate(result, elevation, truth, mission.rig, plan, timing, identity, scenario.require)

@@ -61,7 +61,7 @@ def run(
             fly(mission, sea, navigator, _Watcher(mission, folder, progress, begun, live))
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
-        return conclude(mission, folder, navigator, sea.truth(), watch, begun, reason, say)
+        return conclude(mission, folder, navigator, sea, watch, begun, reason, say)
 
 
 def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Step, Estimate, Any], None]) -> None:

@@ -40,7 +40,8 @@ def evaluate(
     Args:
         plan_numbers: pattern, overlap_along and overlap_across of the plan.
         timing: wall_s, simulated_s, peak_rss_mb and the stages' summary (`Stopwatch.summary`).
-        identity: name, seed, version, scenario_hash, status ("complete" or "aborted") and reason.
+        identity: name, seed, version, scenario_hash, status ("complete" or "aborted"), reason and
+            warning: what to beware of ("" if nothing).
         require: limit for each named metric, e.g. {"map.le90_m": 0.05}.
 
     Raises:
@@ -51,7 +52,10 @@ def evaluate(
     grid = elevation.grid if elevation else None
     metrics = {
         "schema": SCHEMA,
-        **{key: identity.get(key) for key in ("name", "seed", "version", "scenario_hash", "status", "reason")},
+        **{
+            key: identity.get(key)
+            for key in ("name", "seed", "version", "scenario_hash", "status", "reason", "warning")
+        },
         "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in paths.items()},
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),

@@ -65,9 +65,12 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
     """The survey in one or two plain sentences: complete or not, how far off, in which water."""
     if metrics is None:
         return f"This survey is unfinished: it has no metrics.json. It was to be flown {conditions(scenario)}."
+    beware = f" Beware: {metrics['warning']}." if metrics.get("warning") else ""
     if metrics["status"] != "complete":
-        return f"The survey broke off ({metrics['reason']}). It was flown {conditions(scenario)}. {_result(metrics)}"
-    return f"The survey is complete, flown {conditions(scenario)}. {_result(metrics)}"
+        flown = f"The survey broke off ({metrics['reason']}). It was flown {conditions(scenario)}."
+    else:
+        flown = f"The survey is complete, flown {conditions(scenario)}."
+    return f"{flown} {_result(metrics)}{beware}"
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:

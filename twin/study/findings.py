@@ -61,7 +61,7 @@ class Findings:
 
     def __init__(self, rows: pa.Table, study: Study):
         self.rows, self.study, self.required_share = rows, study, study.probability
-        self.status, self.reason = self._texts("status"), self._texts("reason")
+        self.status, self.reason, self.warning = (self._texts(name) for name in ("status", "reason", "warning"))
         self.ended = self.status != "failed"
         self.complete = self.status == "complete"
         self.keys = [key for key in study.varied if f"vary.{key}" in rows.column_names]

@@ -54,7 +54,7 @@ def fly(survey: Survey) -> Row:
         return row_of(survey, "failed", str(error))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    told = row_of(survey, _status(metrics), metrics["reason"]) | flat(metrics)
+    told = row_of(survey, _status(metrics), metrics["reason"]) | {"warning": metrics["warning"]} | flat(metrics)
     return told | {"timing.survey_s": time.perf_counter() - began, "timing.host": platform.node()}
 
 

@@ -103,7 +103,7 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 def _ordered(names: Iterable[str]) -> list[str]:
     """Identity, what varies, figures, times: within each by name, as rows come in no order of their own."""
-    identity = ("sample", "seed", "status", "reason", "scenario_hash")
+    identity = ("sample", "seed", "status", "reason", "warning", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 
     def place(name: str) -> tuple[int, int, str]:

@@ -83,7 +83,7 @@ def headline(study: Study, found: Findings) -> str:
     return (
         f"{_sought(study, found)}A survey passes with a probability of {percent(passing.value)} ({percent(LEVEL)} "
         f"confidence: {percent(passing.low)} to {percent(passing.high)}): {int(found.passed.sum())} of {n} "
-        f"{_passing(found)}.{_required(found)}{_reason(found)}{_failed(found)}"
+        f"{_passing(found)}.{_required(found)}{_reason(found)}{_failed(found)}{_beware(found)}"
     )
 
 
@@ -100,6 +100,12 @@ def _sought(study: Study, found: Findings) -> str:
     ends = " to ".join(number(float(end)) if np.isfinite(end) else "beyond what was flown" for end in limit[1:])
     bound = "at least" if rising else "at most"
     return f"{wanted} where {study.seek} is {bound} {number(limit.value)} ({percent(LEVEL)} confidence: {ends}). "
+
+
+def _beware(found: Findings) -> str:
+    """How many surveys to trust less, and the first of the warnings."""
+    warned = found.warning[found.warning != ""]
+    return f" Beware in {len(warned)} of {len(found.warning)}: {warned[0]}." if len(warned) else ""
 
 
 def _reason(found: Findings) -> str:
