@@ -192,7 +192,7 @@ def test_water_outside_the_calibration_is_warned_of():
 
 
 def test_a_calibration_comes_back_from_disk_and_a_file_that_is_none_is_told(tmp_path):
-    model = ErrorModel(place_px=Law(0.031, 0.7), f2f_lasting=0.123)
+    model = ErrorModel(place_px=Law(0.031, 0.7), f2f_undone=0.123)
     kept = calibration.Calibration(model, 7, {"place_px": 0.1})
     calibration.save(kept, tmp_path / "model.toml")
     assert calibration.load(tmp_path / "model.toml") == kept
@@ -204,7 +204,7 @@ def test_a_calibration_comes_back_from_disk_and_a_file_that_is_none_is_told(tmp_
 def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     """The images are played by a surrogate with other errors than the one that it is compared with."""
     true = ErrorModel(
-        place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_lasting=0.2, steady=0.4,
+        place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_undone=0.4, steady=0.4,
         mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5,
     )  # fmt: skip
     notes = [
@@ -216,7 +216,7 @@ def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
         assert getattr(found, name)(bound_px) == pytest.approx(getattr(true, name)(bound_px), rel=0.05), name
     assert found.place_excess == pytest.approx(true.place_excess, rel=0.2)
     assert found.f2f_excess == pytest.approx(true.f2f_excess, rel=0.1)
-    assert found.f2f_lasting == pytest.approx(true.f2f_lasting, abs=0.1)
+    assert found.f2f_undone == pytest.approx(true.f2f_undone, abs=0.1)
     assert found.steady == pytest.approx(true.steady, abs=0.2)
     assert found.depth_px(bound_px) == pytest.approx(true.depth_px(bound_px), rel=0.15)
     assert found.lateral_px == pytest.approx(true.lateral_px, rel=0.2)

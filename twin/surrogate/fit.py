@@ -45,7 +45,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         steady=_steady(surveys, model.steady),
         f2f_px=f2f,
         f2f_excess=excess("f2f", model.f2f_excess),
-        f2f_lasting=float(np.median([_lasting(s) for s in surveys])),
+        f2f_undone=float(np.median([_undone(s) for s in surveys])),
         mosaic_px=mosaic,
         depth_px=_law(bounds, np.array(depth_px)),
         depth_excess=model.depth_excess * float(np.median(depth / claimed)),
@@ -86,10 +86,15 @@ def _share(bounds: np.ndarray, shares: np.ndarray) -> Share:
     return Share(float(found.x[0]), float(np.exp(found.x[1])), 4.0)
 
 
-def _lasting(notes: Notes) -> float:
-    """Frames of one interval err together by l: their sum's variance is 1 + (n - 1) l^2 times that of as many alone."""
-    n, together = np.median(notes["f2f_frames"]), np.median(notes["f2f_interval"]) / np.median(notes["f2f_nees"])
-    return float(np.sqrt(max(together - 1, 0.0) / (n - 1)))
+def _undone(notes: Notes) -> float:
+    """From by how much less the motion over an interval errs than its n frames would, were they independent.
+
+    Where each undoes the share u of the last one's error, (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) of it is left.
+    """
+    n = float(np.median(notes["f2f_frames"]))
+    left = np.median(notes["f2f_interval"]) / np.median(notes["f2f_nees"])
+    u = np.linspace(-1.0, 1.0, 2001)
+    return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - left))])
 
 
 def _steady(surveys: Sequence[Notes], own: float) -> float:

@@ -40,12 +40,12 @@ def compiled(
         numbers = vision.draw(n), *sea.sensors.noise(n)
         with sea.watch("physics"):
             n, reckoned, true, f2f, online = _fly(
-                vision.last_pose, vehicle.body, gauges, errors, navigator.reckoning, navigator.instruments, pilot.helm,
-                reference, numbers, n_steps, rate_hz,
+                vision.last_pose, vision.last_numbers, vehicle.body, gauges, errors,
+                navigator.reckoning, navigator.instruments, pilot.helm, reference, numbers, n_steps, rate_hz,
             )  # fmt: skip
         times_s = np.arange(len(sea), len(sea) + n) / rate_hz
         sea.record(true[:n], reference[0][:n], course.holding, track)
-        vision.last_pose = true[n - 1]
+        vision.last_pose, vision.last_numbers = true[n - 1], numbers[0][n - 1]
         navigator.go_on(reckoned)
         navigator.record(times_s, f2f[:n], online[:n])
         vehicle.passed(n / rate_hz)
@@ -55,7 +55,7 @@ def compiled(
 
 
 @njit(cache=True, nogil=True)
-def _fly(last, body, gauges, errors, reckoned, instruments, helm, reference, numbers, n_steps, rate_hz):
+def _fly(last, last_numbers, body, gauges, errors, reckoned, instruments, helm, reference, numbers, n_steps, rate_hz):
     """Frames flown (fewer where the physics diverged), reckoning after them, poses (n, 4, 4): true, f2f, online."""
     positions, velocities, yaws, accelerations = reference
     of_vision, of_gauges, of_log = numbers
@@ -64,7 +64,7 @@ def _fly(last, body, gauges, errors, reckoned, instruments, helm, reference, num
     for k in range(n):
         true[k] = body.pose @ gauges.body_from_camera
         height, angles, velocity = read_gauges(gauges, body.pose, twist_of(body), of_gauges[k], of_log[k])
-        a_from_b = moved(errors, last, true[k], of_vision[k])
+        a_from_b = moved(errors, last, true[k], of_vision[k], last_numbers if k == 0 else of_vision[k - 1])
         reckoned, aided = reckon(reckoned, instruments, a_from_b, errors.cov, height, angles, velocity)
         f2f[k], online[k], last = reckoned.f2f, reckoned.online, true[k]
         twist = geometry.log(aided) * rate_hz

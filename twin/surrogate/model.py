@@ -45,7 +45,7 @@ class ErrorModel(NamedTuple):
         common_px: deviation of a bias that all points of a link share.
         f2f_px: claimed deviation of a flow vector from frame to frame.
         f2f_excess: true over claimed deviation of a frame's motion.
-        f2f_lasting: share of a frame's deviation that stays from key point to key point.
+        f2f_undone: share of a frame's error that the next frame undoes: both are measured against the same points.
         mosaic_px: claimed deviation of a vector to the mosaic, as if as many as from frame to frame told it.
         mosaic_excess: true over claimed deviation of a correction.
         depth_px: claimed deviation of a pixel's filtered depth [px of disparity].
@@ -64,7 +64,7 @@ class ErrorModel(NamedTuple):
     common_px: float = 0.005
     f2f_px: Law = Law(0.05, 1.0)
     f2f_excess: float = 1.4
-    f2f_lasting: float = 0.5
+    f2f_undone: float = 0.3
     mosaic_px: Law = Law(0.2, 1.0)
     mosaic_excess: float = 2.0
     depth_px: Law = Law(0.05, 1.0)

@@ -67,11 +67,11 @@ class _Seen(NamedTuple):
 
 
 class FrameErrors(NamedTuple):
-    """What motions from frame to frame err by: root of the true covariance, claimed one (6, 6), lasting error (6,)."""
+    """What motions from frame to frame err by: root of the true covariance, claimed one (6, 6), share undone."""
 
     root: Array
     cov: Array
-    lasting: Array
+    undone: float
 
 
 class SurrogateVision:
@@ -107,6 +107,7 @@ class SurrogateVision:
         self._pixels = _raster(rig)
         self._rays = stereo.normalised(self._pixels, rig)
         self.last_pose: Array | None = None  # true one of the last frame
+        self.last_numbers = np.zeros(6)  # that its motion was drawn by
         self._seen: dict[int, _Seen] = {}
         self._now: _Seen | None = None
         self.looks: list[Look] = []
@@ -144,7 +145,9 @@ class SurrogateVision:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         if self._f2f is None:
             return coast(self._last_motion)
-        self._last_motion = moved(self._f2f, last, now, self.draw(1)[0])
+        numbers = self.draw(1)[0]
+        self._last_motion = moved(self._f2f, last, now, numbers, self.last_numbers)
+        self.last_numbers = numbers
         return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
 
     @property
@@ -184,8 +187,8 @@ class SurrogateVision:
         assert self._now is not None
         model = self.model
         root, cov = self._motion_errors(model.f2f_px(self._now.bound_px))
-        lasting = model.f2f_excess * model.f2f_lasting * (root @ self.draw(1)[0])
-        self._f2f = FrameErrors(model.f2f_excess * np.sqrt(1 - model.f2f_lasting**2) * root, cov, lasting)
+        alone = model.f2f_excess / np.sqrt(1 + model.f2f_undone**2)
+        self._f2f, self.last_numbers = FrameErrors(alone * root, cov, model.f2f_undone), np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
         """Root and covariance (6, 6) of a motion against known depths by eq. (2), where points err by so much."""
@@ -286,9 +289,13 @@ def _raster(rig: StereoRig) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def moved(errors, last, now, numbers):
-    """The motion (4, 4) from one true pose to the next as F2F tells it, with an error by standard normal numbers."""
-    return geometry.inverse(last) @ now @ geometry.exp(errors.root @ numbers + errors.lasting)
+def moved(errors, last, now, numbers, last_numbers):
+    """The motion (4, 4) from one true pose to the next as F2F tells it, with an error by standard normal numbers (6,).
+
+    Args:
+        last_numbers: those of the motion before.
+    """
+    return geometry.inverse(last) @ now @ geometry.exp(errors.root @ (numbers - errors.undone * last_numbers))
 
 
 @njit(cache=True, nogil=True)
