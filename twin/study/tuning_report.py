@@ -81,11 +81,15 @@ def value_of(name: str, value: float) -> str:
 
 
 def recommended_toml(study: Study, plan: Tuning, tuned: Tuned) -> str:
-    """The plan recommended as a scenario file, with what is known of it on top; "" where there is none."""
+    """The plan recommended as a scenario file, with what is known of it on top; "" where there is none.
+
+    What the surrogate found is to be flown rendered.
+    """
     if tuned.scenario is None:
         return ""
+    imaging = tuned.scenario.imaging.model_copy(update={"fidelity": "rendered"})
     head = [f"twin tune of {study.name}", headline(study, plan, tuned)]
-    return "".join(f"# {line}\n" for line in head) + dump_toml(tuned.scenario)
+    return "".join(f"# {line}\n" for line in head) + dump_toml(tuned.scenario.model_copy(update={"imaging": imaging}))
 
 
 def pareto(shown: list[Candidate], tuned: Tuned, plan: Tuning) -> Figure:
