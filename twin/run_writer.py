@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Collection
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,7 @@ class RunFolder:
         mesh.write_glb(self.path / "mesh.glb", elevation)
 
 
+@cache
 def environment() -> dict[str, str]:
     """What the survey ran on."""
     names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "gtsam", "rerun-sdk")

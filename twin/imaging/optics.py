@@ -14,6 +14,7 @@ own, and that the light in the veil was scattered more than once.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ class Optics:
         self._rig, self._medium = rig, medium(water)
         daylight = daylight_at(sun, self._medium, altitude_m)
         self._lights = [lights_of_eye(rig, lamps, daylight, eye) for eye in (0, 1)]
-        self._tables = [_tables(rig, self._medium, lights) for lights in self._lights]
+        self._tables_of = cache(lambda eye: _tables(rig, self._medium, self._lights[eye]))  # some need one eye only
         falls = bool(daylight.per_m.any())
         self._surface_lx = np.full(3, sun.illuminance_lx) if falls else daylight.eye_lx
         self._loss_per_m = np.array([daylight.per_m, self._medium.attenuation_per_m], np.float32)
@@ -136,7 +137,7 @@ class Optics:
         waves, ground = self._level if overhead is None else overhead
         sky = self._surface_lx.astype(np.float32), self._loss_per_m, waves, np.asarray(ground, np.float32)
         lamps = np.column_stack([lights.position_m, lights.axis, lights.intensity_cd, lights.colour])
-        beams, transmission, veil = self._tables[eye]
+        beams, transmission, veil = self._tables_of(eye)
         scene = np.ascontiguousarray(albedo), depth, focal, lamps.astype(np.float32), beams, transmission, veil, sky
         in_bands(lambda first, end: shade(*scene, out, lit, veil_out, first, end), len(depth))
 
