@@ -8,7 +8,7 @@ import study_surveys
 from study_surveys import STUDY, Here, study_of
 
 from twin.errors import ScenarioError, TwinError
-from twin.study import campaign, command
+from twin.study import campaign, command, wording
 from twin.study.engine import connect
 from twin.study.flight import flat, has_passed
 from twin.study.ledger import Ledger
@@ -61,6 +61,16 @@ def test_a_row_is_what_was_varied_how_it_ended_and_every_figure(table):
     lost = table.filter([value > 25 for value in table["vary.water.turbidity"].to_pylist()])
     assert set(lost["status"].to_pylist()) == {"aborted"}
     assert set(lost["reason"].to_pylist()) == {study_surveys.LOST}
+
+
+def test_the_pace_is_that_of_what_was_flown_now(study, tmp_path):
+    def fly(survey):
+        return study_surveys.fly(survey) | {"timing.survey_s": 2.0}
+
+    first = conduct(study, tmp_path / "out", Here(stop_before=5), function=fly).pace
+    rest = conduct(study, tmp_path / "out", resume=True, function=fly).pace
+    assert [(pace.surveys, pace.worked_s) for pace in (first, rest)] == [(5, 10.0), (11, 22.0)]
+    assert wording.pace(600, 300.0, 540.0) == "600 surveys in 300 s, 120 a minute; each took a worker 0.90 s"
 
 
 def test_a_study_that_was_interrupted_goes_on_where_it_was(study, table, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +20,14 @@ from twin.study.surveys import Survey, check_samples, keys, surveys
 from twin.study.worker import Limits
 
 
+class Pace(NamedTuple):
+    """How many surveys were flown now, in what time, and how long workers were at them [s]."""
+
+    surveys: int
+    wall_s: float
+    worked_s: float
+
+
 class Ended(NamedTuple):
     """A study that is over: what was found, its page, what could not be written and why, whether Ctrl-C ended it."""
 
@@ -26,6 +35,7 @@ class Ended(NamedTuple):
     page: Path
     unwritten: list[str]
     interrupted: bool
+    pace: Pace
 
 
 def conduct(
@@ -50,7 +60,15 @@ def conduct(
     done, wanted = ledger.done(), set(keys(study))
     progress.begin(len(wanted - done))
     missing = (survey for survey in surveys(study, folder) if survey.key not in done)
-    interrupted = not fly_all(study, missing, ledger.add, engine, progress, function)
+    worked_s: list[float] = []
+
+    def keep(row: Row) -> None:
+        worked_s.append(row.get("timing.survey_s") or 0.0)
+        ledger.add(row)
+
+    begun = time.perf_counter()
+    interrupted = not fly_all(study, missing, keep, engine, progress, function)
+    pace = Pace(len(worked_s), time.perf_counter() - begun, sum(worked_s))
 
     found = Findings(ledger.table(wanted), study)
     page = folder / "study.html"
@@ -59,7 +77,7 @@ def conduct(
         lambda: write_parquet(found.rows, folder / "results.parquet"),
         lambda: write_report(study, found, page),
     )
-    return Ended(found, page, unwritten, interrupted)
+    return Ended(found, page, unwritten, interrupted, pace)
 
 
 def open_folder(folder: Path, resume: bool, planned: Iterable[Survey]) -> Ledger:

@@ -47,7 +47,8 @@ def run(file: str, options: Options) -> int:
     for fault in ended.unwritten:
         console.fault(f"{folder}: {fault}; once there is space, --resume flies what is missing")
     if options.as_json:
-        print(json.dumps(findings.summary(ended.findings, {"name": study.name, "out": str(folder)}), indent=1))
+        identity = {"name": study.name, "out": str(folder), "pace": ended.pace._asdict()}
+        print(json.dumps(findings.summary(ended.findings, identity), indent=1))
     else:
         _show(study, ended)
     return exit_status(ended)
@@ -87,6 +88,8 @@ def _show(study: Study, ended: Ended) -> None:
         for level in ended.findings.levels
     ]
     console.table(f"{study.name}: median, and what 95 % of surveys keep", rows)
+    if ended.pace.surveys:
+        print(wording.pace(*ended.pace))
     if ended.page.is_file():
         print(f"Report: {ended.page}")
 

@@ -87,6 +87,14 @@ def headline(study: Study, found: Findings) -> str:
     )
 
 
+def pace(surveys: int, wall_s: float, worked_s: float) -> str:
+    """How many surveys were flown in what time, and what each took of a worker."""
+    each_s = worked_s / surveys
+    return (
+        f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} a minute; each took a worker {each_s:.2f} s"
+    )
+
+
 def _sought(study: Study, found: Findings) -> str:
     """How far the sought key may go."""
     if found.sought is None:
