@@ -53,13 +53,13 @@ class Diver:
 
     def key_point(self, pose, believed=None):
         (left, depth), (right, _) = self.frame(pose), self.frame(pose @ RIG.left_from_right)
-        pair = matching.normalise(left), matching.normalise(right)
+        pair = matching.gray(left), matching.gray(right)
         dense_px = (RIG.focal_px * RIG.baseline_m / depth).astype(np.float32)
         points = stereo.points_of_pair(*pair, dense_px, RIG, 300, PATCH_PX)
         self.spool.put(self.count, left, right, pair)
         key = KeyPoint(self.count, self.count, 1, pose if believed is None else believed, points, Readings())
         self.count += 1
-        return key, pair[0], depth
+        return key, matching.normalise(pair[0]), depth
 
 
 @pytest.fixture()
@@ -74,7 +74,12 @@ def over_flat_floor(number, x_m, y_m, depth_m=2.4):
     xyz = rays * depth_m
     measured = np.column_stack([rays[:, :2], np.full(768, RIG.baseline_m / depth_m)])
     points = stereo.StereoPoints(
-        np.zeros((768, 2), np.float32), np.zeros((768, 2)), measured, np.tile(np.eye(3) * 1e-8, (768, 1, 1)), xyz
+        np.zeros((768, 2), np.float32),
+        np.zeros((768, 2)),
+        measured[:, 2] * RIG.focal_px,
+        measured,
+        np.tile(np.eye(3) * 1e-8, (768, 1, 1)),
+        xyz,
     )
     return KeyPoint(number, number, 1, scene.down_camera(x_m, y_m, depth_m), points, Readings())
 
@@ -105,7 +110,7 @@ def test_normalised_images_do_not_depend_on_an_even_lamp_gain():
         scene.digitise(scene.look(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))[0], np.random.default_rng(0), 0)
     )
     half = (image * 0.5).astype(np.uint8)
-    difference = matching.normalise(image).astype(float) - matching.normalise(half)
+    difference = matching.normalise(matching.gray(image)).astype(float) - matching.normalise(matching.gray(half))
     assert np.median(np.abs(difference)) < 3  # of 36 grey levels of contrast; the rest is rounding of the darker image
 
 
@@ -133,7 +138,7 @@ def test_on_a_slope_stereo_errs_as_its_covariance_says():
     rig, rng, pose = scene.small_rig(), np.random.default_rng(1), scene.down_camera(0, 0, 2.0, (0, 0, np.pi / 2))
     left, right, depth = scene.stereo_pair(scene.plane(0.5, 0.2), rig, pose, rng)
     true_px = (rig.focal_px * rig.baseline_m / depth).astype(np.float32)
-    pair = (matching.normalise(colour(image)) for image in (left, right))
+    pair = (matching.gray(colour(image)) for image in (left, right))
     points = stereo.points_of_pair(*pair, true_px, rig, 300, PATCH_PX)
     columns, rows = points.pixels.astype(int).T
     error_px = points.measured[:, 2] * rig.focal_px - true_px[rows, columns]
@@ -151,7 +156,7 @@ def test_frame_to_frame_drifts_by_millimetres_over_fifteen_frames(diver):
     estimated, true = pose, pose
     for _ in range(15):
         true = true @ geometry.exp(np.array([0.001, 0.002, -0.001, 0.001, -0.02, 0.0]))
-        motion, status = f2f.step(matching.normalise(diver.frame(true)[0]))
+        motion, status = f2f.step(matching.normalise(matching.gray(diver.frame(true)[0])))
         assert status == "ok"
         estimated = estimated @ motion.a_from_b
     assert np.linalg.norm(error_of(true, estimated)[3:]) < 0.01
@@ -174,14 +179,14 @@ def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees
     for k, x in enumerate(np.arange(-1.0, 0.3, 0.3)):
         pose = scene.down_camera(x, 0, ALTITUDE_M)
         left, depth = diver.frame(pose)
-        mosaic.add(100 * k, matching.normalise(left), depth.astype(np.float32), pose, RIG)
+        mosaic.add(100 * k, matching.normalise(matching.gray(left)), depth.astype(np.float32), pose, RIG)
     errors = []
     for _ in range(10):
         rpy = tuple(diver.rng.normal(size=3) * 0.02)
         pose = scene.down_camera(0.3, diver.rng.uniform(-0.5, 0.5), ALTITUDE_M + diver.rng.uniform(-0.05, 0.05), rpy)
         left, depth = diver.frame(pose)
         predicted = pose @ geometry.exp(diver.rng.normal(size=6) * [0.003, 0.003, 0.003, 0.01, 0.01, 0.01])
-        found = mosaic.register(matching.normalise(left), depth.astype(np.float32), predicted, 1.9, RIG)
+        found = mosaic.register(matching.normalise(matching.gray(left)), depth.astype(np.float32), predicted, 1.9, RIG)
         assert found is not None
         assert found.laid_by in range(0, 500, 100)  # never between two
         errors.append(error_of(pose, predicted @ found.correction.a_from_b))
@@ -192,7 +197,12 @@ def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees
 def test_an_empty_mosaic_gives_no_position(diver, tmp_path):
     pose = scene.down_camera(0, 0, ALTITUDE_M)
     left, depth = diver.frame(pose)
-    assert Mosaic(0.01, tmp_path).register(matching.normalise(left), depth.astype(np.float32), pose, 1.9, RIG) is None
+    assert (
+        Mosaic(0.01, tmp_path).register(
+            matching.normalise(matching.gray(left)), depth.astype(np.float32), pose, 1.9, RIG
+        )
+        is None
+    )
 
 
 def test_noise_of_depth_does_not_pull_the_registration_with_the_mosaic(diver, tmp_path):
@@ -203,8 +213,10 @@ def test_noise_of_depth_does_not_pull_the_registration_with_the_mosaic(diver, tm
         (laid, truth), (left, seen) = (diver.frame(pose) for pose in poses)
         noisy = [1 / (1 / d + diver.rng.normal(0, 0.01, d.shape)) for d in (truth, seen)]
         mosaic = Mosaic(ALTITUDE_M / RIG.focal_px, tmp_path / str(k))
-        mosaic.add(k, matching.normalise(laid), noisy[0].astype(np.float32), poses[0], RIG)
-        found = mosaic.register(matching.normalise(left), noisy[1].astype(np.float32), poses[1], 1.9, RIG)
+        mosaic.add(k, matching.normalise(matching.gray(laid)), noisy[0].astype(np.float32), poses[0], RIG)
+        found = mosaic.register(
+            matching.normalise(matching.gray(left)), noisy[1].astype(np.float32), poses[1], 1.9, RIG
+        )
         assert found is not None
         errors.append(error_of(poses[1], poses[1] @ found.correction.a_from_b))
         claims.append(np.sqrt(np.diag(found.correction.cov)))

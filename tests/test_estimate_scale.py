@@ -66,14 +66,14 @@ def test_binning_by_four_halves_the_noise_twice():
 def test_where_pixels_are_taken_together_no_band_counts_more_than_another():
     scene, lit = np.random.default_rng(2).integers(60, 200, (240, 320), np.uint8), np.full((240, 320), 128, np.uint8)
     images = [np.stack([scene if band == k else lit for band in range(3)], axis=2) for k in range(3)]
-    red, green, blue = (matching.normalise(image, 2) for image in images)
+    red, green, blue = (matching.normalise(matching.gray(image, 2)) for image in images)
     np.testing.assert_allclose(red.astype(float), green, atol=1)
     np.testing.assert_allclose(red.astype(float), blue, atol=1)
 
 
 def test_where_corners_are_few_a_grid_covers_the_image_best_places_first():
     left, _ = pair(24.0, 12.0, noise=0.5)
-    image = matching.normalise(left, 2)
+    image = matching.normalise(matching.gray(left, 2))
     points = matching.corners(image, 500, 11)
     assert len(points) > 250
     strength = cv2.cornerMinEigenVal(image, 7)[tuple(points.astype(int).T[::-1])]
@@ -84,7 +84,7 @@ def test_where_corners_are_few_a_grid_covers_the_image_best_places_first():
 
 def test_where_corners_are_many_they_are_taken():
     left, _ = pair(2.0, 12.0)
-    points = matching.corners(matching.normalise(left), 500, 11)
+    points = matching.corners(matching.normalise(matching.gray(left)), 500, 11)
     assert len(np.unique(np.diff(np.unique(points[:, 0])))) > 1  # no grid
 
 

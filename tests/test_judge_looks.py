@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from judge_synthetic import survey, write_folder
 
-from twin.estimate.matching import contrast
+from twin.estimate.matching import contrast, gray
 from twin.judge.figures import look_curves
 from twin.judge.looks import look_metrics
 from twin.judge.run_folder import load_run
@@ -18,8 +18,8 @@ CHECKS = np.tile(np.kron([[1.0, -1.0], [-1.0, 1.0]], np.ones((5, 5))), (24, 32))
 
 
 def seen(reflected: float, veil: float, ripple: float = 0.5) -> np.ndarray:
-    """An image (240, 320, 3) of a chequered floor behind a veil, both in grey levels."""
-    return np.repeat((reflected * (1 + ripple * CHECKS) + veil)[..., None], 3, axis=2).astype(np.uint8)
+    """Grey levels (240, 320) of an image of a chequered floor behind a veil, both in grey levels."""
+    return gray(np.repeat((reflected * (1 + ripple * CHECKS) + veil)[..., None], 3, axis=2).astype(np.uint8))
 
 
 def test_contrast_does_not_depend_on_exposure_and_falls_by_the_veils_share():
@@ -29,7 +29,7 @@ def test_contrast_does_not_depend_on_exposure_and_falls_by_the_veils_share():
     assert contrast(seen(50, 0)) == pytest.approx(clear, rel=0.01)
     for veil in (25, 50, 100):
         assert contrast(seen(50, veil)) == pytest.approx(clear * 50 / (50 + veil), rel=0.01)
-    assert contrast(np.full((240, 320, 3), 90, np.uint8)) == contrast(np.zeros((240, 320, 3), np.uint8)) == 0
+    assert contrast(np.full((240, 320), 90, np.float32)) == contrast(np.zeros((240, 320), np.float32)) == 0
 
 
 def test_looks_that_made_no_key_point_count_and_are_counted():

@@ -18,7 +18,7 @@ from twin.estimate.velocity_log import Displacement
 from twin.geometry import Array
 from twin.records import Image, Readings
 
-_CACHE_BYTES = 192 * 2**20
+_CACHE_BYTES = 384 * 2**20
 
 
 @dataclass
@@ -47,12 +47,12 @@ class KeyPoint:
 
 
 class ImageSpool:
-    """Stereo pairs on disk as lossless PNG, the latest normalised ones in memory too.
+    """Stereo pairs on disk as lossless PNG, the grey levels of the latest in memory too.
 
     Memory stays bounded however long the survey is.
 
     Args:
-        binning: of the normalised ones.
+        binning: of the grey levels.
     """
 
     def __init__(self, folder: Path, binning: int = 1):
@@ -61,9 +61,9 @@ class ImageSpool:
         self._writer = ThreadPoolExecutor(1)  # compression takes the second core
         self._lock = threading.Lock()  # links are measured by other threads
         self._writing: Future[None] | None = None
-        self._normalised: OrderedDict[int, tuple[matching.Image, matching.Image]] = OrderedDict()
+        self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
 
-    def put(self, row: int, left: Image, right: Image, normalised: tuple[matching.Image, matching.Image]) -> None:
+    def put(self, row: int, left: Image, right: Image, gray: tuple[matching.Gray, matching.Gray]) -> None:
         """Stores the pair (height, width, 3) of the key point at this frame.
 
         Raises:
@@ -72,7 +72,7 @@ class ImageSpool:
         self.settle()
         self._writing = self._writer.submit(self._write, row, left, right)
         with self._lock:
-            self._remember(row, normalised)
+            self._remember(row, gray)
 
     def settle(self) -> None:
         """Waits for what is being written. Raises OSError where that failed."""
@@ -85,20 +85,20 @@ class ImageSpool:
         self.settle()
         return self._read(row, "left"), self._read(row, "right")
 
-    def normalised(self, row: int) -> tuple[matching.Image, matching.Image]:
-        """Left and right image, binned and locally normalised."""
+    def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
+        """Grey levels of the left and right image, binned (`matching.gray`)."""
         with self._lock:
-            if row not in self._normalised:
+            if row not in self._gray:
                 left, right = self.pair(row)
-                even = [matching.normalise(image, self.binning) for image in (left, right)]
-                self._remember(row, (even[0], even[1]))
-            self._normalised.move_to_end(row)
-            return self._normalised[row]
+                self._remember(row, (matching.gray(left, self.binning), matching.gray(right, self.binning)))
+            self._gray.move_to_end(row)
+            left, right = self._gray[row]
+        return left.astype(np.float32), right.astype(np.float32)
 
-    def _remember(self, row: int, pair: tuple[matching.Image, matching.Image]) -> None:
-        self._normalised[row] = pair
-        while len(self._normalised) * 2 * pair[0].nbytes > _CACHE_BYTES:
-            self._normalised.popitem(last=False)
+    def _remember(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
+        self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
+        while len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
+            self._gray.popitem(last=False)
 
     def _write(self, row: int, left: Image, right: Image) -> None:
         for side, image in (("left", left), ("right", right)):

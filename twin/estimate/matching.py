@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
+Gray = NDArray[np.float32]
 Points = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
@@ -25,47 +26,52 @@ _FLAT_GRAY = 2.0  # deviations below this are sensor noise, not texture
 _ROUND_TRIP_PX = 0.5
 
 
-def normalise(rgb: Image, binning: int = 1) -> Image:
-    """Grey image with local mean and contrast removed: the lamp pattern moves with the vehicle and must not be tracked.
+def gray(rgb: Image, binning: int = 1) -> Gray:
+    """Grey levels (height / binning, width / binning), hardly smoothed: what `patches` are registered on.
+
+    Where pixels are taken together, noise rules, and the bands are taken together as well: their mean holds 1.14 times
+    as much texture for its noise as luma over the coarse floor of `paper_coarse`, and its final error falls by a fifth.
 
     Args:
         rgb: (height, width, 3).
         binning: so many pixels become one along either side.
+    """
+    if binning == 1:
+        levels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    else:
+        levels = cv2.transform(binned(rgb.astype(np.float32), binning), _BANDS)
+    return np.asarray(cv2.GaussianBlur(levels, (3, 3), _SMOOTH_PX), np.float32)
+
+
+def normalise(levels: Gray) -> Image:
+    """Local mean and contrast of grey levels made even: the lamp pattern moves with the vehicle, none must track it.
 
     Returns:
-        (height / binning, width / binning) uint8, local mean 128, local deviation about 36 grey levels.
+        (height, width) uint8, local mean 128, local deviation about 36 grey levels. They depend on what lies around, at
+        the border on less: nothing to be measured on to a hundredth of a pixel.
     """
-    gray, mean, square = _levels(rgb, binning)
-    even = np.empty(gray.shape, np.uint8)
-    _even(gray.ravel(), mean.ravel(), square.ravel(), even.ravel())
+    mean, square = _around(levels)
+    even = np.empty(levels.shape, np.uint8)
+    _even(levels.ravel(), mean.ravel(), square.ravel(), even.ravel())
     return even
 
 
-def contrast(rgb: Image, binning: int = 1) -> float:
+def contrast(levels: Gray) -> float:
     """RMS contrast of what is matched: deviation of grey levels around a place over their mean, median over the image.
 
     Before it is made even by `normalise`. Noise counts as well: in the dark, and in thick water, little else is left.
     """
-    _, mean, square = (level[::4, ::4] for level in _levels(rgb, binning))
+    mean, square = (level[::4, ::4] for level in _around(levels))
     deviation = np.sqrt(np.maximum(square - mean**2, 0))
     return float(np.median(deviation / np.maximum(mean, 1.0)))
 
 
-def _levels(rgb: Image, binning: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Grey levels, hardly smoothed; their mean and mean square in the window around, an eighth of the image wide.
-
-    Where pixels are taken together, noise rules, and the bands are taken together as well: their mean holds 1.14 times
-    as much texture for its noise as luma over the coarse floor of `paper_coarse`, and its final error falls by a fifth.
-    """
-    if binning == 1:
-        gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    else:
-        gray = cv2.transform(binned(rgb.astype(np.float32), binning), _BANDS)
-    gray = cv2.GaussianBlur(gray, (3, 3), _SMOOTH_PX)
-    size = (gray.shape[1] // 8 | 1,) * 2
-    mean = cv2.boxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
-    square = cv2.sqrBoxFilter(gray, -1, size, borderType=cv2.BORDER_REFLECT)
-    return np.asarray(gray, np.float32), np.asarray(mean, np.float32), np.asarray(square, np.float32)
+def _around(levels: Gray) -> tuple[Gray, Gray]:
+    """Mean and mean square in the window around each pixel, an eighth of the image wide."""
+    size = (levels.shape[1] // 8 | 1,) * 2
+    mean = cv2.boxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
+    square = cv2.sqrBoxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(mean, np.float32), np.asarray(square, np.float32)
 
 
 def binned(image: Pixels, by: int) -> Pixels:

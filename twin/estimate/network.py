@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from twin import geometry
 from twin.estimate import matching, motion, observation, patches, stereo
@@ -139,7 +140,7 @@ class PairMatch:
         points = node.points
         if points is None:
             return [None for _ in others]
-        left, _ = self.spool.normalised(node.row)
+        left, _ = self.spool.gray(node.row)
         cut = patches.cut(patches.pyramid(left, _LEVELS), points.pixels, self.patch_px)
         return list(self._workers.map(lambda other: self._flow(node, points, cut, other), others))
 
@@ -158,16 +159,25 @@ class PairMatch:
         left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
         left_px = expected[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
         shift_px = np.column_stack([expected[:, 2] * rig.focal_px, np.zeros(len(expected))])
-        left, right = self.spool.normalised(other.row)
+        left, right = self.spool.gray(other.row)
         left_target = patches.splines(patches.pyramid(left, _LEVELS))
         in_left = patches.register(cut, left_target, left_px, left_warp)
         right_px, right_target = in_left.points - shift_px, patches.splines([right])
         in_right = patches.register(cut, right_target, right_px, right_warp)
         ok = in_left.ok & in_right.ok & stereo.on_one_row(in_left.points, in_right.points)
+        ok &= self._shows(points, other_from_node)
         in_node_px = (in_left.cov[ok] + in_right.cov[ok]) / 2
         cov = left_warp[ok] @ in_node_px @ left_warp[ok].transpose(0, 2, 1)
         measured, measured_cov = stereo.fuse(in_left.points[ok], in_right.points[ok], cov, rig)
         return Matched(measured, measured_cov, points.measured[ok], points.cov[ok])
+
+    def _shows(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
+        """Which points (n,) both images of the other pair show, patch and all."""
+        around = np.column_stack([points.measured[:, :2], points.around_px / self.rig.focal_px])
+        expected, _, _ = observation.transfer(around, other_from_node, self.rig.baseline_m)
+        left_px = expected[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
+        right_px = left_px - np.column_stack([expected[:, 2] * self.rig.focal_px, np.zeros(len(expected))])
+        return np.logical_and(*(stereo.well_inside(place, self.rig, self.patch_px) for place in (left_px, right_px)))
 
     def motion(self, node: KeyPoint, other: KeyPoint, matched: Matched) -> motion.Motion | None:
         """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted.

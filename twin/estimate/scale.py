@@ -36,8 +36,10 @@ def binning(left: Image, right: Image, rig: StereoRig, settings: Estimation) -> 
 
 def _share_found(left_rgb: Image, right_rgb: Image, by: int, rig: StereoRig, settings: Estimation) -> float:
     """Share of the corners with a rough disparity that are found to a fraction of a pixel."""
-    left, right = matching.normalise(left_rgb, by), matching.normalise(right_rgb, by)
-    dense_px = disparity.search(left, right, disparity.Reach(rig).max_disparity_px)
+    left, right = matching.gray(left_rgb, by), matching.gray(right_rgb, by)
+    dense_px = disparity.search(
+        matching.normalise(left), matching.normalise(right), disparity.Reach(rig).max_disparity_px
+    )
     pixels, _ = stereo.corners_with_disparity(left, dense_px, settings.points, settings.patch_px)
     points = stereo.points_of_pair(left, right, dense_px, rig, settings.points, settings.patch_px)
     return len(points.xyz) / max(len(pixels), 1)

@@ -107,6 +107,7 @@ class StereoVision:
         self.mosaic = Mosaic(self._cell_m * binning, self._folder / "mosaic")
         self.matcher = PairMatch(self.rig, self.spool, self.settings.patch_px)
         self.reach = disparity.Reach(self.rig)
+        self._gray = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
         self._image = np.zeros((self.rig.height_px, self.rig.width_px), np.uint8)
         self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
 
@@ -115,12 +116,17 @@ class StereoVision:
         binning = scale.binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self._use(binning)
-            self._image = matching.normalise(left, binning)
+            self._take(left)
             self.f2f.step(self._image)
+
+    def _take(self, left: Image) -> None:
+        """Makes the image of the left eye the one of now."""
+        self._gray = matching.gray(left, self.binning)
+        self._image = matching.normalise(self._gray)
 
     def step(self, frame: Frame) -> tuple[Motion, str]:
         with self.watch("f2f"):
-            self._image = matching.normalise(frame.left, self.binning)
+            self._take(frame.left)
             return self.f2f.step(self._image)
 
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -128,17 +134,17 @@ class StereoVision:
         with self.watch("stereo"):
             if self._points is None:
                 self._settle_scale(frame.left, frame.right)
-            right = matching.normalise(frame.right, self.binning)
-            dense_px = disparity.search(self._image, right, self.reach.max_disparity_px)
+            right = matching.gray(frame.right, self.binning)
+            dense_px = disparity.search(self._image, matching.normalise(right), self.reach.max_disparity_px)
             self.reach.see(dense_px)
             points = stereo.points_of_pair(
-                self._image, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
+                self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
-        self.looks.append(Look(row, len(points.xyz), matching.contrast(frame.left, self.binning)))
+        self.looks.append(Look(row, len(points.xyz), matching.contrast(self._gray)))
         if len(points.xyz) < _LEAST_POINTS:
             return None
         self._points, self._depth_m = points, _depth(dense_px, self.rig)
-        self.spool.put(row, frame.left, frame.right, (self._image, right))
+        self.spool.put(row, frame.left, frame.right, (self._gray, right))
         return points
 
     def restart(self) -> None:
@@ -158,7 +164,7 @@ class StereoVision:
         self.mosaic.clear()
         self._depth_of_key = {k.number: self._depth_of_key[k.number] for k in keys}
         for key in keys:
-            image = self.spool.normalised(key.row)[0]
+            image = matching.normalise(self.spool.gray(key.row)[0])
             depth_m = self._depth_of_key[key.number].astype(np.float32)
             self.mosaic.add(key.number, image, depth_m, key.world_from_camera, self.rig)
 
