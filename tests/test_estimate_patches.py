@@ -153,3 +153,19 @@ def test_fused_matches_are_the_least_squares_estimate_given_equal_rows():
 )
 def test_a_match_on_another_row_or_beyond_infinity_is_none(right, possible):
     assert stereo.on_one_row(np.array([[90.0, 50.0]]), np.array([right])).item() == possible
+
+
+def test_at_the_border_those_are_found_that_err_inwards_so_only_what_is_well_inside_counts():
+    rig = StereoRig(SHAPE[1], SHAPE[0], 160.0, 0.3, 30.0, np.eye(4))
+    rows = np.arange(12.0, 108.0, 2.0)
+    errors = {column: [] for column in (6.0, 9.0)}  # half a patch and what interpolation needs, and three pixels more
+    for seed in range(12):
+        images, *_ = pair(np.eye(2), np.zeros(2), noise=25.0, seed=seed)
+        for column, found in errors.items():
+            points = np.column_stack([np.full(len(rows), column), rows])
+            match = register(images, points, points, np.eye(2))
+            found.append((match.points - points)[match.ok, 0])
+    border, inside = (np.concatenate(found) for found in errors.values())
+    sure = [3 * error.std() / np.sqrt(len(error)) for error in (border, inside)]
+    assert border.mean() > sure[0] and abs(inside.mean()) < sure[1]
+    assert stereo.well_inside(np.array([[6.0, 50.0], [9.0, 50.0]]), rig, PATCH_PX).tolist() == [False, True]
