@@ -157,8 +157,7 @@ class PairMatch:
         expected, by_point, _ = observation.transfer(points.measured, other_from_node, rig.baseline_m)
         warp = by_point[:, :, :2] + by_point[:, :, 2:] * points.slope[:, None, :]
         left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
-        left_px = expected[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
-        shift_px = np.column_stack([expected[:, 2] * rig.focal_px, np.zeros(len(expected))])
+        left_px, shift_px = self._places(expected)
         left, right = self.spool.gray(other.row)
         left_target = patches.splines(patches.pyramid(left, _LEVELS))
         in_left = patches.register(cut, left_target, left_px, left_warp)
@@ -175,9 +174,14 @@ class PairMatch:
         """Which points (n,) both images of the other pair show, patch and all."""
         around = np.column_stack([points.measured[:, :2], points.around_px / self.rig.focal_px])
         expected, _, _ = observation.transfer(around, other_from_node, self.rig.baseline_m)
+        left_px, shift_px = self._places(expected)
+        in_left, in_right = (stereo.well_inside(px, self.rig, self.patch_px) for px in (left_px, left_px - shift_px))
+        return in_left & in_right
+
+    def _places(self, expected: Array) -> tuple[Array, Array]:
+        """Where the left image shows points (n, 3), and how much farther left the right one does: (n, 2) [px]."""
         left_px = expected[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
-        right_px = left_px - np.column_stack([expected[:, 2] * self.rig.focal_px, np.zeros(len(expected))])
-        return np.logical_and(*(stereo.well_inside(place, self.rig, self.patch_px) for place in (left_px, right_px)))
+        return left_px, np.column_stack([expected[:, 2] * self.rig.focal_px, np.zeros(len(expected))])
 
     def motion(self, node: KeyPoint, other: KeyPoint, matched: Matched) -> motion.Motion | None:
         """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted.

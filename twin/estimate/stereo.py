@@ -80,8 +80,8 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
     """Which patches (n, 2) are so far inside an image that no error of their places decides whether they are found.
 
     Told of expected places that are free of the match's noise. Where the measured place decides, those are kept that
-    err inwards: over coarse texture, with errors of 0.1 to 0.2 px, disparities at the border came out 0.016 px too
-    small and legs tilted by 0.5 mrad each to the next.
+    err inwards: over coarse texture, with errors of 0.1 to 0.2 px, disparities at the border came out 0.02 px smaller,
+    and links over two key points erred by 0.16 mrad on average.
     """
     return matching.inside(pixels, (rig.height_px, rig.width_px), patch_px // 2 + _SPARE_PX)
 

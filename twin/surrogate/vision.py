@@ -181,9 +181,8 @@ class SurrogateVision:
             measured = truth + noise.reshape(-1, 3)[met] @ (self._unit_root.T * place * model.place_excess)
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * place**2, (n, 3, 3))
-            return StereoPoints(
-                self._pixels[met].astype(np.float32), np.zeros((n, 2)), measured[:, 2], measured, cov, xyz
-            )
+            pixels, around_px = self._pixels[met].astype(np.float32), self.rig.focal_px * measured[:, 2]
+            return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz)
 
     def restart(self) -> None:
         assert self._now is not None
