@@ -193,8 +193,8 @@ def quaternion_wxyz(rotation: Array) -> Array:
 
 
 def rotation_from_wxyz(quaternion: Array) -> Array:
-    """Rotation matrix of MuJoCo's quaternion [w, x, y, z]."""
-    return Rotation.from_quat(np.asarray(quaternion)[[1, 2, 3, 0]]).as_matrix()
+    """Rotation matrices (..., 3, 3) of MuJoCo's quaternions [w, x, y, z] (..., 4)."""
+    return Rotation.from_quat(np.asarray(quaternion)[..., [1, 2, 3, 0]]).as_matrix()
 
 
 def quaternion_xyzw(rotation: Array) -> Array:

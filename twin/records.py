@@ -167,8 +167,8 @@ class Trajectory:
         """Reads a TUM file that `save` or another tool wrote."""
         rows = np.loadtxt(path, ndmin=2)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        for k, row in enumerate(rows):
-            poses[k] = geometry.pose(geometry.rotation_from_wxyz(row[[7, 4, 5, 6]]), row[1:4])
+        poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
+        poses[:, :3, 3] = rows[:, 1:4]
         return Trajectory(rows[:, 0], poses)
 
 

@@ -63,21 +63,17 @@ def align(
     graph, values = _without_links(nodes, anchors, rig, noise)
     fit = _Fit(graph, list(links), _factors_of(links, {} if factors is None else factors))
     dropped: list[Link] = []
-    reached = False
     for _ in range(_ROUNDS):
-        values, reached = fit.optimise(values, _FEW_ITERATIONS)
-        wrong = fit.contradictions(values)
+        found = fit.optimise(values, _FEW_ITERATIONS, marginals_of)
+        values, wrong = found.values, fit.contradictions(found.values)
         if not wrong.any():
             break
         dropped += [link for link, out in zip(fit.links, wrong, strict=True) if out]
-        fit, reached = fit.without(wrong), False
-    if not reached:
-        values, _ = fit.optimise(values, _MOST_ITERATIONS)
-    return Aligned(
-        np.stack([values.atPose3(k.number).matrix() for k in nodes]),
-        _marginals(fit.graph(), values, nodes, marginals_of),
-        dropped,
-    )
+        fit = fit.without(wrong)
+    if wrong.any() or not found.reached:
+        found = fit.optimise(values, _MOST_ITERATIONS, marginals_of)
+    poses = np.stack([found.values.atPose3(k.number).matrix() for k in nodes])
+    return Aligned(poses, _marginals(found, nodes, marginals_of), dropped)
 
 
 class _Fit(NamedTuple):
@@ -94,8 +90,8 @@ class _Fit(NamedTuple):
             graph.add(factor)
         return graph
 
-    def optimise(self, start: gtsam.Values, iterations: int) -> tuple[gtsam.Values, bool]:
-        return pose_graph.optimise(self.graph(), start, iterations)
+    def optimise(self, start: gtsam.Values, iterations: int, last: Sequence[int] | None) -> pose_graph.Optimum:
+        return pose_graph.optimise(self.graph(), start, iterations, last)
 
     def contradictions(self, values: gtsam.Values) -> Mask:
         """(n,) links that contradict the rest, but for those small beside the worst, which may be its doing.
@@ -130,9 +126,8 @@ def _without_links(nodes, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGra
     return graph, start
 
 
-def _marginals(graph, values, nodes: Sequence[KeyPoint], wanted: Sequence[int] | None) -> Array:
+def _marginals(found: pose_graph.Optimum, nodes: Sequence[KeyPoint], wanted: Sequence[int] | None) -> Array:
     covs = np.zeros((len(nodes), 6, 6))
     rows = [k for k, node in enumerate(nodes) if wanted is None or node.number in wanted]
-    if rows:
-        covs[rows] = pose_graph.marginals(graph, values, [nodes[k].number for k in rows])
+    covs[rows] = found.marginals([nodes[k].number for k in rows])
     return covs

@@ -1,14 +1,15 @@
-"""Marginal covariances of a linearised graph: as much of the inverse as the elimination touched, and no more.
+"""Marginal covariances of an eliminated graph: as much of the inverse as the elimination touched, and no more.
 
-Elimination leaves, variable by variable, R x + S p = d with the parents p that are eliminated later. From the last one
-back, cov(x, p) = -W cov(p, p) and cov(x, x) = (R'R)^-1 - cov(x, p) W' with W = R^-1 S (Takahashi et al. 1973). The
-covariance of all parents is at hand: they stand together in the block of the one eliminated first among them. Where
-variables follow one another with the same parents they share a block, which only grows.
+Elimination leaves, variable by variable, R x + S p = d with the parents p that are eliminated later. Variables that
+follow one another with the same parents form a supernode, whose rows are taken together: from the last one back,
+cov(x, p) = -W cov(p, p) and cov(x, x) = (R'R)^-1 - cov(x, p) W' with W = R^-1 S (Takahashi et al. 1973). The covariance
+of the parents is at hand: they all belong to, or are parents of, the supernode of the one eliminated first among them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -30,76 +31,65 @@ class _Row(NamedTuple):
     s: Array
 
 
-class _Block:
-    """Joint covariance of the variables that it has taken in, first to last."""
+class _Supernode(NamedTuple):
+    """Variables in the order of their elimination, and the number of the supernode with the first of their parents."""
 
-    def __init__(self) -> None:
-        self.cov, self.size = np.empty((0, 0)), 0
-        self._place: dict[int, Columns] = {}
+    rows: list[_Row]
+    above: int | None
 
-    def columns(self, keys: Collection[int]) -> Columns:
-        """Where the numbers of these variables stand."""
-        return np.concatenate([self._place[k] for k in keys])
-
-    def part(self, keys: Collection[int]) -> _Block:
-        """A block of some of the variables."""
-        columns, part = self.columns(keys), _Block()
-        part.cov, part.size = self.cov[columns[:, None], columns], len(columns)
-        ends = np.cumsum([len(self._place[k]) for k in keys])
-        part._place = dict(zip(keys, np.split(np.arange(part.size), ends[:-1]), strict=True))
-        return part
-
-    def append(self, key: int, cov: Array, cross: Array) -> None:
-        """Takes a variable in: its covariance (d, d), and (d, n) with what the block has so far."""
-        n, d = self.size, len(cov)
-        if n + d > len(self.cov):
-            grown = np.empty((max(2 * n, n + d),) * 2)
-            grown[:n, :n] = self.cov[:n, :n]
-            self.cov = grown
-        self.cov[n : n + d, :n], self.cov[:n, n : n + d], self.cov[n : n + d, n : n + d] = cross, cross.T, cov
-        self._place[key], self.size = np.arange(n, n + d), n + d
+    @property
+    def parents(self) -> tuple[int, ...]:
+        return self.rows[-1].parents
 
 
-def marginals(graph: gtsam.GaussianFactorGraph, order: gtsam.Ordering, wanted: Collection[int]) -> dict[int, Array]:
-    """Covariance (d, d) of each of the variables `wanted`; quickest where `order` has them last.
+class _Joint:
+    """Covariance of a supernode's variables and of their parents, by that of the supernode above, which has these."""
 
-    Raises:
-        RuntimeError: the factors do not hold every variable.
-    """
-    net = graph.eliminateSequential(order)
-    rows = [_row(net.at(k)) for k in range(net.size())]
-    owner, start = _owners(rows)
-    last_use = {block: k for k in reversed(range(len(rows))) for block in (owner[k], start[k])}
-    blocks: dict[int, _Block] = {}
+    def __init__(self, node: _Supernode, above: _Joint | None):
+        sizes = {row.key: len(row.r) for row in node.rows}
+        n = sum(sizes.values())
+        if above is not None:
+            sizes |= {key: len(above.place[key]) for key in node.parents}
+        ends = np.cumsum([0, *sizes.values()])
+        self.place = {key: np.arange(a, b) for key, a, b in zip(sizes, ends, ends[1:], strict=False)}
+        self.cov = np.empty((ends[-1], ends[-1]))
+        eliminated = np.zeros((n, ends[-1]))
+        for row in node.rows:
+            own = self.place[row.key]
+            eliminated[own[:, None], own] = row.r
+            eliminated[own[:, None], self._columns(row.parents)] = row.s
+        inverse = solve_triangular(eliminated[:, :n], np.eye(n), check_finite=False)
+        self.cov[:n, :n] = inverse @ inverse.T
+        if above is not None:
+            weight = inverse @ eliminated[:, n:]
+            self.cov[n:, n:] = above.part(node.parents)
+            self.cov[:n, n:] = -weight @ self.cov[n:, n:]
+            self.cov[n:, :n] = self.cov[:n, n:].T
+            self.cov[:n, :n] -= self.cov[:n, n:] @ weight.T
+
+    def part(self, keys: Sequence[int]) -> Array:
+        """What it says of some of the variables."""
+        columns = self._columns(keys)
+        return self.cov[columns[:, None], columns]
+
+    def _columns(self, keys: Sequence[int]) -> Columns:
+        return np.concatenate([self.place[key] for key in keys]) if keys else np.empty(0, np.int64)
+
+
+def marginals(net: gtsam.GaussianBayesNet) -> dict[int, Array]:
+    """Covariance (d, d) of each variable."""
+    supernodes = _supernodes([_row(net.at(k)) for k in reversed(range(net.size()))])
+    below = Counter(node.above for node in supernodes)
+    joints: dict[int | None, _Joint] = {}
     found: dict[int, Array] = {}
-    for k in reversed(range(len(rows))):
-        if len(found) == len(wanted):
-            break
-        row = rows[k]
-        if owner[k] == k:
-            from_block = start[k]
-            blocks[k] = _Block() if from_block is None else blocks[from_block].part(row.parents)
-        cov = _take_in(row, blocks[owner[k]])
-        if row.key in wanted:
-            found[row.key] = cov
-        for block in {owner[k], start[k]}:
-            if last_use[block] == k:
-                blocks.pop(block, None)
+    for number, node in enumerate(supernodes):
+        joint = joints[number] = _Joint(node, joints.get(node.above))
+        found |= {row.key: joint.part([row.key]) for row in node.rows}
+        below[node.above] -= 1
+        for done in (number, node.above):
+            if not below[done]:
+                joints.pop(done, None)
     return found
-
-
-def _take_in(row: _Row, block: _Block) -> Array:
-    """The covariance of a variable all of whose parents make up the block, which it joins."""
-    n = block.size
-    inverse = solve_triangular(row.r, np.eye(len(row.r)))
-    own, cross = inverse @ inverse.T, np.empty((len(row.r), 0))
-    if n:
-        weight = np.zeros((len(row.r), n))
-        weight[:, block.columns(row.parents)] = inverse @ row.s
-        cross = -weight @ block.cov[:n, :n]
-        own = own - cross @ weight.T
-    block.append(row.key, own, cross)
-    return own
 
 
 def _row(conditional: gtsam.GaussianConditional) -> _Row:
@@ -107,23 +97,23 @@ def _row(conditional: gtsam.GaussianConditional) -> _Row:
     return _Row(key, conditional.R(), tuple(parents), conditional.S())
 
 
-def _owners(rows: list[_Row]) -> tuple[list[int], list[int | None]]:
-    """For each variable the one whose block it joins (itself: a new one), and the one whose block that starts from.
-
-    One variable may go on in the block of its first parent: one whose parents are all that is in it.
-    """
-    turn = {row.key: k for k, row in enumerate(rows)}
-    owner = list(range(len(rows)))
-    start: list[int | None] = [None] * len(rows)
-    taken: set[int] = set()
-    for k in reversed(range(len(rows))):
-        parents = [turn[key] for key in rows[k].parents]
-        if not parents:
-            continue
-        first = min(parents)
-        if first not in taken and len(parents) == 1 + len(rows[first].parents):
-            taken.add(first)
-            owner[k] = owner[first]
+def _supernodes(rows: Sequence[_Row]) -> list[_Supernode]:
+    """All supernodes, from the last one eliminated back, of rows in that order."""
+    turn = {row.key: -k for k, row in enumerate(rows)}
+    home: dict[int | None, int] = {}
+    supernodes: list[_Supernode] = []
+    for row in rows:
+        first = min(row.parents, key=turn.__getitem__, default=None)
+        above = home.get(first)
+        if above is not None and _follows(row, first, supernodes[above].rows[0]):
+            supernodes[above].rows.insert(0, row)
+            home[row.key] = above
         else:
-            start[k] = owner[first]
-    return owner, start
+            home[row.key] = len(supernodes)
+            supernodes.append(_Supernode([row], above))
+    return supernodes
+
+
+def _follows(row: _Row, first: int | None, last: _Row) -> bool:
+    """Whether a row has no other parents than the one eliminated next and that one's."""
+    return last.key == first and len(row.parents) == 1 + len(last.parents)

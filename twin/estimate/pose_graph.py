@@ -1,8 +1,9 @@
 """Pose graphs: the poses X that agree best with the motions Z measured between them, the core of the alignment (P15).
 
 F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance; rho is r^2 / 2, or
-Huber's function. gtsam minimises it by Levenberg-Marquardt. Without good poses to start from, the start is chordal
-(Carlone et al. 2015): rotations by linear least squares, then positions. Raw odometry is none on a hard graph.
+Huber's function. Gauss-Newton on gtsam's factors minimises it, Levenberg-Marquardt where that leads
+up. Without good poses to start from, the start is chordal (Carlone et al. 2015): rotations by linear least squares,
+then positions. Raw odometry is none on a hard graph.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def solve(links: Sequence[Link], start: dict[int, Array] | None = None, huber: f
     graph = _held(numbers[0], values.atPose3(numbers[0]))
     for factor in between_factors(links, huber):
         graph.add(factor)
-    values, _ = optimise(graph, values)
+    values = optimise(graph, values).values
     return Solved({number: values.atPose3(number).matrix() for number in numbers}, graph.error(values))
 
 
@@ -69,44 +70,81 @@ def gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
     return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
 
 
+class Optimum(NamedTuple):
+    """The values that minimise F, whether they were reached, and what the graph was eliminated to at the last step."""
+
+    values: gtsam.Values
+    reached: bool
+    eliminated: gtsam.GaussianBayesTree | gtsam.GaussianBayesNet
+
+    def marginals(self, numbers: Sequence[int]) -> Array:
+        """(n, 6, 6) covariance of poses [rotation, translation] (rad, m), each in its own axes."""
+        if isinstance(self.eliminated, gtsam.GaussianBayesNet):
+            covs = selected.marginals(self.eliminated)
+            return np.array([covs[number] for number in numbers]).reshape(-1, 6, 6)
+        return np.array([self.eliminated.marginalCovariance(number) for number in numbers]).reshape(-1, 6, 6)
+
+
 def optimise(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int = 100
-) -> tuple[gtsam.Values, bool]:
-    """The nearest minimum by Levenberg-Marquardt, and whether it was reached in so many iterations.
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int = 100, last: Sequence[int] | None = ()
+) -> Optimum:
+    """The nearest minimum by Gauss-Newton; where its step leads up, by Levenberg-Marquardt.
+
+    Args:
+        last: numbers of the few poses whose marginals will be wanted: eliminated last, theirs cost nothing. None: all,
+            for which the graph is eliminated variable by variable once it is near, not by the quicker tree.
 
     Raises:
         RuntimeError: the factors do not hold every variable.
     """
+    order, values, cost = _order(graph, start, last), start, graph.error(start)
+    by_variable, reached, eliminated = False, False, None
+    while iterations > 0 and not reached:
+        del eliminated  # one at a time is enough to hold
+        eliminated = _eliminate(graph.linearize(values), order, by_variable)
+        moved = values.retract(eliminated.optimize())
+        moved_cost, iterations = graph.error(moved), iterations - 1
+        if moved_cost > cost + _LEAST_GAIN:
+            moved = _damped(graph, values, order, iterations)
+            moved_cost = graph.error(moved)
+        reached = cost - moved_cost < _LEAST_GAIN and by_variable == (last is None)
+        values, cost, by_variable = moved, moved_cost, last is None
+    return Optimum(values, reached, eliminated)
+
+
+def _eliminate(
+    linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool
+) -> gtsam.GaussianBayesTree | gtsam.GaussianBayesNet:
+    return linear.eliminateSequential(order) if by_variable else linear.eliminateMultifrontal(order)
+
+
+def _damped(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, order: gtsam.Ordering, iterations: int
+) -> gtsam.Values:
+    """The nearest minimum by Levenberg-Marquardt."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0)
     parameters.setAbsoluteErrorTol(_LEAST_GAIN)
     parameters.setMaxIterations(iterations)
-    if start.size() > _MANY:
-        parameters.setOrderingType("METIS")
-    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    return optimizer.optimize(), optimizer.iterations() < iterations
+    parameters.setOrdering(order)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
+
+
+def _order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int] | None) -> gtsam.Ordering:
+    """The order of elimination.
+
+    What has a letter for its name (a beacon, a scale error) comes last: first, it would join all poses that share it.
+    """
+    if values.size() > _MANY:
+        return gtsam.Ordering.MetisNonlinearFactorGraph(graph)
+    shared = [key for key in values.keys() if gtsam.symbolChr(key)]
+    return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*(last or ()), *shared])
 
 
 def chi2(factors: Sequence[gtsam.BetweenFactorPose3], covs: Array, values: gtsam.Values) -> Array:
     """(n,) squared residual of each link in units of its covariance (n, 6, 6), before any robust weight."""
     residuals = np.array([factor.unwhitenedError(values) for factor in factors]).reshape(-1, 6)
     return np.einsum("ni,ni->n", residuals, np.linalg.solve(covs, residuals[..., None])[..., 0])
-
-
-def marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, numbers: Sequence[int]) -> Array:
-    """(n, 6, 6) covariance of these poses [rotation, translation] (rad, m), each in its own axes.
-
-    They are eliminated last, so that a few cost one elimination and no walk through the tree; and with them what has a
-    letter for its name (a beacon, a scale error): eliminated first, it would join all poses that share it.
-    """
-    shared = [key for key in values.keys() if gtsam.symbolChr(key)]
-    order = (
-        gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-        if _MANY < len(numbers) == values.size()
-        else gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*numbers, *shared])
-    )
-    covs = selected.marginals(graph.linearize(values), order, frozenset(numbers))
-    return np.array([covs[number] for number in numbers]).reshape(-1, 6, 6)
 
 
 def _values(poses: dict[int, Array]) -> gtsam.Values:
