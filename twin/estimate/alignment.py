@@ -1,7 +1,7 @@
 """Global alignment (P15, P16): the poses of all nodes that agree best with the motions measured between them.
 
 Eliminating the multipliers of the mixed-adjustment model, eq. (7), leaves a least-squares problem whose blocks are the
-links: a graph of between-factors. gtsam solves it (Levenberg-Marquardt with Huber weights) and gives the marginals.
+links: a graph of between-factors. `pose_graph` solves it (with Huber weights) and gives the marginals.
 Links that contradict the rest are dropped and told.
 """
 
@@ -63,15 +63,16 @@ def align(
     graph, values = _without_links(nodes, anchors, rig, noise)
     fit = _Fit(graph, list(links), _factors_of(links, {} if factors is None else factors))
     dropped: list[Link] = []
+    found = fit.optimise(values, _FEW_ITERATIONS, marginals_of)
     for _ in range(_ROUNDS):
-        found = fit.optimise(values, _FEW_ITERATIONS, marginals_of)
-        values, wrong = found.values, fit.contradictions(found.values)
+        wrong = fit.contradictions(found.values)
         if not wrong.any():
             break
         dropped += [link for link, out in zip(fit.links, wrong, strict=True) if out]
         fit = fit.without(wrong)
-    if wrong.any() or not found.reached:
-        found = fit.optimise(values, _MOST_ITERATIONS, marginals_of)
+        found = fit.optimise(found.values, _FEW_ITERATIONS, marginals_of)
+    if not found.reached:
+        found = fit.optimise(found.values, _MOST_ITERATIONS, marginals_of)
     poses = np.stack([found.values.atPose3(k.number).matrix() for k in nodes])
     return Aligned(poses, _marginals(found, nodes, marginals_of), dropped)
 

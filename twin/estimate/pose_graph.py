@@ -25,6 +25,9 @@ _MANY = 2500  # poses from which on nested dissection saves more than it costs
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 
 
+Eliminated = gtsam.GaussianBayesTree | gtsam.GaussianBayesNet
+
+
 class Solved(NamedTuple):
     """Poses (4, 4) by number, and the value of F."""
 
@@ -75,7 +78,7 @@ class Optimum(NamedTuple):
 
     values: gtsam.Values
     reached: bool
-    eliminated: gtsam.GaussianBayesTree | gtsam.GaussianBayesNet
+    eliminated: Eliminated
 
     def marginals(self, numbers: Sequence[int]) -> Array:
         """(n, 6, 6) covariance of poses [rotation, translation] (rad, m), each in its own axes."""
@@ -98,7 +101,8 @@ def optimise(
         RuntimeError: the factors do not hold every variable.
     """
     order, values, cost = _order(graph, start, last), start, graph.error(start)
-    by_variable, reached, eliminated = False, False, None
+    by_variable, reached = False, False
+    eliminated: Eliminated = gtsam.GaussianBayesTree()
     while iterations > 0 and not reached:
         del eliminated  # one at a time is enough to hold
         eliminated = _eliminate(graph.linearize(values), order, by_variable)
@@ -112,9 +116,7 @@ def optimise(
     return Optimum(values, reached, eliminated)
 
 
-def _eliminate(
-    linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool
-) -> gtsam.GaussianBayesTree | gtsam.GaussianBayesNet:
+def _eliminate(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool) -> Eliminated:
     return linear.eliminateSequential(order) if by_variable else linear.eliminateMultifrontal(order)
 
 
