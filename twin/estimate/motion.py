@@ -22,6 +22,7 @@ from twin.geometry import Array
 
 _HUBER = 1.5
 _MIN_POINTS = 12
+_MEDIAN_SIZE = {2: 0.680, 3: 0.888}  # roots of the median of chi2 with so many degrees of freedom, over 3
 
 
 class Motion(NamedTuple):
@@ -105,6 +106,7 @@ def pair_motion(
     guess: Array,
     common_sigma: float = 0.0,
     correlation: float = 1.0,
+    told: int = 3,
     iterations: int = 6,
 ) -> Motion | None:
     """Motion between two stereo pairs with the structure estimated along: no errors-in-variables bias.
@@ -121,6 +123,7 @@ def pair_motion(
         common_sigma: standard deviation of a bias that all points share in each of the three, normalised: it does not
             average out, however many points there are.
         correlation: by how much the points are fewer than they seem.
+        told: how many of its three numbers a tells of a point; the variance of others in `cov_a` is large.
 
     Returns:
         The motion, its residual in units of the expected deviation (1 = as expected), or None when too few agree.
@@ -131,7 +134,7 @@ def pair_motion(
     weight, normal, by_bias, scale = np.zeros(len(a)), np.eye(6), np.zeros((6, 3)), 1.0
     for _ in range(iterations):
         seen = linearise(a, b, structure, cov_a, cov_b, a_from_b, baseline_m)
-        scale = max(float(np.median(seen.size)) / 0.888, 1e-3)  # root of the median of chi2 with 3 degrees, over 3
+        scale = max(float(np.median(seen.size)) / _MEDIAN_SIZE[told], 1e-3)
         weight = _huber(seen.size, scale, cut=4.0)
         normal, right, by_common = weighted_normal_equations(seen, weight)
         twist = np.asarray(np.linalg.solve(normal, right), np.float64)
