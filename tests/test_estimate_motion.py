@@ -112,6 +112,29 @@ def test_pair_motion_has_a_true_covariance_and_no_bias():
     assert np.all(np.abs(np.mean(errors, axis=0)) < 4 * standard_error)
 
 
+def test_where_one_image_tells_no_disparity_motion_has_a_true_covariance_and_no_bias_either():
+    """Against eq. (2), which takes the noisy depth of b as exact: the same points, and 0.02 m of bias."""
+    rng, sigma = np.random.default_rng(5), np.array([1e-3, 1e-3, 4e-3])
+    true = geometry.exp(np.array([0.01, -0.02, 0.03, 0.25, -0.1, 0.05]))
+    off, claimed, by_exact_depth = [], [], []
+    for _ in range(200):
+        a, b = (z + rng.normal(size=z.shape) * sigma for z in seen(floor_points(rng), true))
+        cov_b = np.tile(np.diag(sigma**2), (len(b), 1, 1))
+        cov_a = cov_b.copy()
+        a[:, 2], cov_a[:, 2, 2] = 0.0, 1.0
+        found = motion.pair_motion(a, b, cov_a, cov_b, BASELINE_M, true, told=2)
+        assert found is not None
+        off.append(geometry.log(geometry.inverse(true) @ found.a_from_b))
+        claimed.append(off[-1] @ np.linalg.solve(found.cov, off[-1]))
+        exact = motion.exact_depth_motion(a, b, BASELINE_M, true)
+        assert exact is not None
+        by_exact_depth.append(geometry.log(geometry.inverse(true) @ exact))
+    spread = np.std(off, axis=0) / np.sqrt(len(off))
+    assert np.abs(np.mean(off, axis=0) / spread).max() < 4
+    assert np.abs(np.mean(by_exact_depth, axis=0) / spread).max() > 10
+    assert np.mean(claimed) == pytest.approx(6, rel=0.25)
+
+
 def test_a_bias_that_all_points_share_does_not_average_out():
     """Its covariance is J J' sigma^2, with J by finite differences: what the motion becomes when all points move."""
     true = geometry.exp(np.array([0.01, -0.02, 0.03, 0.4, -0.2, 0.05]))

@@ -172,6 +172,36 @@ def test_frame_to_frame_says_so_when_it_sees_nothing(diver):
     assert np.sqrt(motion.cov[3, 3]) >= 0.01  # a covariance that admits it
 
 
+def test_frame_to_frame_finds_back_after_a_blind_frame(diver):
+    pose, step = scene.down_camera(-1, 0, ALTITUDE_M), geometry.exp(np.array([0.001, 0.0, 0.0, 0.0, -0.02, 0.0]))
+    key, image, _ = diver.key_point(pose)
+    f2f, estimated, seen = FrameToFrame(RIG, PATCH_PX), pose, []
+    f2f.step(image)
+    f2f.restart(image, key.points)
+    for k in range(6):
+        picture = diver.frame(pose @ np.linalg.matrix_power(step, k + 1))[0]
+        motion, status = f2f.step(np.full_like(image, 128) if k == 3 else matching.normalise(matching.gray(picture)))
+        seen.append(status)
+        estimated = estimated @ motion.a_from_b
+    assert seen == ["ok"] * 3 + ["too few points matched"] + ["ok"] * 2
+    assert np.linalg.norm(error_of(pose @ np.linalg.matrix_power(step, 6), estimated)[3:]) < 0.01
+
+
+def test_frame_to_frame_goes_on_where_most_of_the_key_point_has_left_the_image(diver):
+    """Half an image away, and turned by a quarter of a radian."""
+    pose, step = scene.down_camera(-1, 0, ALTITUDE_M), geometry.exp(np.array([0.0, 0.0, 0.006, 0.0, -0.03, 0.0]))
+    key, image, _ = diver.key_point(pose)
+    f2f, estimated, true = FrameToFrame(RIG, PATCH_PX), pose, pose
+    f2f.step(image)
+    f2f.restart(image, key.points)
+    for _ in range(40):
+        true = true @ step
+        motion, status = f2f.step(matching.normalise(matching.gray(diver.frame(true)[0])))
+        assert status == "ok"
+        estimated = estimated @ motion.a_from_b
+    assert np.linalg.norm(error_of(true, estimated)[3:]) < 0.02
+
+
 def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees(diver):
     cell_m = ALTITUDE_M / RIG.focal_px
     mosaic = Mosaic(cell_m, diver.spool.folder / "mosaic")

@@ -81,7 +81,9 @@ class FrameToFrame:
         An image that shows too few of the points becomes the anchor itself, with those that it shows.
         """
         now_from_anchor = geometry.inverse(expected)
-        guess = self.rig.project(geometry.transform(now_from_anchor, anchor.xyz(self.rig.baseline_m)))
+        guess = self.rig.project(geometry.transform(now_from_anchor, anchor.xyz(self.rig.baseline_m))).astype(
+            np.float32
+        )
         found, ok = matching.track(anchor.image, image, anchor.pixels, guess, self.patch_px)
         pixels, measured, cov = found[ok], anchor.measured[ok], anchor.cov[ok]
         seen, seen_cov = np.zeros_like(measured), np.zeros_like(cov)
@@ -92,7 +94,10 @@ class FrameToFrame:
         )
         if moved is None:
             return None
-        self.anchor_from_now, carry = geometry.inverse(moved.a_from_b), geometry.adjoint(moved.a_from_b)
+        carry = geometry.adjoint(moved.a_from_b)
+        self.anchor_from_now = geometry.rigid(
+            geometry.inverse(moved.a_from_b)
+        )  # else errors double from frame to frame
         located = moved._replace(a_from_b=self.anchor_from_now, cov=carry @ moved.cov @ carry.T)
         if ok.mean() < _KEPT:
             seen[:, 2] = observation.transfer(measured, moved.a_from_b, self.rig.baseline_m)[0][:, 2]
