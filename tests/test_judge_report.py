@@ -48,6 +48,13 @@ def test_the_report_needs_nothing_but_itself(folder):
     assert len(page) < 5_000_000
 
 
+def test_the_headline_bewares_of_what_metrics_json_warns_of_and_of_nothing_else(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert "Beware" not in wording.headline(metrics | {"warning": ""}, load_run(folder).scenario)
+    warned = wording.headline(metrics | {"warning": "surrogate: too murky"}, load_run(folder).scenario)
+    assert warned.endswith("Beware: surrogate: too murky.")
+
+
 def test_the_report_tells_the_figures_of_metrics_json(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
     page = write_report(folder).read_text()
