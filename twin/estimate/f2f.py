@@ -95,9 +95,7 @@ class FrameToFrame:
         if moved is None:
             return None
         carry = geometry.adjoint(moved.a_from_b)
-        self.anchor_from_now = geometry.rigid(
-            geometry.inverse(moved.a_from_b)
-        )  # else errors double from frame to frame
+        self.anchor_from_now = geometry.rigid(geometry.inverse(moved.a_from_b))  # else errors double with every frame
         located = moved._replace(a_from_b=self.anchor_from_now, cov=carry @ moved.cov @ carry.T)
         if ok.mean() < _KEPT:
             seen[:, 2] = observation.transfer(measured, moved.a_from_b, self.rig.baseline_m)[0][:, 2]
