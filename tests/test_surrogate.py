@@ -205,7 +205,7 @@ def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     """The images are played by a surrogate with other errors than the one that it is compared with."""
     true = ErrorModel(
         place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_undone=0.4, steady=0.4,
-        mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5,
+        mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5, apart=4.0,
     )  # fmt: skip
     notes = [
         witnessed(mission(water), true, seed) for seed, water in enumerate(('water.jerlov="I"', 'water.jerlov="III"'))
@@ -218,6 +218,7 @@ def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     assert found.f2f_excess == pytest.approx(true.f2f_excess, rel=0.1)
     assert found.f2f_undone == pytest.approx(true.f2f_undone, abs=0.1)
     assert found.steady == pytest.approx(true.steady, abs=0.2)
+    assert found.apart == pytest.approx(true.apart, rel=0.25)
     assert found.depth_px(bound_px) == pytest.approx(true.depth_px(bound_px), rel=0.15)
     assert found.lateral_px == pytest.approx(true.lateral_px, rel=0.2)
 

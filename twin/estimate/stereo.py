@@ -76,6 +76,11 @@ def on_one_row(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArr
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
+def margin_px(patch_px: int) -> int:
+    """How far from the border a patch has to be expected to count."""
+    return patch_px // 2 + _SPARE_PX
+
+
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
     """Which patches (n, 2) are so far inside an image that no error of their places decides whether they are found.
 
@@ -83,7 +88,7 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
     err inwards: over coarse texture, with errors of 0.1 to 0.2 px, disparities at the border came out 0.02 px smaller,
     and links over two key points erred by 0.16 mrad on average.
     """
-    return matching.inside(pixels, (rig.height_px, rig.width_px), patch_px // 2 + _SPARE_PX)
+    return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
 
 def corners_with_disparity(

@@ -30,7 +30,8 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
     place = _law(bounds, place_px)
     f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
     mosaic = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
-    widened = float(np.median(ratio("link_claim") / ratio("place_ratio")))
+    apart, link_claims = _apart(surveys, model.apart)
+    widened = float(np.median(link_claims / ratio("place_ratio")))
     depth, lateral = (np.sqrt(x) for x in zip(*(_map_parts(s, "") for s in surveys), strict=True))
     claimed = [np.sqrt(_map_parts(s, "_claimed")[0]) for s in surveys]
     depth_px = [model.depth_px(b) * share for b, share in zip(bounds, claimed, strict=True)]
@@ -43,6 +44,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         matched=_share(bounds, np.minimum(ratio("link_matched") * [model.matched(b) for b in bounds], 1.0)),
         correlation=model.correlation * widened**2,
         steady=_steady(surveys, model.steady),
+        apart=apart,
         f2f_px=f2f,
         f2f_excess=excess("f2f", model.f2f_excess),
         f2f_undone=float(np.median([_undone(s) for s in surveys])),
@@ -110,6 +112,24 @@ def _steady(surveys: Sequence[Notes], own: float) -> float:
     )
     share = left - guessed + (4 - 2 * own - 2 * own**2) / 6
     return float(np.clip((np.sqrt(max(9 - 12 * share, 0.0)) - 1) / 2, 0.0, 0.98))
+
+
+def _apart(surveys: Sequence[Notes], own: float) -> tuple[float, np.ndarray]:
+    """How fast claims of links grow with the way between their key points, and their ratio (n,) at none, by survey.
+
+    One of the two pairs is placed by the match, so that (1 + (apart way)^2 / 2) is what a link's variance grows by.
+    """
+    ways = [np.square(s["link_apart"]) / 2 for s in surveys]
+    claims = [2 * np.log(s["link_claim"]) + np.log1p(own**2 * way) for s, way in zip(surveys, ways, strict=True)]
+
+    def off(x: np.ndarray) -> list[np.ndarray]:
+        return [claim - np.log1p(x[0] ** 2 * way) for claim, way in zip(claims, ways, strict=True)]
+
+    def around(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([(rest - np.median(rest)) / np.sqrt(len(rest)) for rest in off(x)])
+
+    found = least_squares(around, [max(own, 1.0)], bounds=([0.0], [30.0]), loss="soft_l1", f_scale=0.02).x
+    return float(found[0]), np.exp([np.median(rest) / 2 for rest in off(found)])
 
 
 def _map_parts(notes: Notes, what: str) -> np.ndarray:

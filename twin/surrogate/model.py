@@ -42,6 +42,8 @@ class ErrorModel(NamedTuple):
         matched: share of the points in view of another key point that are found there.
         correlation: by how much points are fewer than they seem, as `matching.correlation` tells.
         steady: how much of a place's deviation in the earlier images is the same in whatever link it is looked for.
+        apart: by how much patches are placed worse from farther off: the variance of a match grows by the square of
+            this times the way between two key points, in depths.
         common_px: deviation of a bias that all points of a link share.
         f2f_px: claimed deviation of a flow vector from frame to frame.
         f2f_excess: true over claimed deviation of a frame's motion.
@@ -61,6 +63,7 @@ class ErrorModel(NamedTuple):
     matched: Share = Share(0.97, 1.0, 4.0)
     correlation: float = 1.5
     steady: float = 0.8
+    apart: float = 0.0
     common_px: float = 0.005
     f2f_px: Law = Law(0.05, 1.0)
     f2f_excess: float = 1.4

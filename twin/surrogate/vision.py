@@ -103,7 +103,10 @@ class SurrogateVision:
     ):
         self.rig, self.settings, self.model, self.watch = rig, settings, model, watch
         self._truth, self._conditions, self._rng, self.floor, self.chart = truth, conditions, rng, floor, chart
-        self._camera = (rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), rig.baseline_m)
+        margin_px = float(stereo.margin_px(settings.patch_px))
+        self._camera = (
+            rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m
+        )  # fmt: skip
         self._pixels = _raster(rig)
         self._rays = stereo.normalised(self._pixels, rig)
         self.last_pose: Array | None = None  # true one of the last frame
@@ -138,6 +141,11 @@ class SurrogateVision:
         assert self._now is not None
         return len(self._now.points) / self._now.n_points
 
+    def way_in_depths(self, a_from_b: Array) -> float:
+        """Length of a motion (4, 4) by the depth of the floor under the last key point."""
+        assert self._now is not None
+        return float(way_in_depths(a_from_b, self._now.points, self.rig.baseline_m))
+
     def step(self, frame: Frame) -> tuple[Motion, str]:
         now = self._truth()
         last, self.last_pose = self.last_pose, now
@@ -165,12 +173,13 @@ class SurrogateVision:
             if len(met) < _LEAST_POINTS:
                 self.looks.append(Look(row, 0, None))
                 return None
-            depth_m = depth_m[met]
-            bound_px = self._conditions.bound_px(float(depth_m.mean()))
+            bound_px = self._conditions.bound_px(float(depth_m[met].mean()))
             n_points = len(met) / len(self._rays) * model.points(bound_px) * self.settings.points
             self.looks.append(Look(row, int(n_points), None))
-            if n_points < _LEAST_POINTS:
+            met = met[self._shown(met, depth_m)]
+            if min(n_points, len(met)) < _LEAST_POINTS:
                 return None
+            depth_m = depth_m[met]
             truth = np.column_stack([self._rays[met], self.rig.baseline_m / depth_m])
             n = len(truth)
             place = model.place_px(bound_px) * np.sqrt(n / n_points)
@@ -183,6 +192,13 @@ class SurrogateVision:
             cov = np.broadcast_to(self._unit_cov * place**2, (n, 3, 3))
             pixels, around_px = self._pixels[met].astype(np.float32), self.rig.focal_px * measured[:, 2]
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz)
+
+    def _shown(self, rows: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
+        """Which of these points of the raster, whose depths are `depth_m[rows]`, both eyes see well inside."""
+        left_px = self._pixels[rows]
+        right_px = left_px - np.column_stack([self._camera[0] * self.rig.baseline_m / depth_m[rows], 0 * rows])
+        inside = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
+        return np.logical_and(*inside)
 
     def restart(self) -> None:
         assert self._now is not None
@@ -239,7 +255,7 @@ class SurrogateVision:
         place = model.place_px(bound_px) * np.sqrt(n / (here.n_points * model.matched(bound_px)))
         numbers = self._numbers_of(number, other, n + 1)
         in_view, motion, cov = _link(
-            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, numbers, model.steady,
+            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, numbers, model.steady, model.apart,
             model.common_px / self.rig.focal_px, there.pose, here.pose, self._camera, self._unit_cov * place**2,
             self._unit_root * (place * model.place_excess), network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
@@ -301,8 +317,9 @@ def moved(errors, last, now, numbers, last_numbers):
 
 @njit(cache=True, nogil=True)
 def _link(
-    points, here, there, numbers, steady, common, there_pose, here_pose, camera, cov, root, common_claim, correlation
-):
+    points, here, there, numbers, steady, apart, common, there_pose, here_pose, camera, cov, root, common_claim,
+    correlation,
+):  # fmt: skip
     """How many points two key points both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
 
     Args:
@@ -311,14 +328,16 @@ def _link(
         there: (rows, cols, 3) the same of the earlier pair, over its image.
         numbers: (n + 1, 3) standard normal: what it errs by in this match alone (`steady` is the other's share), and a
             bias that all points share.
+        apart: by how much it errs more for every depth that the two are apart.
         common, common_claim: deviation of that bias, and the one claimed, normalised.
         there_pose, here_pose: (4, 4) true poses.
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
     """
-    focal, cx, cy, width, height, baseline = camera
+    focal, cx, cy, width, height, margin, baseline = camera
     there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
-    n, margin, passing = 0, 5.0, np.sqrt(1 - steady * steady)
+    farther = (apart * way_in_depths(there_from_here, points, baseline)) ** 2
+    n, passing = 0, np.sqrt(1 - steady * steady + farther)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
         u, v = seen[k, 0] * focal + cx, seen[k, 1] * focal + cy
@@ -332,16 +351,23 @@ def _link(
                     b[n, r] += root[r, c] * here[k, c]
             n += 1
     a, b = a[:n], b[:n]
-    covs = np.empty((n, 3, 3))
+    covs, farther_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for k in range(n):
-        covs[k] = cov
-    error, _, by_motion, information, _ = observation.linearised(a, b, b, covs, covs, there_from_here, baseline)
+        covs[k], farther_covs[k] = cov, cov * (1 + farther)
+    error, _, by_motion, information, _ = observation.linearised(a, b, b, farther_covs, covs, there_from_here, baseline)
     normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
     if n < _LEAST_POINTS:
         return n, there_from_here, normal
     inverse = np.linalg.inv(normal)
     shared = inverse @ by_common * common_claim
     return n, there_from_here @ geometry.exp(inverse @ right), inverse * correlation + shared @ shared.T
+
+
+@njit(cache=True, nogil=True)
+def way_in_depths(a_from_b, measured, baseline):
+    """Way between two poses by the mean depth of points (n, 3) measured from one of them."""
+    x, y, z = a_from_b[0, 3], a_from_b[1, 3], a_from_b[2, 3]
+    return np.sqrt(x * x + y * y + z * z) * np.mean(measured[:, 2]) / baseline
 
 
 @njit(cache=True, nogil=True)

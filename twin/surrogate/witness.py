@@ -101,6 +101,7 @@ class Witness:
                 self._close(other.number, node.number, (seen, guessed), true)
                 self._compare("link", seen, guessed, true)
                 self.notes["link_matched"].append(seen.n_points / guessed.n_points)
+                self.notes["link_apart"].append(self.surrogate.way_in_depths(true))
         return answers
 
     def map(
