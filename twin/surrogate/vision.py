@@ -35,6 +35,7 @@ from twin.surrogate.model import ErrorModel
 from twin.surrogate.owners import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
+_FIELD = 128  # cells of the floor until what it makes matches err by repeats itself
 _LEAST_POINTS = 12  # of these, and of those they stand for
 _LEAST_SHARE = 0.3  # as of the links
 _BLOCK = 4096  # numbers drawn at a time
@@ -120,6 +121,8 @@ class SurrogateVision:
         self._key, self._bits, self._drawing = int(rng.integers(2**63)), np.random.Philox(key=0), Lock()
         self._begin = self._bits.state
         self._drawn, self._used = np.zeros((0, 6)), 0
+        self._common = rng.standard_normal(3)
+        self._relief = rng.standard_normal((2, _FIELD, _FIELD, 3))
         one = np.zeros((1, 2))
         self._unit_cov = stereo.fuse(one, one, np.eye(2)[None], rig)[1][0]  # of a point whose place errs by a pixel
         self._unit_root = np.linalg.cholesky(self._unit_cov)
@@ -253,11 +256,12 @@ class SurrogateVision:
         bound_px = max(here.bound_px, there.bound_px)
         n = len(here.points)
         place = model.place_px(bound_px) * np.sqrt(n / (here.n_points * model.matched(bound_px)))
-        numbers = self._numbers_of(number, other, n + 1)
+        numbers = self._numbers_of(number, other, n)
         in_view, motion, cov = _link(
-            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, numbers, model.steady, model.apart,
-            model.common_px / self.rig.focal_px, there.pose, here.pose, self._camera, self._unit_cov * place**2,
-            self._unit_root * (place * model.place_excess), network.COMMON_PX / self.rig.focal_px, model.correlation,
+            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, model.steady,
+            model.apart, self._common * (model.common_px / self.rig.focal_px), there.pose, here.pose, self._camera,
+            self._unit_cov * place**2, self._unit_root * (place * model.place_excess),
+            network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
         n_matched = int(in_view / n * here.n_points * model.matched(bound_px))
         if in_view < _LEAST_POINTS or n_matched < max(_LEAST_POINTS, _LEAST_SHARE * here.n_points):
@@ -317,7 +321,7 @@ def moved(errors, last, now, numbers, last_numbers):
 
 @njit(cache=True, nogil=True)
 def _link(
-    points, here, there, numbers, steady, apart, common, there_pose, here_pose, camera, cov, root, common_claim,
+    points, here, there, relief, numbers, steady, apart, common, there_pose, here_pose, camera, cov, root, common_claim,
     correlation,
 ):  # fmt: skip
     """How many points two key points both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
@@ -326,28 +330,34 @@ def _link(
         points: (n, 3) of the later key point.
         here: (n, 3) standard normal: what the later pair errs by at these points.
         there: (rows, cols, 3) the same of the earlier pair, over its image.
-        numbers: (n + 1, 3) standard normal: what it errs by in this match alone (`steady` is the other's share), and a
-            bias that all points share.
-        apart: by how much it errs more for every depth that the two are apart.
-        common, common_claim: deviation of that bias, and the one claimed, normalised.
+        relief: (2, f, f, 3) standard normal: what the floor makes a match err by for a way east and a way north; the
+            same whoever matches there, so that errors add up along the path.
+        numbers: (n, 3) standard normal: what it errs by in this match alone (`steady` is the other's share).
+        apart: by how much it errs more, as `relief` tells, for every depth that the two are apart.
+        common, common_claim: (3,) bias that all points of all links share, and its claimed deviation, normalised.
         there_pose, here_pose: (4, 4) true poses.
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
     """
     focal, cx, cy, width, height, margin, baseline = camera
-    there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
+    there_from_here = geometry.inverse(there_pose) @ here_pose
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
     farther = (apart * way_in_depths(there_from_here, points, baseline)) ** 2
-    n, passing = 0, np.sqrt(1 - steady * steady + farther)
+    inverse_depth = np.mean(points[:, 2]) / baseline
+    east, north = apart * inverse_depth * (there_pose[:2, 3] - here_pose[:2, 3])
+    cell_m = width / focal / there.shape[1] / inverse_depth
+    n, passing = 0, np.sqrt(1 - steady * steady)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
         u, v = seen[k, 0] * focal + cx, seen[k, 1] * focal + cy
         if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
             cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
+            row, col = _floor_cell(here_pose, points[k], baseline, cell_m, relief.shape[1])
             for r in range(3):
-                a[n, r] = seen[k, r] + bias[r]
+                a[n, r] = seen[k, r] + common[r]
                 b[n, r] = points[k, r]
                 for c in range(r + 1):
-                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
+                    below = east * relief[0, row, col, c] + north * relief[1, row, col, c]
+                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c] + below)
                     b[n, r] += root[r, c] * here[k, c]
             n += 1
     a, b = a[:n], b[:n]
@@ -361,6 +371,15 @@ def _link(
     inverse = np.linalg.inv(normal)
     shared = inverse @ by_common * common_claim
     return n, there_from_here @ geometry.exp(inverse @ right), inverse * correlation + shared @ shared.T
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _floor_cell(pose, point, baseline, cell_m, n):
+    """Row and column of the floor's cell that a camera measures at (x, y, disparity), of n that repeat."""
+    depth = baseline / point[2]
+    x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
+    y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
+    return int(np.floor(y / cell_m)) % n, int(np.floor(x / cell_m)) % n
 
 
 @njit(cache=True, nogil=True)
