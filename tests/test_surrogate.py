@@ -69,10 +69,14 @@ def test_patches_are_placed_worse_in_murkier_water_from_farther_and_with_more_no
     assert noisier == pytest.approx(4 * base, rel=0.05)
 
 
+COMPARED = ErrorModel(apart=3.0)
+
+
 def redrawn(vision, seed):
     """The same vision with other numbers."""
     vision._rng, vision._key, vision._drawn = np.random.default_rng(seed), seed, np.zeros((0, 6))
-    vision._used = 0
+    vision._used, lasting = 0, np.random.default_rng([seed, 1])
+    vision._common, vision._relief = lasting.standard_normal(3), lasting.standard_normal(vision._relief.shape)
     return vision
 
 
@@ -125,6 +129,30 @@ def test_what_stays_the_same_cancels_around_a_triangle(reef):
         return np.mean(left)
 
     assert closure(0.95) < 0.5 * closure(0.0)
+
+
+def test_what_the_floor_makes_links_err_by_adds_up_along_the_path_and_cancels_around_a_triangle(reef):
+    """Over ten steps of one way; what each match errs by alone adds up to the root of ten of a step."""
+    poses, at = [tilted(0.02 * k, 0, 2.0) for k in range(11)], [0]
+    model = ErrorModel(steady=0.0, common_px=0.0, place_excess=1e-6, apart=1e6)
+    vision, steps, ways, closures = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch()), [], [], []
+    for seed in range(30):
+        redrawn(vision, seed)
+        for k in range(11):
+            at[0] = k
+            vision.look(None, k)
+            vision.lay(k, poses[k])
+
+        def error(i, j):
+            link = vision._link(vision._seen[j], vision._seen[i], j, i).a_from_b
+            return geometry.log(geometry.inverse(geometry.inverse(poses[i]) @ poses[j]) @ link)
+
+        steps.append([error(k, k + 1) for k in range(10)])
+        ways.append(np.sum(steps[-1], axis=0))
+        closures.append(steps[-1][0] + steps[-1][1] - error(0, 2))
+    alone, together, closure = (np.mean(np.square(x)[..., 3:]) for x in (steps, ways, closures))
+    assert together > 5 * 10 * alone
+    assert closure < 0.3 * alone
 
 
 @pytest.fixture
@@ -210,7 +238,7 @@ def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     notes = [
         witnessed(mission(water), true, seed) for seed, water in enumerate(('water.jerlov="I"', 'water.jerlov="III"'))
     ]
-    found = fit_to(notes, ErrorModel()).model
+    found = fit_to(notes, COMPARED).model
     bound_px = found.bound_px[1]
     for name in ("place_px", "f2f_px", "mosaic_px"):
         assert getattr(found, name)(bound_px) == pytest.approx(getattr(true, name)(bound_px), rel=0.05), name
@@ -245,7 +273,7 @@ def witnessed(flown, true, seed):
         return sea.world_from_camera
 
     redrawn(sea.vision, 100 + seed)
-    witness = Witness(Played(sea.vision), vision_beside(flown, ErrorModel(), truth, Stopwatch()), truth)
+    witness = Witness(Played(sea.vision), vision_beside(flown, COMPARED, truth, Stopwatch()), truth)
     navigator = survey.make_navigator(flown, witness, Stopwatch())
     survey.fly(flown, sea, navigator, lambda *_: None)
     result = navigator.finish()

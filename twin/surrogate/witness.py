@@ -42,6 +42,7 @@ class Witness:
         self.notes: dict[str, list[float]] = defaultdict(list)
         self._poses: dict[int, Array] = {}
         self._errors: dict[tuple[int, int], list[Array]] = {}
+        self._ways: dict[tuple[int, int], float] = {}
         self._last_step = np.eye(4)
         self._last: Array | None = None
         self._walked: list[tuple[Array, Array]] = []  # error and claimed covariance of the frames since a key point
@@ -98,10 +99,11 @@ class Witness:
         for other, seen, guessed in zip(others, answers, guesses, strict=True):
             if seen is not None and guessed is not None:
                 true = geometry.inverse(self._poses[other.number]) @ here
+                self._ways[other.number, node.number] = self.surrogate.way_in_depths(true)
                 self._close(other.number, node.number, (seen, guessed), true)
                 self._compare("link", seen, guessed, true)
                 self.notes["link_matched"].append(seen.n_points / guessed.n_points)
-                self.notes["link_apart"].append(self.surrogate.way_in_depths(true))
+                self.notes["link_apart"].append(self._ways[other.number, node.number])
         return answers
 
     def map(
@@ -139,6 +141,7 @@ class Witness:
         self._errors[i, j] = [geometry.log(geometry.inverse(true) @ link.a_from_b) for link in links]
         steps = (j - 2, j - 1), (j - 1, j), (j - 2, j)
         if i == j - 2 and all(step in self._errors for step in steps):
+            self.notes["closure_apart"].append(sum(self._ways[step] ** 2 for step in steps))
             sigma, carry = np.sqrt(np.diag(links[0].cov)), geometry.adjoint(geometry.inverse(self._last_step))
             errors = zip(*(self._errors[step] for step in steps), strict=True)
             for name, (a, b, c) in zip(("", "_surrogate"), errors, strict=True):
