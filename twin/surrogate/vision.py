@@ -35,7 +35,7 @@ from twin.surrogate.model import ErrorModel
 from twin.surrogate.owners import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
-_FIELD = 128  # cells of the floor until what it makes matches err by repeats itself
+_FIELD = 128  # cells of the floor until what it makes matches err by is the same again
 _LEAST_POINTS = 12  # of these, and of those they stand for
 _LEAST_SHARE = 0.3  # as of the links
 _BLOCK = 4096  # numbers drawn at a time
