@@ -43,7 +43,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         place_excess=excess("link", model.place_excess) * widened,
         matched=_share(bounds, np.minimum(ratio("link_matched") * [model.matched(b) for b in bounds], 1.0)),
         correlation=model.correlation * widened**2,
-        steady=_steady(surveys, model.steady, model.apart, apart),
+        steady=_steady(surveys, model.steady),
         apart=apart,
         f2f_px=f2f,
         f2f_excess=excess("f2f", model.f2f_excess),
@@ -99,22 +99,17 @@ def _undone(notes: Notes) -> float:
     return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - left))])
 
 
-def _steady(surveys: Sequence[Notes], own: float, own_apart: float, apart: float) -> float:
-    """By how much three links around three key points close better than they would one by one.
+def _steady(surveys: Sequence[Notes], own: float) -> float:
+    """By how much more than the surrogate a link of the path undoes what the one before it erred by.
 
-    With equal deviations of both pairs the share left is (4 - 2 r - 2 r^2) / (6 + sum of (apart way)^2), where r is
-    steady: of the six parts the later pair's cancel where it is the later one twice, what is the same whoever looks
-    cancels at the other two, and so does what the floor makes links err by, which grows with their ways. Geometry adds
-    the same to images and surrogate.
+    The key point between them is the later one of the first and the earlier one of the second: what is steady about it
+    enters with both signs. (Links around three key points tell nothing of it: those from one key point err alike.)
     """
-    ways = np.median([np.median(s["closure_apart"]) for s in surveys])
-    left, guessed = (
-        np.median([np.sum(s[f"closure{whose}"]) / np.sum(s[f"closure{whose}_parts"]) for s in surveys])
-        * (6 + far**2 * ways) / 6
-        for whose, far in (("", apart), ("_surrogate", own_apart))
-    )  # fmt: skip
-    share = left - guessed + (4 - 2 * own - 2 * own**2) / 6
-    return float(np.clip((np.sqrt(max(9 - 12 * share, 0.0)) - 1) / 2, 0.0, 0.98))
+    undone, guessed = (
+        np.mean([np.sum(s[f"chain{whose}_product"]) / np.sum(s[f"chain{whose}_square"]) for s in surveys])
+        for whose in ("", "_surrogate")
+    )
+    return float(np.clip(own * undone / min(guessed, -1e-3), 0.0, 0.98))
 
 
 def _apart(surveys: Sequence[Notes], own: float) -> tuple[float, np.ndarray]:

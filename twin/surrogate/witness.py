@@ -41,9 +41,7 @@ class Witness:
         self.looks = images.looks
         self.notes: dict[str, list[float]] = defaultdict(list)
         self._poses: dict[int, Array] = {}
-        self._errors: dict[tuple[int, int], list[Array]] = {}
-        self._ways: dict[tuple[int, int], float] = {}
-        self._last_step = np.eye(4)
+        self._chain: tuple[int, list[Array]] = (-1, [])  # where the last link of the path ended, and its errors
         self._last: Array | None = None
         self._walked: list[tuple[Array, Array]] = []  # error and claimed covariance of the frames since a key point
 
@@ -99,11 +97,11 @@ class Witness:
         for other, seen, guessed in zip(others, answers, guesses, strict=True):
             if seen is not None and guessed is not None:
                 true = geometry.inverse(self._poses[other.number]) @ here
-                self._ways[other.number, node.number] = self.surrogate.way_in_depths(true)
-                self._close(other.number, node.number, (seen, guessed), true)
+                if other.number == node.number - 1:
+                    self._follow(node.number, (seen, guessed), true)
                 self._compare("link", seen, guessed, true)
                 self.notes["link_matched"].append(seen.n_points / guessed.n_points)
-                self.notes["link_apart"].append(self._ways[other.number, node.number])
+                self.notes["link_apart"].append(self.surrogate.way_in_depths(true))
         return answers
 
     def map(
@@ -136,20 +134,16 @@ class Witness:
                 self.notes[f"map_{name}_{whose}"].append(float((1.4826 * np.median(np.abs(off))) ** 2))
                 self.notes[f"map_{name}_{whose}_claimed"].append(float(np.median(mapped.sigma_m[known]) ** 2))
 
-    def _close(self, i: int, j: int, links: tuple[Motion, Motion], true: Array) -> None:
-        """Notes by how much less three links around the last three key points err together than one by one."""
-        self._errors[i, j] = [geometry.log(geometry.inverse(true) @ link.a_from_b) for link in links]
-        steps = (j - 2, j - 1), (j - 1, j), (j - 2, j)
-        if i == j - 2 and all(step in self._errors for step in steps):
-            self.notes["closure_apart"].append(sum(self._ways[step] ** 2 for step in steps))
-            sigma, carry = np.sqrt(np.diag(links[0].cov)), geometry.adjoint(geometry.inverse(self._last_step))
-            errors = zip(*(self._errors[step] for step in steps), strict=True)
-            for name, (a, b, c) in zip(("", "_surrogate"), errors, strict=True):
-                parts = [(carry @ a) / sigma, b / sigma, c / sigma]
-                self.notes[f"closure{name}"].append(float(np.sum((parts[0] + parts[1] - parts[2]) ** 2)))
-                self.notes[f"closure{name}_parts"].append(float(np.sum(np.square(parts))))
-        if i == j - 1:
-            self._last_step = true
+    def _follow(self, j: int, links: tuple[Motion, Motion], true: Array) -> None:
+        """Notes by how much a link of the path undoes what the one before it erred by, in deviations as claimed."""
+        errors = [geometry.log(geometry.inverse(true) @ link.a_from_b) for link in links]
+        (end, before), self._chain = self._chain, (j, errors)
+        if end == j - 1:
+            sigma, carry = np.sqrt(np.diag(links[0].cov)), geometry.adjoint(geometry.inverse(true))
+            for name, last, now in zip(("", "_surrogate"), before, errors, strict=True):
+                a, b = carry @ last / sigma, now / sigma
+                self.notes[f"chain{name}_product"].append(float(a @ b))
+                self.notes[f"chain{name}_square"].append(float(a @ a + b @ b) / 2)
 
     def _compare(self, name: str, seen: Motion, guessed: Motion, true: Array) -> None:
         self.notes[f"{name}_claim"].append(_ratio(seen.cov, guessed.cov))
