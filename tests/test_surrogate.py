@@ -76,7 +76,7 @@ def redrawn(vision, seed):
     """The same vision with other numbers."""
     vision._rng, vision._key, vision._drawn = np.random.default_rng(seed), seed, np.zeros((0, 6))
     vision._used, lasting = 0, np.random.default_rng([seed, 1])
-    vision._common, vision._relief = lasting.standard_normal(3), lasting.standard_normal(vision._relief.shape)
+    vision._relief = lasting.standard_normal(vision._relief.shape)
     return vision
 
 

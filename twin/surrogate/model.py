@@ -44,7 +44,7 @@ class ErrorModel(NamedTuple):
         steady: how much of a place's deviation in the earlier images is the same in whatever link it is looked for.
         apart: by how much patches are placed worse from farther off: the variance of a match grows by the square of
             this times the way between two key points, in depths.
-        common_px: deviation of a bias that all points of all links of a survey share.
+        common_px: deviation of a bias that all points of a link share.
         f2f_px: claimed deviation of a flow vector from frame to frame.
         f2f_excess: true over claimed deviation of a frame's motion.
         f2f_undone: share of a frame's error that the next frame undoes: both are measured against the same points.

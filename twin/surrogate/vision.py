@@ -121,7 +121,6 @@ class SurrogateVision:
         self._key, self._bits, self._drawing = int(rng.integers(2**63)), np.random.Philox(key=0), Lock()
         self._begin = self._bits.state
         self._drawn, self._used = np.zeros((0, 6)), 0
-        self._common = rng.standard_normal(3)
         self._relief = rng.standard_normal((2, _FIELD, _FIELD, 3))
         one = np.zeros((1, 2))
         self._unit_cov = stereo.fuse(one, one, np.eye(2)[None], rig)[1][0]  # of a point whose place errs by a pixel
@@ -256,10 +255,10 @@ class SurrogateVision:
         bound_px = max(here.bound_px, there.bound_px)
         n = len(here.points)
         place = model.place_px(bound_px) * np.sqrt(n / (here.n_points * model.matched(bound_px)))
-        numbers = self._numbers_of(number, other, n)
+        numbers = self._numbers_of(number, other, n + 1)
         in_view, motion, cov = _link(
             here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, model.steady,
-            model.apart, self._common * (model.common_px / self.rig.focal_px), there.pose, here.pose, self._camera,
+            model.apart, model.common_px / self.rig.focal_px, there.pose, here.pose, self._camera,
             self._unit_cov * place**2, self._unit_root * (place * model.place_excess),
             network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
@@ -332,14 +331,15 @@ def _link(
         there: (rows, cols, 3) the same of the earlier pair, over its image.
         relief: (2, f, f, 3) standard normal: what the floor makes a match err by for a way east and a way north; the
             same whoever matches there, so that errors add up along the path.
-        numbers: (n, 3) standard normal: what it errs by in this match alone (`steady` is the other's share).
+        numbers: (n + 1, 3) standard normal: what it errs by in this match alone (`steady` is the other's share), and a
+            bias that all points share.
         apart: by how much it errs more, as `relief` tells, for every depth that the two are apart.
-        common, common_claim: (3,) bias that all points of all links share, and its claimed deviation, normalised.
+        common, common_claim: deviation of that bias, and the one claimed, normalised.
         there_pose, here_pose: (4, 4) true poses.
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
     """
     focal, cx, cy, width, height, margin, baseline = camera
-    there_from_here = geometry.inverse(there_pose) @ here_pose
+    there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
     farther = (apart * way_in_depths(there_from_here, points, baseline)) ** 2
     inverse_depth = np.mean(points[:, 2]) / baseline
@@ -353,7 +353,7 @@ def _link(
             cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
             row, col = _floor_cell(here_pose, points[k], baseline, cell_m, relief.shape[1])
             for r in range(3):
-                a[n, r] = seen[k, r] + common[r]
+                a[n, r] = seen[k, r] + bias[r]
                 b[n, r] = points[k, r]
                 for c in range(r + 1):
                     below = east * relief[0, row, col, c] + north * relief[1, row, col, c]
