@@ -80,33 +80,56 @@ def redrawn(vision, seed):
     return vision
 
 
-def test_links_err_as_their_covariance_says(reef):
+@pytest.mark.parametrize("apart", [0.0, 10.0])
+def test_links_err_as_their_covariance_says(reef, apart):
     """With excess 1 and no correlation each of six degrees of freedom counts 1."""
-    model = ErrorModel(place_excess=1.0, correlation=1.0, steady=0.0, place_px=Law(0.05, 0.0))
+    model = ErrorModel(place_excess=1.0, correlation=1.0, steady=0.0, place_px=Law(0.05, 0.0), apart=apart)
     poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
     vision = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch())
     true, squares = geometry.inverse(poses[0]) @ poses[1], []
     for seed in range(150):
-        link = linked(redrawn(vision, seed), at)
+        link = linked(redrawn(vision, seed), poses, at)
         error = geometry.log(geometry.inverse(true) @ link.a_from_b)
         squares.append(error @ np.linalg.solve(link.cov, error) / 6)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
 
 
-def linked(vision, at):
+def looked(vision, poses, at):
+    """What was seen at key points with these poses, `at` being where the vehicle is."""
+    for k, pose in enumerate(poses):
+        at[0] = k
+        assert vision.look(None, k) is not None
+        vision.lay(k, pose)
+    return vision._seen
+
+
+def linked(vision, poses, at):
     """The link from the second of two key points to the first."""
-    at[0] = 0
-    assert vision.look(None, 0) is not None
-    vision.lay(0, vision._now.pose)
-    at[0] = 1
-    assert vision.look(None, 1) is not None
-    return vision._link(vision._now, vision._seen[0], 1, 0)
+    seen = looked(vision, poses, at)
+    return vision._link(seen[1], seen[0], 1, 0)
+
+
+def error_of_link(vision, i, j):
+    there, here = vision._seen[i], vision._seen[j]
+    return geometry.log(
+        geometry.inverse(geometry.inverse(there.pose) @ here.pose) @ vision._link(here, there, j, i).a_from_b
+    )
+
+
+def test_points_lie_where_both_eyes_see_them(reef):
+    pose = tilted(0, 0, 2.0)
+    vision = vision_beside(reef, ErrorModel(), lambda: pose, Stopwatch())
+    points = vision.look(None, 0)
+    right_px = points.pixels[:, 0] - reef.rig.focal_px * vision._now.points[:, 2]
+    assert right_px.min() >= reef.scenario.estimate.patch_px // 2
+    left = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision._now.met)]
+    assert len(left) and left[:, 0].max() < points.pixels[:, 0].max() / 2  # what is left out is at the left border
 
 
 def test_a_link_is_the_same_whatever_was_measured_before_it(reef):
     poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
     vision = vision_beside(reef, ErrorModel(), lambda: poses[at[0]], Stopwatch())
-    first = linked(vision, at)
+    first = linked(vision, poses, at)
     vision.draw(1)
     np.testing.assert_array_equal(vision._link(vision._now, vision._seen[0], 1, 0).a_from_b, first.a_from_b)
 
@@ -118,12 +141,7 @@ def test_what_stays_the_same_cancels_around_a_triangle(reef):
         model = ErrorModel(steady=steady, common_px=0.0)
         vision, left = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch()), []
         for seed in range(60):
-            redrawn(vision, seed)
-            for k in range(3):
-                at[0] = k
-                vision.look(None, k)
-                vision.lay(k, poses[k])
-            seen = vision._seen
+            seen = looked(redrawn(vision, seed), poses, at)
             a, b, c = (vision._link(seen[j], seen[i], j, i).a_from_b for i, j in ((0, 1), (1, 2), (0, 2)))
             left.append(np.sum(geometry.log(geometry.inverse(c) @ a @ b)[3:] ** 2))
         return np.mean(left)
@@ -137,19 +155,10 @@ def test_what_the_floor_makes_links_err_by_adds_up_along_the_path_and_cancels_ar
     model = ErrorModel(steady=0.0, common_px=0.0, place_excess=1e-6, apart=1e6)
     vision, steps, ways, closures = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch()), [], [], []
     for seed in range(30):
-        redrawn(vision, seed)
-        for k in range(11):
-            at[0] = k
-            vision.look(None, k)
-            vision.lay(k, poses[k])
-
-        def error(i, j):
-            link = vision._link(vision._seen[j], vision._seen[i], j, i).a_from_b
-            return geometry.log(geometry.inverse(geometry.inverse(poses[i]) @ poses[j]) @ link)
-
-        steps.append([error(k, k + 1) for k in range(10)])
+        looked(redrawn(vision, seed), poses, at)
+        steps.append([error_of_link(vision, k, k + 1) for k in range(10)])
         ways.append(np.sum(steps[-1], axis=0))
-        closures.append(steps[-1][0] + steps[-1][1] - error(0, 2))
+        closures.append(steps[-1][0] + steps[-1][1] - error_of_link(vision, 0, 2))
     alone, together, closure = (np.mean(np.square(x)[..., 3:]) for x in (steps, ways, closures))
     assert together > 5 * 10 * alone
     assert closure < 0.3 * alone
@@ -163,16 +172,9 @@ def test_what_is_steady_makes_a_link_undo_the_one_before_and_is_found_by_that(re
         model, products, squares = ErrorModel(steady=steady, common_px=0.0), [], []
         vision = vision_beside(reef, model, lambda: poses[at[0]], Stopwatch())
         for seed in range(120):
-            redrawn(vision, seed)
-            for k in range(11):
-                at[0] = k
-                vision.look(None, k)
-                vision.lay(k, poses[k])
-            seen, errors = vision._seen, []
-            for k in range(10):
-                link = vision._link(seen[k + 1], seen[k], k + 1, k).a_from_b
-                errors.append(geometry.log(geometry.inverse(geometry.inverse(poses[k]) @ poses[k + 1]) @ link))
-            errors = np.array(errors) / np.std(errors, axis=0)
+            looked(redrawn(vision, seed), poses, at)
+            errors = np.array([error_of_link(vision, k, k + 1) for k in range(10)])
+            errors /= np.std(errors, axis=0)
             products.append(np.sum(errors[1:] * errors[:-1]))
             squares.append(np.sum(errors[1:] ** 2))
         return {"product": products, "square": squares}

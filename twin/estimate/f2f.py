@@ -81,9 +81,8 @@ class FrameToFrame:
         An image that shows too few of the points becomes the anchor itself, with those that it shows.
         """
         now_from_anchor = geometry.inverse(expected)
-        guess = self.rig.project(geometry.transform(now_from_anchor, anchor.xyz(self.rig.baseline_m))).astype(
-            np.float32
-        )
+        points = geometry.transform(now_from_anchor, anchor.xyz(self.rig.baseline_m))
+        guess = self.rig.project(points).astype(np.float32)
         found, ok = matching.track(anchor.image, image, anchor.pixels, guess, self.patch_px)
         pixels, measured, cov = found[ok], anchor.measured[ok], anchor.cov[ok]
         seen, seen_cov = np.zeros_like(measured), np.zeros_like(cov)

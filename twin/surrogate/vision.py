@@ -146,7 +146,7 @@ class SurrogateVision:
     def way_in_depths(self, a_from_b: Array) -> float:
         """Length of a motion (4, 4) by the depth of the floor under the last key point."""
         assert self._now is not None
-        return float(way_in_depths(a_from_b, self._now.points, self.rig.baseline_m))
+        return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._now.points[:, 2]) / self.rig.baseline_m)
 
     def step(self, frame: Frame) -> tuple[Motion, str]:
         now = self._truth()
@@ -197,10 +197,11 @@ class SurrogateVision:
 
     def _shown(self, rows: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
         """Which of these points of the raster, whose depths are `depth_m[rows]`, both eyes see well inside."""
+        shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[rows]
         left_px = self._pixels[rows]
-        right_px = left_px - np.column_stack([self._camera[0] * self.rig.baseline_m / depth_m[rows], 0 * rows])
-        inside = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
-        return np.logical_and(*inside)
+        right_px = left_px - np.column_stack([shift_px, np.zeros(len(rows))])
+        in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
+        return in_left & in_right
 
     def restart(self) -> None:
         assert self._now is not None
@@ -341,10 +342,9 @@ def _link(
     focal, cx, cy, width, height, margin, baseline = camera
     there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
-    farther = (apart * way_in_depths(there_from_here, points, baseline)) ** 2
     inverse_depth = np.mean(points[:, 2]) / baseline
-    east, north = apart * inverse_depth * (there_pose[:2, 3] - here_pose[:2, 3])
-    cell_m = width / focal / there.shape[1] / inverse_depth
+    east, north, up = apart * inverse_depth * (there_pose[:3, 3] - here_pose[:3, 3])
+    farther, cell_m = east**2 + north**2 + up**2, width / focal / there.shape[1] / inverse_depth
     n, passing = 0, np.sqrt(1 - steady * steady)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
@@ -380,13 +380,6 @@ def _floor_cell(pose, point, baseline, cell_m, n):
     x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
     y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
     return int(np.floor(y / cell_m)) % n, int(np.floor(x / cell_m)) % n
-
-
-@njit(cache=True, nogil=True)
-def way_in_depths(a_from_b, measured, baseline):
-    """Way between two poses by the mean depth of points (n, 3) measured from one of them."""
-    x, y, z = a_from_b[0, 3], a_from_b[1, 3], a_from_b[2, 3]
-    return np.sqrt(x * x + y * y + z * z) * np.mean(measured[:, 2]) / baseline
 
 
 @njit(cache=True, nogil=True)
