@@ -9,7 +9,7 @@ from study_surveys import STUDY, Here, study_of
 
 from twin.errors import ScenarioError, TwinError
 from twin.study import campaign, command, wording
-from twin.study.engine import connect
+from twin.study.engine import Outcome, connect
 from twin.study.flight import flat, has_passed
 from twin.study.ledger import Ledger
 from twin.study.progress import Progress
@@ -71,6 +71,20 @@ def test_the_pace_is_that_of_what_was_flown_now(study, tmp_path):
     rest = conduct(study, tmp_path / "out", resume=True, function=fly).pace
     assert [(pace.surveys, pace.worked_s) for pace in (first, rest)] == [(5, 10.0), (11, 22.0)]
     assert wording.pace(600, 300.0, 540.0) == "600 surveys in 300 s, 120 a minute; each took a worker 0.90 s"
+
+
+def test_a_row_tells_how_often_its_survey_was_tried():
+    assert campaign.row_from(Outcome("task", {"status": "complete"}, "", 2))["timing.attempts"] == 2
+
+
+def test_what_a_killed_study_was_at_is_cleared_away(study, tmp_path):
+    """Runs are written under hidden names until they are whole."""
+    conduct(study, tmp_path / "out", Here(stop_before=5))
+    half = tmp_path / "out" / "runs" / ".00003_s1"
+    half.mkdir()
+    (half / "log.jsonl").write_text("cut o")
+    conduct(study, tmp_path / "out", resume=True)
+    assert not half.exists()
 
 
 def test_a_study_that_was_interrupted_goes_on_where_it_was(study, table, tmp_path):

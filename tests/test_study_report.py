@@ -75,6 +75,29 @@ def test_the_limits_side_tells_what_is_kept_by_most(found):
     assert level.limit == 0.02
 
 
+def test_of_figures_that_are_better_the_higher_the_limits_side_is_the_low_one(tmp_path):
+    study = study_of(tmp_path, STUDY, ('show = ["map.le90_m"]', 'show = ["map.completeness"]'))
+    shares = np.random.default_rng(0).uniform(0.9, 1.0, 12)
+    found = found_of(study, tmp_path, lambda s: fly(s) | {"map.completeness": shares[s.sample]})
+    level = next(level for level in found.levels if level.name == "map.completeness")
+    assert level.bound.value == pytest.approx(np.percentile(shares[found.complete], 5))
+
+
+def test_a_survey_that_broke_off_has_not_passed_whatever_it_kept_and_its_map_does_not_count(tmp_path):
+    study = study_of(tmp_path)
+
+    def broken(survey):
+        row = fly(survey)
+        return row | {"status": "aborted"} if survey.sample < 6 else row
+
+    for name in ("whole", "broken"):
+        (tmp_path / name).mkdir()
+    whole, found = found_of(study, tmp_path / "whole"), found_of(study, tmp_path / "broken", broken)
+    assert whole.passed[:6].any()
+    assert not found.passed[:6].any()
+    assert found.levels[0].surveys == whole.complete[6:].sum()
+
+
 def test_what_matters_most_comes_first(found):
     order = [influence.key for influence in found.influences]
     assert order[0] == "water.turbidity"
@@ -90,6 +113,8 @@ def test_what_failures_share_is_told(found):
     reasons = {reason.reason: reason.surveys for reason in found.reasons}
     assert reasons[findings.general(LOST)] == (found.status == "aborted").sum()
     assert reasons["missed map.le90_m"] == (found.complete & ~found.passed).sum()
+    counts = [reason.surveys for reason in found.reasons]
+    assert counts == sorted(counts, reverse=True)
 
 
 def test_reasons_that_differ_in_numbers_only_count_together():
@@ -108,6 +133,22 @@ def test_a_saltelli_design_gives_sobol_indices_and_a_hole_in_it_none(tmp_path):
     status = pa.array(["aborted"] + found.rows["status"].to_pylist()[1:])
     holed = found.rows.set_column(found.rows.column_names.index("status"), "status", status)
     assert Findings(holed, study).sobol == {}
+
+
+def test_sobol_indices_are_of_the_means_over_seeds(tmp_path):
+    """Two seeds double every sum; means and so the indices of a law without noise stay."""
+    changes = (('"lhs"', '"saltelli"'), ("samples = 12", "samples = 64"), ("40.0]", "20.0]"))
+
+    def quiet(survey):
+        row = fly(survey)
+        return row | {"map.le90_m": 0.001 * survey.values["water.turbidity"]}
+
+    def means(*more):
+        folder = tmp_path / str(len(more))
+        folder.mkdir()
+        return found_of(study_of(folder, STUDY, *changes, *more), folder, quiet)._mean_of_samples("map.le90_m")
+
+    np.testing.assert_allclose(means(("samples = 64", "samples = 64\nseeds = 2")), means())
 
 
 def test_the_page_holds_the_answer_the_numbers_and_no_link_to_elsewhere(tmp_path):

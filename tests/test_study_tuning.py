@@ -11,7 +11,7 @@ from twin.study import tuning_report
 from twin.study.flight import row_of
 from twin.study.progress import Progress
 from twin.study.statistics import wilson
-from twin.study.tuning import Candidate, best, plan_of, tune
+from twin.study.tuning import Candidate, Flights, best, plan_of, tune
 
 TUNING = """
 scenario = "quickstart"
@@ -105,6 +105,52 @@ def test_a_search_that_was_interrupted_ends_with_the_same_candidates(searched, t
     again = search(study, tmp_path / "out", resume=True)
     assert again.candidates == whole.candidates
     assert again.finalists == whole.finalists
+
+
+@pytest.fixture
+def judged(tmp_path):
+    """A plan's two surveys, judged after these rows came back."""
+    study = study_of(tmp_path, TUNING, ("samples = 2", "samples = 5"))
+    values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
+
+    def judge(*changes):
+        flights = Flights(study, plan_of(study), tmp_path, ())
+        for survey, change in zip(flights.surveys(0, values), changes, strict=True):
+            flights.keep(fly(survey) | change)
+        again = [survey.key for survey in flights.missing({0: values})]
+        return flights.judge(0, values), again
+
+    return judge
+
+
+def test_what_failed_says_nothing_of_a_plan_and_is_flown_again(judged):
+    failed = {"status": "failed", "map.le90_m": 1.0, "require.map.le90_m.passed": False}
+    candidate, again = judged({}, failed, {}, {}, {})
+    assert candidate.share == wilson(4, 4)
+    assert candidate.objectives[2] == 0.0  # risk
+    assert len(again) == 1
+
+
+def test_an_objective_is_the_median_of_what_was_complete(judged):
+    errors = [{"map.le90_m": 0.001 * k} for k in (1, 2, 3, 9)]
+    candidate, again = judged(*errors, {"status": "aborted", "map.le90_m": 1.0})
+    assert candidate.objectives[1] == pytest.approx(0.0025)
+    assert again == []
+
+
+def test_a_plan_without_a_complete_survey_is_the_worst_in_every_objective(judged):
+    candidate, _ = judged(*5 * [{"status": "aborted"}])
+    assert not candidate.has_result
+    assert candidate.objectives[:2] == (1e9, 1e9)
+
+
+def test_where_more_is_better_the_worst_is_far_below(tmp_path):
+    study = study_of(tmp_path, TUNING, ('"map.le90_m", "risk"', '"map.completeness", "risk"'))
+    flights = Flights(study, plan_of(study), tmp_path, ())
+    values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
+    for survey in flights.surveys(0, values):
+        flights.keep(lose(survey))
+    assert flights.judge(0, values).objectives[:2] == (1e9, -1e9)
 
 
 def test_where_no_plan_passes_none_is_recommended(searched, tmp_path):
