@@ -17,7 +17,7 @@ from twin.geometry import Array
 from twin.records import Link, StereoRig
 
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
-_LEAST_SHARE = 0.3  # of matched points that agree on one motion
+LEAST_SHARE = 0.3  # of matched points that agree on one motion
 COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
 _NEAREST_M = 1e-3  # of a point before a camera
 _LEVELS = 2  # a quarter of the image: matches are found though positions err by 8 pixels
@@ -200,7 +200,7 @@ class PairMatch:
             common_sigma=COMMON_PX / self.rig.focal_px,
             correlation=matching.correlation(matched.node[:, :2] * self.rig.focal_px, self.patch_px),
         )
-        if result is None or result.n_points < _LEAST_SHARE * len(matched.node):
+        if result is None or result.n_points < LEAST_SHARE * len(matched.node):
             return None
         return result._replace(closed_form=closed_form)
 

@@ -29,7 +29,7 @@ def fit_to(notes: Sequence[Notes], model: ErrorModel) -> Calibration:
     Raises:
         TwinError: too few surveys got as far as a map.
     """
-    whole = [n for n in notes if "link_claim" in n and "map_level_images" in n]
+    whole = [n for n in notes if "chain_images" in n and "map_level_images" in n]
     if len(whole) < _LEAST_SURVEYS:
         raise TwinError("calibrate", f"{len(whole)} surveys were flown to their end", f"at least {_LEAST_SURVEYS}")
     found = fitted(whole, model)

@@ -13,7 +13,7 @@ from twin.study.surveys import surveys
 from twin.surrogate import calibration
 from twin.surrogate.calibrate import fit_to, note
 
-DEFAULT = ("calibration_reef", "calibration_paper")
+DEFAULT = ("calibration_reef", "calibration_sun", "calibration_paper")
 
 
 def run(files: Sequence[str], out: Path, runs: Path) -> int:

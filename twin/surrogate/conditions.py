@@ -3,6 +3,9 @@
 The image of a level floor at some depth is made by the project's own light and sensor from the scenario's own texture.
 With g the gradient of the grey image along a row and s the noise, a patch of p x p pixels in two images can be placed
 no better than c = sqrt(2) s / (p rms(g)) pixels, the bound of Cramer and Rao for a shift.
+
+And how far the floor under a patch lies out of the plane that it is matched as: from another place, that makes it seem
+to have moved.
 """
 
 from __future__ import annotations
@@ -19,37 +22,90 @@ from twin.imaging.photo_sensor import sensor_of
 from twin.records import Image, StereoRig
 
 _DEPTHS = 6
+_PATCHES = 300  # of the floor, looked at for how uneven it is
+_SAMPLES = 9  # along either side of one
 
 
 class Conditions:
-    """The bound c of a survey as a function of depth, over all depths that the plan can meet.
+    """The bound c of a survey, and how uneven its floor is, by depth, over all depths that the plan can meet.
 
     Attributes:
-        table: depths (m,) [m] and the bound at each (m,) [px].
-        bounds_px: least and greatest bound.
+        depths_m: (m,).
+        bounds_px: (m,) bound there.
+        unevens_px: (m,) how far the floor under a patch, seen from there, lies out of its plane.
+        lamp_share: how much of the light is the lamps', which move along.
     """
 
     def __init__(self, scenario: Scenario, terrain: terrains.Terrain):
         nearest = max(scenario.plan.altitude_m - terrain.highest_m, 0.3)
-        depths_m = np.geomspace(0.8 * nearest, 1.2 * (scenario.plan.altitude_m - terrain.lowest_m), _DEPTHS)
-        self.table = depths_m, bounds_px(scenario, terrain, depths_m)
-        self.bounds_px = float(self.table[1].min()), float(self.table[1].max())
+        self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (scenario.plan.altitude_m - terrain.lowest_m), _DEPTHS)
+        self.bounds_px = bounds_px(scenario, terrain, self.depths_m)
+        self.unevens_px = unevenness_px(scenario, terrain, self.depths_m)
+        self.lamp_share = lamp_share(scenario, terrain)
 
     def bound_px(self, depth_m: float) -> float:
         """The bound at a depth [m]."""
-        return float(np.interp(depth_m, *self.table))
+        return float(np.interp(depth_m, self.depths_m, self.bounds_px))
+
+    def uneven_px(self, depth_m: float) -> float:
+        """How uneven the floor is from a depth [m]."""
+        return float(np.interp(depth_m, self.depths_m, self.unevens_px))
 
 
 def bounds_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array) -> Array:
     """The bound c [px] at depths (n,) [m]."""
-    imaging = scenario.imaging.model_copy(update={"shadows": False})
-    scenario = scenario.model_copy(
-        update={"imaging": imaging, "snow": scenario.snow.model_copy(update={"density_per_m3": 0.0})}
-    )
+    scenario = _plain(scenario)
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
     light = Light(scenario, terrain, rng)
     texture, texel_m = _texture(scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
     return np.array([_bound_px(scenario, rig, light, _albedo(texture, texel_m, rig, z), z, rng) for z in depths_m])
+
+
+def lamp_share(scenario: Scenario, terrain: terrains.Terrain) -> float:
+    """Share of the light that a level floor at the planned altitude sends back which is the lamps', from 0 to 1."""
+    if not scenario.lamps or scenario.sun.illuminance_lx == 0:
+        return float(bool(scenario.lamps))
+    sunlit, both = (_sent_back(s, terrain) for s in (scenario.model_copy(update={"lamps": ()}), scenario))
+    return 1 - sunlit / both
+
+
+def _sent_back(scenario: Scenario, terrain: terrains.Terrain) -> float:
+    """Mean radiance of a white floor at the planned altitude less that of a black one [cd/m2]."""
+    light, rig = Light(_plain(scenario), terrain, np.random.default_rng(0)), scenario.believed_rig()
+    depth = np.full((rig.height_px, rig.width_px), scenario.plan.altitude_m, np.float32)
+    world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, scenario.plan.altitude_m]))
+    white, black = (
+        light.radiance(np.full((*depth.shape, 3), level, np.uint8), depth, 0, Moment(world_from_left, 0.0))
+        for level in (255, 0)
+    )
+    return float(np.mean(white - black))
+
+
+def _plain(scenario: Scenario) -> Scenario:
+    """The scenario without what the surrogate knows nothing of."""
+    imaging = scenario.imaging.model_copy(update={"shadows": False})
+    snow = scenario.snow.model_copy(update={"density_per_m3": 0.0})
+    return scenario.model_copy(update={"imaging": imaging, "snow": snow})
+
+
+def unevenness_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array) -> Array:
+    """Deviation of the floor under a patch from its plane, seen from depths (n,) [m], all over the planned area.
+
+    In pixels that it moves against the plane, for every depth that the camera moves sideways: f rms(z) / depth.
+    """
+    focal_px, patch_px = scenario.believed_rig().focal_px, scenario.estimate.patch_px
+    side = np.linspace(-0.5, 0.5, _SAMPLES)
+    x, y = (part.ravel() for part in np.meshgrid(side, side))
+    plane = np.column_stack([np.ones_like(x), x, y])
+    apart = np.eye(len(x)) - plane @ np.linalg.pinv(plane)
+    rng = np.random.default_rng(0)
+    centres = (rng.random((_PATCHES, 1, 2)) - 0.5) * scenario.plan.area_m
+    found = []
+    for depth_m in depths_m:
+        at = centres + np.column_stack([x, y]) * (patch_px * depth_m / focal_px)
+        height_m = terrain.height_at(at[..., 0], at[..., 1])
+        found.append(focal_px * np.sqrt(np.nanmean((height_m @ apart) ** 2)) / depth_m)
+    return np.array(found)
 
 
 def _bound_px(scenario: Scenario, rig: StereoRig, light: Light, albedo: Image, depth_m: float, rng) -> float:

@@ -8,6 +8,11 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from twin.surrogate.model import ErrorModel, Law, Share
+from twin.surrogate.witness import RELIEF, STEADY
+
+_LINK_PARTS = ("images", "patches", "relief")
+
+_THIRDS_ERR = 0.1  # of the squared errors of a third of a survey's links, relative
 
 Notes = Mapping[str, Sequence[float]]
 
@@ -27,31 +32,38 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         return own * float(np.median(np.sqrt(ratio(f"{name}_nees") / ratio(f"{name}_nees_surrogate"))))
 
     place_px = ratio("place_ratio") * [model.place_px(b) for b in bounds]
-    place = _law(bounds, place_px)
-    f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
-    mosaic = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
+    place, _ = _law(bounds, place_px)
+    f2f, _ = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
+    mosaic, _ = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
     apart, link_claims = _apart(surveys, model.apart)
     widened = float(np.median(link_claims / ratio("place_ratio")))
+    patches, relief, steady = _link_parts(surveys, model.relief)
+    place_excess, lamps = _by_lamps(patches / ratio("place_ratio"), ratio("lamp_share"))
     depth, lateral = (np.sqrt(x) for x in zip(*(_map_parts(s, "") for s in surveys), strict=True))
     claimed = [np.sqrt(_map_parts(s, "_claimed")[0]) for s in surveys]
-    depth_px = [model.depth_px(b) * share for b, share in zip(bounds, claimed, strict=True)]
+    uneven_px = ratio("uneven_px")
+    before_px = np.hypot([model.depth_px(b) for b in bounds], model.depth_uneven * uneven_px)
+    depth_px, depth_uneven = _law(bounds, before_px * claimed, uneven_px)
     in_claims = ratio("mosaic_difference") - model.mosaic_excess**2
     return model._replace(
         bound_px=(float(bounds.min()), float(bounds.max())),
         points=_share(bounds, ratio("points")),
         place_px=place,
-        place_excess=excess("link", model.place_excess) * widened,
+        place_excess=place_excess,
+        lamps=lamps,
         matched=_share(bounds, np.minimum(ratio("link_matched") * [model.matched(b) for b in bounds], 1.0)),
         correlation=model.correlation * widened**2,
-        steady=_steady(surveys, model.steady),
+        steady=steady,
         apart=apart,
+        relief=relief,
         f2f_px=f2f,
         f2f_excess=excess("f2f", model.f2f_excess),
         f2f_undone=float(np.median([_undone(s) for s in surveys])),
         mosaic_px=mosaic,
-        depth_px=_law(bounds, np.array(depth_px)),
+        depth_px=depth_px,
+        depth_uneven=depth_uneven,
         depth_excess=model.depth_excess * float(np.median(depth / claimed)),
-        lateral_px=model.lateral_px * float(np.median(lateral)),
+        lateral_px=model.lateral_px * float(np.sqrt(np.mean(lateral**2))),
         complete=_share(bounds, ratio("map_known")),
         mosaic_excess=float(np.sqrt(np.median(np.maximum(in_claims, 0.01) / ratio("mosaic_claim") ** 2))),
     )
@@ -69,14 +81,16 @@ def _spread(surveys: Sequence[Notes], ratio: str, compared: Law, law: Law) -> fl
     return float(np.sqrt(np.mean(np.square(logs))))
 
 
-def _law(bounds: np.ndarray, deviations: np.ndarray) -> Law:
-    """Least squares of the logarithms."""
+def _law(bounds: np.ndarray, deviations: np.ndarray, more: np.ndarray | None = None) -> tuple[Law, float]:
+    """Least squares of the logarithms; and how deviations grow with something else (n,), in squares too."""
+    more = np.zeros_like(bounds) if more is None else more
 
     def off(x: np.ndarray) -> np.ndarray:
-        return np.log(np.hypot(x[0], x[1] * bounds) / deviations)
+        return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * more) ** 2) / deviations)
 
-    found = least_squares(off, [deviations.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
-    return Law(float(found.x[0]), float(found.x[1]))
+    least = [1e-4, 0.0, 0.0]
+    found = least_squares(off, [deviations.min() / 2, 1.0, 0.01], bounds=(least, [10.0, 100.0, 10.0])).x
+    return Law(float(found[0]), float(found[1])), float(found[2])
 
 
 def _share(bounds: np.ndarray, shares: np.ndarray) -> Share:
@@ -99,17 +113,47 @@ def _undone(notes: Notes) -> float:
     return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - left))])
 
 
-def _steady(surveys: Sequence[Notes], own: float) -> float:
-    """By how much more than the surrogate a link of the path undoes what the one before it erred by.
+def _link_parts(surveys: Sequence[Notes], own_relief: float) -> tuple[np.ndarray, float, float]:
+    """By how much links err in all: as multiples of what patches (n,) and relief alone do, and what is steady of these.
 
-    The key point between them is the later one of the first and the earlier one of the second: what is steady about it
-    enters with both signs. (Links around three key points tell nothing of it: those from one key point err alike.)
+    Relief's share grows with the way, that of patches does not: within each survey, links are compared by thirds of
+    their ways. Over a smooth floor that tells nothing, so that the relief of before counts as well, as known to itself.
+    What is steady about a key point lets a link of the path undo what the one before it erred by, as it is the earlier
+    one of the second and the later one of the first; relief lets it err the same way again. (Links around three key
+    points tell nothing of it: those from one key point err alike.)
     """
-    undone, guessed = (
-        np.mean([np.sum(s[f"chain{whose}_product"]) / np.sum(s[f"chain{whose}_square"]) for s in surveys])
-        for whose in ("", "_surrogate")
-    )
-    return float(np.clip(own * undone / min(guessed, -1e-3), 0.0, 0.98))
+    thirds = np.array([_squares_by_way(s) for s in surveys])
+    images, by_patches, by_relief = thirds.transpose(2, 0, 1)
+    own = (own_relief / RELIEF) ** 2
+    rows, wanted = [_THIRDS_ERR / own], [_THIRDS_ERR]
+    for patch, more in zip(by_patches / images, by_relief / images, strict=True):
+        across = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # what patches leave
+        rows, wanted = [*rows, *(across @ more)], [*wanted, *across.sum(axis=1)]
+    relief = max(float(np.dot(rows, wanted) / np.dot(rows, rows)), 0.0)
+    patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
+    chains = np.array([[np.mean(s[f"chain_{name}"]) for name in _LINK_PARTS] for s in surveys])
+    steady = STEADY * np.sum((chains[:, 0] - relief * chains[:, 2]) / patches) / np.sum(chains[:, 1])
+    return np.sqrt(patches), RELIEF * float(np.sqrt(relief)), float(np.clip(steady, 0.0, 0.98))
+
+
+def _by_lamps(excess: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
+    """True over claimed deviation of patches without lamps, and by how much it grows with their share of the light.
+
+    Least squares of the relative errors of squares.
+    """
+    effects = np.column_stack([np.ones_like(excess), lamp_share**2]) / excess[:, None] ** 2
+    alike, more = nnls(effects, np.ones(len(excess)))[0]
+    return float(np.sqrt(alike)), float(np.sqrt(more / max(alike, 1e-6)))
+
+
+def _squares_by_way(notes: Notes) -> np.ndarray:
+    """(3, 3) squared errors of links near, farther and far: of the images, by patches and by relief alone.
+
+    The mean of 19 in 20.
+    """
+    errors = np.column_stack([notes[f"link_{name}"] for name in _LINK_PARTS])
+    thirds = (np.sort(errors[third], axis=0) for third in np.array_split(np.argsort(notes["link_apart"]), 3))
+    return np.array([third[: len(third) - len(third) // 20].mean(axis=0) for third in thirds])
 
 
 def _apart(surveys: Sequence[Notes], own: float) -> tuple[float, np.ndarray]:

@@ -36,8 +36,8 @@ from twin.surrogate.owners import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
 _FIELD = 128  # cells of the floor until what it makes matches err by is the same again
-_LEAST_POINTS = 12  # of these, and of those they stand for
-_LEAST_SHARE = 0.3  # as of the links
+_LEAST_POINTS = 12  # of those they stand for
+_LEAST_OF_RASTER = 6  # of these, for a motion
 _BLOCK = 4096  # numbers drawn at a time
 
 
@@ -50,6 +50,7 @@ class _Seen(NamedTuple):
         met: (n,) which rays these are.
         noise: (rows, cols, 3) standard normal numbers of the images there.
         bound_px: Cramer-Rao bound of a patch's place.
+        uneven_px: how far the floor under a patch lies out of its plane, as `conditions`.
         n_points: matched points that they stand for.
         unit_cov, unit_root: (6, 6) covariance of a motion against known depths by eq. (2), and its root, where
             normalised points err by one.
@@ -61,6 +62,7 @@ class _Seen(NamedTuple):
     met: NDArray[np.int64]
     noise: Array
     bound_px: float
+    uneven_px: float
     n_points: float
     unit_cov: Array
     unit_root: Array
@@ -121,7 +123,7 @@ class SurrogateVision:
         self._key, self._bits, self._drawing = int(rng.integers(2**63)), np.random.Philox(key=0), Lock()
         self._begin = self._bits.state
         self._drawn, self._used = np.zeros((0, 6)), 0
-        self._relief = rng.standard_normal((2, _FIELD, _FIELD, 3))
+        self._relief = rng.standard_normal((_FIELD, _FIELD, 2))
         one = np.zeros((1, 2))
         self._unit_cov = stereo.fuse(one, one, np.eye(2)[None], rig)[1][0]  # of a point whose place errs by a pixel
         self._unit_root = np.linalg.cholesky(self._unit_cov)
@@ -129,13 +131,25 @@ class SurrogateVision:
     @property
     def bounds_px(self) -> tuple[float, float]:
         """Least and greatest Cramer-Rao bound that the survey can meet."""
-        return self._conditions.bounds_px
+        bounds_px = self._conditions.bounds_px
+        return float(bounds_px.min()), float(bounds_px.max())
+
+    @property
+    def lamp_share(self) -> float:
+        """How much of the light is the lamps'."""
+        return self._conditions.lamp_share
 
     @property
     def bound_px(self) -> float:
         """Cramer-Rao bound of a patch's place at the last key point."""
         assert self._now is not None
         return self._now.bound_px
+
+    @property
+    def uneven_px(self) -> float:
+        """How far the floor under a patch lies out of its plane at the last key point."""
+        assert self._now is not None
+        return self._now.uneven_px
 
     @property
     def stand_for(self) -> float:
@@ -172,14 +186,15 @@ class SurrogateVision:
             self.chart.see(pose)
             depth_m = self.floor.depth_at(self._pixels, pose, self.rig)
             met = np.flatnonzero(depth_m < np.inf)
-            if len(met) < _LEAST_POINTS:
+            if len(met) < _LEAST_OF_RASTER:
                 self.looks.append(Look(row, 0, None))
                 return None
-            bound_px = self._conditions.bound_px(float(depth_m[met].mean()))
+            mean_m = float(depth_m[met].mean())
+            bound_px = self._conditions.bound_px(mean_m)
             n_points = len(met) / len(self._rays) * model.points(bound_px) * self.settings.points
             self.looks.append(Look(row, int(n_points), None))
             met = met[self._shown(met, depth_m)]
-            if min(n_points, len(met)) < _LEAST_POINTS:
+            if n_points < _LEAST_POINTS or len(met) < _LEAST_OF_RASTER:
                 return None
             depth_m = depth_m[met]
             truth = np.column_stack([self._rays[met], self.rig.baseline_m / depth_m])
@@ -188,7 +203,8 @@ class SurrogateVision:
             noise = self._rng.standard_normal((*_RASTER, 3))
             unit = _unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
             cells = cells_of(pose, truth, self.rig.baseline_m)
-            self._now = _Seen(pose, truth, met, noise, bound_px, n_points, *unit, cells)
+            uneven_px = self._conditions.uneven_px(mean_m)
+            self._now = _Seen(pose, truth, met, noise, bound_px, uneven_px, n_points, *unit, cells)
             measured = truth + noise.reshape(-1, 3)[met] @ (self._unit_root.T * place * model.place_excess)
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * place**2, (n, 3, 3))
@@ -242,29 +258,36 @@ class SurrogateVision:
             self._owners.lay(key.number, key.world_from_camera, self._seen[key.number].cells)
 
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
+        return self.links(node, others, self.model)
+
+    def links(self, node: KeyPoint, others: Sequence[KeyPoint], model: ErrorModel) -> list[Motion | None]:
+        """What `measure` answers by this model."""
         with self.watch("network"):
             assert self._now is not None
             here = self._seen.get(node.number, self._now)
-            return [self._link(here, self._seen[k.number], node.number, k.number) for k in others]
+            return [self._link(here, self._seen[k.number], node.number, k.number, model) for k in others]
 
-    def _link(self, here: _Seen, there: _Seen, number: int, other: int) -> Motion | None:
+    def _link(self, here: _Seen, there: _Seen, number: int, other: int, model: ErrorModel) -> Motion | None:
         """The motion between two key points: one step of its equations from the truth, on noisy points.
 
         Its numbers are its own, whichever link is measured first.
         """
-        model = self.model
         bound_px = max(here.bound_px, there.bound_px)
         n = len(here.points)
-        place = model.place_px(bound_px) * np.sqrt(n / (here.n_points * model.matched(bound_px)))
+        fewer = np.sqrt(n / (here.n_points * model.matched(bound_px)))
+        place, excess = (
+            model.place_px(bound_px) * fewer,
+            model.place_excess * np.hypot(1, model.lamps * self.lamp_share),
+        )
         numbers = self._numbers_of(number, other, n + 1)
         in_view, motion, cov = _link(
-            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, model.steady,
-            model.apart, model.common_px / self.rig.focal_px, there.pose, here.pose, self._camera,
-            self._unit_cov * place**2, self._unit_root * (place * model.place_excess),
+            here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, there.pose, here.pose,
+            self._camera, self._unit_cov * place**2, self._unit_root * (place * excess), model.steady,
+            model.relief * here.uneven_px / self.rig.focal_px * fewer, model.common_px / self.rig.focal_px, model.apart,
             network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
         n_matched = int(in_view / n * here.n_points * model.matched(bound_px))
-        if in_view < _LEAST_POINTS or n_matched < max(_LEAST_POINTS, _LEAST_SHARE * here.n_points):
+        if in_view < _LEAST_OF_RASTER or n_matched < _LEAST_POINTS or model.matched(bound_px) < network.LEAST_SHARE:
             return None
         return Motion(motion, cov, n_matched, 1.0)
 
@@ -282,8 +305,9 @@ class SurrogateVision:
         shared, lost = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
         believed = result.final.world_from_camera[result.key_frames]
         seen = [self._seen[k] for k in range(len(believed))]
-        depths_m, bounds_px = self._conditions.table
+        depths_m, bounds_px = self._conditions.depths_m, self._conditions.bounds_px
         depth_px, complete = (np.array([law(b) for b in bounds_px]) for law in (model.depth_px, model.complete))
+        depth_px = np.hypot(depth_px, model.depth_uneven * self._conditions.unevens_px)
         errors = CellErrors(shared, lost, model.lateral_px, depths_m, depth_px * model.depth_excess, depth_px, complete)
         for k, (here, following) in enumerate(zip(seen, [*seen[1:], None], strict=True)):
             next_pose = None if following is None else following.pose
@@ -321,8 +345,8 @@ def moved(errors, last, now, numbers, last_numbers):
 
 @njit(cache=True, nogil=True)
 def _link(
-    points, here, there, relief, numbers, steady, apart, common, there_pose, here_pose, camera, cov, root, common_claim,
-    correlation,
+    points, here, there, relief, numbers, there_pose, here_pose, camera, cov, root, steady, relief_size, common, apart,
+    common_claim, correlation,
 ):  # fmt: skip
     """How many points two key points both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
 
@@ -330,34 +354,34 @@ def _link(
         points: (n, 3) of the later key point.
         here: (n, 3) standard normal: what the later pair errs by at these points.
         there: (rows, cols, 3) the same of the earlier pair, over its image.
-        relief: (2, f, f, 3) standard normal: what the floor makes a match err by for a way east and a way north; the
-            same whoever matches there, so that errors add up along the path.
-        numbers: (n + 1, 3) standard normal: what it errs by in this match alone (`steady` is the other's share), and a
-            bias that all points share.
-        apart: by how much it errs more, as `relief` tells, for every depth that the two are apart.
-        common, common_claim: deviation of that bias, and the one claimed, normalised.
+        relief: (f, f, 2) standard normal: what the floor makes matches err by, the same whoever matches there.
+        numbers: (n + 1, 3) standard normal: what it errs by in this match alone, and a bias that all points share.
         there_pose, here_pose: (4, 4) true poses.
         cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
+        steady: share of the earlier pair in what a match errs by; the rest is its own.
+        relief_size: deviation of what relief makes it err by for every depth that the two are apart.
+        common, common_claim: deviation of the bias, and the one claimed.
+        apart: by how much a match is claimed to err more for every depth that the two are apart.
     """
     focal, cx, cy, width, height, margin, baseline = camera
     there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
     seen, _, _ = observation.transfer(points, there_from_here, baseline)
     inverse_depth = np.mean(points[:, 2]) / baseline
-    east, north, up = apart * inverse_depth * (there_pose[:3, 3] - here_pose[:3, 3])
-    farther, cell_m = east**2 + north**2 + up**2, width / focal / there.shape[1] / inverse_depth
-    n, passing = 0, np.sqrt(1 - steady * steady)
+    way, cell_m = inverse_depth * there_from_here[:3, 3], width / focal / there.shape[1] / inverse_depth
+    n, passing, farther = 0, np.sqrt(1 - steady * steady), apart**2 * np.sum(way**2)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
         u, v = seen[k, 0] * focal + cx, seen[k, 1] * focal + cy
         if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
             cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
-            row, col = _floor_cell(here_pose, points[k], baseline, cell_m, relief.shape[1])
+            row, col = _floor_cell(here_pose, points[k], baseline, cell_m, len(relief))
+            askew, along = relief_size * relief[row, col]
+            a[n], b[n] = seen[k] + bias, points[k]
+            a[n, 0] += way[1] * askew
+            a[n, 1] += way[0] * askew + 2 * way[1] * along
             for r in range(3):
-                a[n, r] = seen[k, r] + bias[r]
-                b[n, r] = points[k, r]
                 for c in range(r + 1):
-                    below = east * relief[0, row, col, c] + north * relief[1, row, col, c]
-                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c] + below)
+                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
                     b[n, r] += root[r, c] * here[k, c]
             n += 1
     a, b = a[:n], b[:n]
@@ -366,7 +390,7 @@ def _link(
         covs[k], farther_covs[k] = cov, cov * (1 + farther)
     error, _, by_motion, information, _ = observation.linearised(a, b, b, farther_covs, covs, there_from_here, baseline)
     normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
-    if n < _LEAST_POINTS:
+    if n < _LEAST_OF_RASTER:
         return n, there_from_here, normal
     inverse = np.linalg.inv(normal)
     shared = inverse @ by_common * common_claim

@@ -25,6 +25,7 @@ from twin.surrogate.vision import SurrogateVision
 
 _LEAST_CELLS = 300
 _EXACT = Law(1e-4, 0.0)
+STEADY, RELIEF = 0.8, 0.2  # of the links that have one error alone
 
 
 class Witness:
@@ -40,8 +41,10 @@ class Witness:
         self.images, self.surrogate, self._truth = images, surrogate, truth
         self.looks = images.looks
         self.notes: dict[str, list[float]] = defaultdict(list)
+        self.notes["lamp_share"] = [surrogate.lamp_share]
         self._poses: dict[int, Array] = {}
-        self._chain: tuple[int, list[Array]] = (-1, [])  # where the last link of the path ended, and its errors
+        self._node = -1  # the last one
+        self._chain: tuple[int, dict[str, Array]] = (-1, {})  # where the last link of the path ended, and its errors
         self._last: Array | None = None
         self._walked: list[tuple[Array, Array]] = []  # error and claimed covariance of the frames since a key point
 
@@ -66,6 +69,7 @@ class Witness:
             sizes = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, guessed)]
             self.notes["place_ratio"].append(float(np.sqrt(sizes[0] / sizes[1] * self.surrogate.stand_for)))
             self.notes["bound_px"].append(self.surrogate.bound_px)
+            self.notes["uneven_px"].append(self.surrogate.uneven_px)
         return points
 
     def restart(self) -> None:
@@ -91,18 +95,41 @@ class Witness:
         self.surrogate.relay(keys)
 
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
-        answers, guesses = self.images.measure(node, others), self.surrogate.measure(node, others)
+        """The links of the images; those of the surrogate with all errors; and with one error alone."""
+        model, answers = self.surrogate.model, {"images": self.images.measure(node, others)}
+        alone = {
+            "all": model,
+            "patches": model._replace(place_excess=1.0, lamps=0.0, steady=STEADY, relief=0.0),
+            "relief": model._replace(place_excess=0.0, relief=RELIEF, common_px=0.0),
+        }
+        answers |= {name: self.surrogate.links(node, others, errors) for name, errors in alone.items()}
         pose = self._poses.get(node.number)
         here = self._truth() if pose is None else pose
-        for other, seen, guessed in zip(others, answers, guesses, strict=True):
-            if seen is not None and guessed is not None:
-                true = geometry.inverse(self._poses[other.number]) @ here
-                if other.number == node.number - 1:
-                    self._follow(node.number, (seen, guessed), true)
-                self._compare("link", seen, guessed, true)
-                self.notes["link_matched"].append(seen.n_points / guessed.n_points)
-                self.notes["link_apart"].append(self.surrogate.way_in_depths(true))
-        return answers
+        for k, other in enumerate(others):
+            links = {name: motions[k] for name, motions in answers.items()}
+            self._note_link(other.number, node.number, links, geometry.inverse(self._poses[other.number]) @ here)
+        self._node = node.number
+        return answers["images"]
+
+    def _note_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
+        """Notes by how much the links from i to j err, in the surrogate's claims.
+
+        Of two links along the path, by how much one undoes what the one before it erred by.
+        """
+        seen, guessed = links["images"], links["all"]
+        if seen is None or guessed is None:
+            return
+        self.notes["link_claim"].append(_ratio(seen.cov, guessed.cov))
+        self.notes["link_matched"].append(seen.n_points / guessed.n_points)
+        self.notes["link_apart"].append(self.surrogate.way_in_depths(true))
+        errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
+        for name, error in errors.items():
+            self.notes[f"link_{name}"].append(_chi2(error, guessed.cov) / 6)
+        if i == self._node:
+            (end, before), self._chain = self._chain, (j, errors)
+            sigma, carry = np.sqrt(np.diag(guessed.cov)), geometry.adjoint(geometry.inverse(true))
+            for name, last in before.items() if end == i else ():
+                self.notes[f"chain_{name}"].append(float(carry @ last / sigma @ (errors[name] / sigma)) / 6)
 
     def map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
@@ -110,9 +137,9 @@ class Witness:
         """The map of the images; and those of the surrogate along the same path, each with one error alone."""
         mapped, model = self.images.map(result, grid, step_cov, progress), self.surrogate.model
         alone = {
-            "pose": model._replace(depth_px=_EXACT, lateral_px=0.0),
+            "pose": model._replace(depth_px=_EXACT, depth_uneven=0.0, lateral_px=0.0),
             "depth": model._replace(lateral_px=0.0),
-            "lateral": model._replace(depth_px=_EXACT),
+            "lateral": model._replace(depth_px=_EXACT, depth_uneven=0.0),
         }
         chart = self.surrogate.chart
         self.notes["map_known"].append(float(np.isfinite(mapped.height_m[chart.seen]).mean()))
@@ -133,17 +160,6 @@ class Witness:
                 off = error[known] - np.median(error[known])
                 self.notes[f"map_{name}_{whose}"].append(float((1.4826 * np.median(np.abs(off))) ** 2))
                 self.notes[f"map_{name}_{whose}_claimed"].append(float(np.median(mapped.sigma_m[known]) ** 2))
-
-    def _follow(self, j: int, links: tuple[Motion, Motion], true: Array) -> None:
-        """Notes by how much a link of the path undoes what the one before it erred by, in deviations as claimed."""
-        errors = [geometry.log(geometry.inverse(true) @ link.a_from_b) for link in links]
-        (end, before), self._chain = self._chain, (j, errors)
-        if end == j - 1:
-            sigma, carry = np.sqrt(np.diag(links[0].cov)), geometry.adjoint(geometry.inverse(true))
-            for name, last, now in zip(("", "_surrogate"), before, errors, strict=True):
-                a, b = carry @ last / sigma, now / sigma
-                self.notes[f"chain{name}_product"].append(float(a @ b))
-                self.notes[f"chain{name}_square"].append(float(a @ a + b @ b) / 2)
 
     def _compare(self, name: str, seen: Motion, guessed: Motion, true: Array) -> None:
         self.notes[f"{name}_claim"].append(_ratio(seen.cov, guessed.cov))
