@@ -11,7 +11,6 @@ from twin.surrogate.model import ErrorModel, Law, Share
 from twin.surrogate.witness import RELIEF, STEADY
 
 _LINK_PARTS = ("images", "patches", "relief")
-
 _THIRDS_ERR = 0.1  # of the squared errors of a third of a survey's links, relative
 
 Notes = Mapping[str, Sequence[float]]
@@ -124,7 +123,7 @@ def _link_parts(surveys: Sequence[Notes], own_relief: float) -> tuple[np.ndarray
     """
     thirds = np.array([_squares_by_way(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
-    own = (own_relief / RELIEF) ** 2
+    own = max(own_relief / RELIEF, 0.5) ** 2
     rows, wanted = [_THIRDS_ERR / own], [_THIRDS_ERR]
     for patch, more in zip(by_patches / images, by_relief / images, strict=True):
         across = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # what patches leave
