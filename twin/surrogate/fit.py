@@ -31,18 +31,16 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         return own * float(np.median(np.sqrt(ratio(f"{name}_nees") / ratio(f"{name}_nees_surrogate"))))
 
     place_px = ratio("place_ratio") * [model.place_px(b) for b in bounds]
-    place, _ = _law(bounds, place_px)
-    f2f, _ = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
-    mosaic, _ = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
+    place = _law(bounds, place_px)
+    f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
+    mosaic = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
     apart, link_claims = _apart(surveys, model.apart)
     widened = float(np.median(link_claims / ratio("place_ratio")))
     patches, relief, steady = _link_parts(surveys, model.relief)
     place_excess, lamps = _by_lamps(patches / ratio("place_ratio"), ratio("lamp_share"))
     depth, lateral = (np.sqrt(x) for x in zip(*(_map_parts(s, "") for s in surveys), strict=True))
     claimed = [np.sqrt(_map_parts(s, "_claimed")[0]) for s in surveys]
-    uneven_px = ratio("uneven_px")
-    before_px = np.hypot([model.depth_px(b) for b in bounds], model.depth_uneven * uneven_px)
-    depth_px, depth_uneven = _law(bounds, before_px * claimed, uneven_px)
+    depth_px = [model.depth_px(b) * share for b, share in zip(bounds, claimed, strict=True)]
     in_claims = ratio("mosaic_difference") - model.mosaic_excess**2
     return model._replace(
         bound_px=(float(bounds.min()), float(bounds.max())),
@@ -59,8 +57,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         f2f_excess=excess("f2f", model.f2f_excess),
         f2f_undone=float(np.median([_undone(s) for s in surveys])),
         mosaic_px=mosaic,
-        depth_px=depth_px,
-        depth_uneven=depth_uneven,
+        depth_px=_law(bounds, np.array(depth_px)),
         depth_excess=model.depth_excess * float(np.median(depth / claimed)),
         lateral_px=model.lateral_px * float(np.sqrt(np.mean(lateral**2))),
         complete=_share(bounds, ratio("map_known")),
@@ -80,16 +77,14 @@ def _spread(surveys: Sequence[Notes], ratio: str, compared: Law, law: Law) -> fl
     return float(np.sqrt(np.mean(np.square(logs))))
 
 
-def _law(bounds: np.ndarray, deviations: np.ndarray, more: np.ndarray | None = None) -> tuple[Law, float]:
-    """Least squares of the logarithms; and how deviations grow with something else (n,), in squares too."""
-    more = np.zeros_like(bounds) if more is None else more
+def _law(bounds: np.ndarray, deviations: np.ndarray) -> Law:
+    """Least squares of the logarithms."""
 
     def off(x: np.ndarray) -> np.ndarray:
-        return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * more) ** 2) / deviations)
+        return np.log(np.hypot(x[0], x[1] * bounds) / deviations)
 
-    least = [1e-4, 0.0, 0.0]
-    found = least_squares(off, [deviations.min() / 2, 1.0, 0.01], bounds=(least, [10.0, 100.0, 10.0])).x
-    return Law(float(found[0]), float(found[1])), float(found[2])
+    found = least_squares(off, [deviations.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
+    return Law(float(found.x[0]), float(found.x[1]))
 
 
 def _share(bounds: np.ndarray, shares: np.ndarray) -> Share:

@@ -59,7 +59,6 @@ class ErrorModel(NamedTuple):
         mosaic_px: claimed deviation of a vector to the mosaic, as if as many as from frame to frame told it.
         mosaic_excess: true over claimed deviation of a correction.
         depth_px: claimed deviation of a pixel's filtered depth [px of disparity].
-        depth_uneven: by what part of what the floor under a patch lies out of its plane these grow, in squares.
         depth_excess: true over claimed deviation of these.
         lateral_px: deviation of the surface sideways that all views of it share.
         complete: share of the cells in view whose depth is known.
@@ -82,7 +81,6 @@ class ErrorModel(NamedTuple):
     mosaic_px: Law = Law(0.2, 1.0)
     mosaic_excess: float = 2.0
     depth_px: Law = Law(0.05, 1.0)
-    depth_uneven: float = 0.0
     depth_excess: float = 1.0
     lateral_px: float = 0.2
     complete: Share = Share(0.999, 2.0, 4.0)

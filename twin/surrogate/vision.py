@@ -146,12 +146,6 @@ class SurrogateVision:
         return self._now.bound_px
 
     @property
-    def uneven_px(self) -> float:
-        """How far the floor under a patch lies out of its plane at the last key point."""
-        assert self._now is not None
-        return self._now.uneven_px
-
-    @property
     def stand_for(self) -> float:
         """By how much the points of the last key point are fewer than those they stand for."""
         assert self._now is not None
@@ -307,7 +301,6 @@ class SurrogateVision:
         seen = [self._seen[k] for k in range(len(believed))]
         depths_m, bounds_px = self._conditions.depths_m, self._conditions.bounds_px
         depth_px, complete = (np.array([law(b) for b in bounds_px]) for law in (model.depth_px, model.complete))
-        depth_px = np.hypot(depth_px, model.depth_uneven * self._conditions.unevens_px)
         errors = CellErrors(shared, lost, model.lateral_px, depths_m, depth_px * model.depth_excess, depth_px, complete)
         for k, (here, following) in enumerate(zip(seen, [*seen[1:], None], strict=True)):
             next_pose = None if following is None else following.pose

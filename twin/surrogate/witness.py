@@ -69,7 +69,6 @@ class Witness:
             sizes = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, guessed)]
             self.notes["place_ratio"].append(float(np.sqrt(sizes[0] / sizes[1] * self.surrogate.stand_for)))
             self.notes["bound_px"].append(self.surrogate.bound_px)
-            self.notes["uneven_px"].append(self.surrogate.uneven_px)
         return points
 
     def restart(self) -> None:
@@ -137,9 +136,9 @@ class Witness:
         """The map of the images; and those of the surrogate along the same path, each with one error alone."""
         mapped, model = self.images.map(result, grid, step_cov, progress), self.surrogate.model
         alone = {
-            "pose": model._replace(depth_px=_EXACT, depth_uneven=0.0, lateral_px=0.0),
+            "pose": model._replace(depth_px=_EXACT, lateral_px=0.0),
             "depth": model._replace(lateral_px=0.0),
-            "lateral": model._replace(depth_px=_EXACT, depth_uneven=0.0),
+            "lateral": model._replace(depth_px=_EXACT),
         }
         chart = self.surrogate.chart
         self.notes["map_known"].append(float(np.isfinite(mapped.height_m[chart.seen]).mean()))
