@@ -202,7 +202,7 @@ def tune(
     live: LinesOption = False,
     as_json: SummaryOption = False,
 ) -> None:
-    """Search the plan that a study's [tune] asks for, and write the one recommended as a scenario."""
+    """Search the plan that the section tune of a study asks for, and write the one recommended as a scenario."""
     from twin.study import command
 
     if not (scheduler or slurm):
