@@ -269,10 +269,8 @@ class SurrogateVision:
         bound_px = max(here.bound_px, there.bound_px)
         n = len(here.points)
         fewer = np.sqrt(n / (here.n_points * model.matched(bound_px)))
-        place, excess = (
-            model.place_px(bound_px) * fewer,
-            model.place_excess * np.hypot(1, model.lamps * self.lamp_share),
-        )
+        place = model.place_px(bound_px) * fewer
+        excess = model.place_excess * np.hypot(1, model.lamps * self.lamp_share)
         numbers = self._numbers_of(number, other, n + 1)
         in_view, motion, cov = _link(
             here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, there.pose, here.pose,
