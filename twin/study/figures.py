@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable
 from typing import Any
 
@@ -128,7 +129,7 @@ def distributions(found: Findings, levels: list[Level]) -> Figure | None:
         if level.limit is not None:
             axes.axvline(level.limit, color=LIMIT, linestyle="--", label="limit")
         unit_axis(axes.xaxis, level.name)
-        axes.set_xlabel(name_of(level.name))
+        axes.set_xlabel(label_of(level.name))
     panels[0].set_ylabel("surveys")
     panels[0].legend(fontsize=8)
     return figure
@@ -140,6 +141,11 @@ def _edges(values: Array, log: bool) -> Array:
     if log:
         return np.geomspace(low, high, count + 1)
     return np.linspace(low, high if high > low else low + 1e-9 + abs(low) * 1e-3, count + 1)
+
+
+def label_of(metric: str) -> str:
+    """A metric's name, in lines that fit beside a panel."""
+    return textwrap.fill(name_of(metric), 26)
 
 
 def unit_axis(axis, metric: str) -> None:

@@ -11,13 +11,14 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from twin.judge.figures import to_data_uri
 from twin.judge.page import render_page
 from twin.judge.style import COLOURS, FIGURE_STYLE
 from twin.scenario_file import dump_toml
 from twin.study import wording
-from twin.study.figures import log_axis, make_panels, spans_decades, unit_axis
+from twin.study.figures import label_of, log_axis, make_panels, spans_decades, unit_axis
 from twin.study.study_file import Study, Tuning
 from twin.study.tuning import Candidate, Tuned, best
 
@@ -143,7 +144,9 @@ def _named(axis, name: str) -> None:
         axis.set_major_formatter(lambda value, _: wording.percent(value))
     else:
         unit_axis(axis, name)
-    axis.set_label_text(wording.name_of(name))
+    if axis.get_scale() == "linear":
+        axis.set_major_locator(MaxNLocator(4))  # ticks are words
+    axis.set_label_text(label_of(name))
 
 
 def _plain(value: object) -> str:
