@@ -4,14 +4,16 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import study_tasks
 
 from twin.errors import TwinError
 from twin.study.engine import LocalEngine, connect
-from twin.study.worker import Limits
+from twin.study.worker import Crew, Limits
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +83,26 @@ def test_who_stops_listening_ends_the_workers():
     running.close()
     with pytest.raises(ProcessLookupError):
         os.kill(worker._process.pid, 0)
+
+
+def test_a_pipe_is_closed_once_when_a_study_ends_while_its_worker_is_asked():
+    crew = Crew()
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(crew.work, study_tasks.misbehave, ("hang", ""), Limits())
+        while not crew._busy:
+            time.sleep(0.01)
+        (worker,) = crew._busy
+        closed = []
+
+        def close_slowly():
+            closed.append(threading.get_ident())
+            time.sleep(0.3)
+
+        worker._pipe._close = close_slowly
+        crew.end()
+        reply, attempts = asked.result(timeout=20)
+    assert (reply.kind, attempts, len(closed)) == ("killed", 1, 1)
+    assert crew.work(study_tasks.square, 3, Limits())[0].reason == "the study is over"
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):

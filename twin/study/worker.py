@@ -71,15 +71,19 @@ class Worker:
             if self._pipe.poll(timeout_s):
                 return pickle.loads(self._pipe.recv_bytes())
         except (EOFError, OSError):
-            self.end()
+            self.kill()
             return Reply("killed", reason=self._death())
-        self.end()
+        self.kill()
         return Reply("hung", reason=f"did not end within {timeout_s:g} s")
 
-    def end(self) -> None:
-        """Kills the process, if it is still there."""
+    def kill(self) -> None:
+        """Kills the process, if it is still there; any thread may, and one that asks is answered "killed"."""
         self._process.kill()
         self._process.wait()
+
+    def end(self) -> None:
+        """Kills the process and closes the pipe to it: for the one thread that holds this worker."""
+        self.kill()
         self._pipe.close()
 
     def _death(self) -> str:
@@ -104,9 +108,12 @@ class Crew:
         """Kills all workers; whoever waits for one is told so."""
         with self._lock:
             self._over = True
-            workers = [*self._idle, *self._busy]
-        for worker in workers:
+            idle, self._idle = self._idle, []
+            busy = list(self._busy)
+        for worker in idle:
             worker.end()
+        for worker in busy:
+            worker.kill()  # who asked it ends it: a pipe closed by two threads would close another's file
 
     def work(self, function: Callable[[Any], Any], task: Any, limits: Limits) -> tuple[Reply, int]:
         """The reply to a task, and the number of attempts: only a process that died is tried again."""
@@ -125,14 +132,15 @@ class Crew:
             worker = self._idle.pop() if self._idle else Worker(self._free.pop(0) if self._free else None)
             self._busy.add(worker)
         reply = worker.ask(request, timeout_s)
-        if reply.kind == "crashed":
-            worker.end()  # who knows what it left behind
         with self._lock:
             self._busy.discard(worker)
-            if reply.kind == "done":
+            kept = reply.kind == "done" and not self._over
+            if kept:
                 self._idle.append(worker)
             else:
                 self._free.append(worker.processor)
+        if not kept:
+            worker.end()  # also after a crash: who knows what it left behind
         return reply
 
 
