@@ -53,10 +53,21 @@ def rigid(almost: Array) -> Array:
 
     (..., 4, 4) -> (..., 4, 4)
     """
-    u, _, vt = np.linalg.svd(almost[..., :3, :3])
-    u[..., 2] *= np.linalg.det(u @ vt)[..., None]
+    return _rigid(np.ascontiguousarray(almost).reshape(-1, 4, 4)).reshape(almost.shape)
+
+
+@njit(cache=True, nogil=True)
+def _rigid(almost):
+    """Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986). (n, 4, 4) -> (n, 4, 4)."""
     result = almost.copy()
-    result[..., :3, :3] = u @ vt
+    for pose in result:
+        change = np.inf
+        while change > 1e-12:  # the next one is its square
+            a, b, c = pose[0, :3], pose[1, :3], pose[2, :3]
+            cofactors = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)))
+            step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - pose[:3, :3])
+            pose[:3, :3] += step
+            change = np.abs(step).max()
     return result
 
 

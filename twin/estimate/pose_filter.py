@@ -39,14 +39,10 @@ class PoseFilter:
             (6, 6) by how much the covariance fell; None where the measurement contradicts the prediction beyond both
             uncertainties and is refused.
         """
-        moved = clipped(since, self.cov, most=1.0)
-        residual = geometry.log(geometry.inverse(self.world_from_camera) @ measured)
-        inverse = np.linalg.inv(moved + cov)
-        if residual @ inverse @ residual > _GATE:
+        chi2, pose, learnt = _corrected(self.world_from_camera, self.cov, measured, cov, since)
+        if chi2 > _GATE:
             return None
-        gain = moved @ inverse
-        learnt = np.asarray(gain @ moved, np.float64)
-        self.reset(self.world_from_camera @ geometry.exp(gain @ residual), self.cov - learnt)
+        self.reset(pose, self.cov - learnt)
         return learnt
 
     def fix(self, readings: Readings) -> None:
@@ -105,13 +101,14 @@ def predicted(world_from_camera, cov, a_from_b, motion_cov):
     return world_from_camera @ a_from_b, carried(cov, a_from_b) + motion_cov
 
 
+@njit(cache=True, nogil=True)
 def clipped(cov: Array, other: Array, least: float = 0.0, most: float = np.inf) -> Array:
     """A covariance (n, n), cut to between `least` and `most` times another, in the axes that both have in common."""
     root = np.linalg.cholesky(other)
     inward = np.linalg.inv(root)
     sizes, axes = np.linalg.eigh(inward @ cov @ inward.T)
     axes = root @ axes
-    return np.asarray(axes * np.clip(sizes, least, most) @ axes.T, np.float64)
+    return axes * np.minimum(np.maximum(sizes, least), most) @ axes.T
 
 
 @njit(cache=True, nogil=True)
@@ -127,6 +124,16 @@ def _updated(world_from_camera, prior, residual, jacobian, cov):
     gain = np.linalg.solve(jacobian @ prior @ jacobian.T + cov, jacobian @ prior).T.copy()
     keep = np.eye(6) - gain @ jacobian
     return world_from_camera @ geometry.exp(gain @ residual), keep @ prior @ keep.T + gain @ cov @ gain.T
+
+
+@njit(cache=True, nogil=True)
+def _corrected(world_from_camera, prior, measured, cov, since):
+    """How far a measured pose is off (chi2), the pose that it leads to, and by how much the covariance falls."""
+    moved = clipped(since, prior, 0.0, 1.0)
+    residual = geometry.log(geometry.inverse(world_from_camera) @ measured)
+    inverse = np.linalg.inv(moved + cov)
+    gain = moved @ inverse
+    return residual @ inverse @ residual, world_from_camera @ geometry.exp(gain @ residual), gain @ moved
 
 
 def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:

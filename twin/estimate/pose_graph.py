@@ -18,9 +18,9 @@ from twin.estimate import marginals as selected
 from twin.geometry import Array
 from twin.records import Link
 
-#: A step that lowers F by less ends the search: it moved no pose by more than 0.05 of its standard deviation, and the
-#: next one, quadratically less, is not taken.
-_LEAST_GAIN = 1e-3
+#: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
+#: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
+_BEYOND_LINEAR = 5e-4
 _MANY = 2500  # poses from which on nested dissection saves more than it costs
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 
@@ -95,29 +95,26 @@ def optimise(
 
     Args:
         last: numbers of the few poses whose marginals will be wanted: eliminated last, theirs cost nothing. None: all,
-            for which the graph is eliminated variable by variable once it is near, not by the quicker tree.
+            for which the graph is eliminated variable by variable, not by the quicker tree.
 
     Raises:
         RuntimeError: the factors do not hold every variable.
     """
     order, values, cost = _order(graph, start, last), start, graph.error(start)
-    by_variable, reached = False, False
-    eliminated: Eliminated = gtsam.GaussianBayesTree()
+    reached, eliminated = False, gtsam.GaussianBayesTree()
     while iterations > 0 and not reached:
         del eliminated  # one at a time is enough to hold
-        eliminated = _eliminate(graph.linearize(values), order, by_variable)
-        moved = values.retract(eliminated.optimize())
+        linear = graph.linearize(values)
+        eliminated = linear.eliminateSequential(order) if last is None else linear.eliminateMultifrontal(order)
+        step = eliminated.optimize()
+        moved, expected = values.retract(step), eliminated.error(gtsam.VectorValues.Zero(step))
         moved_cost, iterations = graph.error(moved), iterations - 1
-        if moved_cost > cost + _LEAST_GAIN:
-            moved = _damped(graph, values, order, iterations)
+        if moved_cost > cost + _BEYOND_LINEAR:
+            moved, expected = _damped(graph, values, order, iterations), 0.0
             moved_cost = graph.error(moved)
-        reached = cost - moved_cost < _LEAST_GAIN and by_variable == (last is None)
-        values, cost, by_variable = moved, moved_cost, last is None
+        reached = abs(cost - moved_cost - expected) < _BEYOND_LINEAR
+        values, cost = moved, moved_cost
     return Optimum(values, reached, eliminated)
-
-
-def _eliminate(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool) -> Eliminated:
-    return linear.eliminateSequential(order) if by_variable else linear.eliminateMultifrontal(order)
 
 
 def _damped(
@@ -126,7 +123,7 @@ def _damped(
     """The nearest minimum by Levenberg-Marquardt."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(0)
-    parameters.setAbsoluteErrorTol(_LEAST_GAIN)
+    parameters.setAbsoluteErrorTol(_BEYOND_LINEAR)
     parameters.setMaxIterations(iterations)
     parameters.setOrdering(order)
     return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
