@@ -257,7 +257,7 @@ def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
     for k, pose in enumerate(poses):
         start.insert(k, gtsam.Pose3(pose))
         moved.insert(k, gtsam.Pose3(away @ pose))
-    aiding.add_readings(graph, start, key_points(poses, walked=walked), RIG, NOISE)
+    aiding.add_readings(graph, start, key_points(poses, walked=walked), RIG, NOISE, {})
     moved.insert(gtsam.symbol("s", 0), np.zeros(1))
     assert graph.error(start) > 0.5
     assert graph.error(moved) == pytest.approx(graph.error(start), rel=1e-9)

@@ -31,15 +31,23 @@ def add_readings(
     nodes: Sequence[KeyPoint],
     rig: StereoRig,
     noise: SensorNoise,
+    known: dict[int, gtsam.NonlinearFactorGraph],
 ) -> None:
-    """Adds a factor for each reading of the nodes, and the beacons and the scale error that they tell of."""
+    """Adds a factor for each reading of the nodes, and the beacons and the scale error that they tell of.
+
+    Args:
+        known: what readings tell of one node each, by its number; that of new ones is added.
+    """
     camera_from_body = geometry.inverse(rig.body_from_camera)
     height = gtsam.noiseModel.Diagonal.Sigmas(np.array([_FREE_M, _FREE_M, noise.pressure_m]))
     attitude = gaussian(pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1])  # the same for every reading
     for node in nodes:
-        _add_height(graph, node, height)
-        _add_attitude(graph, node, camera_from_body, noise, attitude)
-        _add_fix(graph, node, noise)
+        if node.number not in known:
+            alone = known[node.number] = gtsam.NonlinearFactorGraph()
+            _add_height(alone, node, height)
+            _add_attitude(alone, node, camera_from_body, noise, attitude)
+            _add_fix(alone, node, noise)
+        graph.push_back(known[node.number])
     _add_beacons(graph, start, nodes, rig, noise)
     _add_displacements(graph, start, nodes, rig, noise)
 

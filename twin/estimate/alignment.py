@@ -29,8 +29,11 @@ _FEW_ITERATIONS = 10  # of a round: with gross links in, Huber's weights settle 
 _HUBER = 3.0
 
 
-#: Of links, by the numbers of their nodes.
-Factors = dict[tuple[int, int], gtsam.BetweenFactorPose3]
+class Factors(NamedTuple):
+    """Those made before, by the numbers of their nodes: windows share most of theirs."""
+
+    of_links: dict[tuple[int, int], gtsam.BetweenFactorPose3]
+    of_readings: dict[int, gtsam.NonlinearFactorGraph]
 
 
 class Aligned(NamedTuple):
@@ -58,10 +61,11 @@ def align(
         anchors: number of each held node: its covariance (6, 6) [rotation, translation].
         rig, noise: calibration as believed.
         marginals_of: numbers of the nodes whose covariance is wanted; all if None, zeros for the others.
-        factors: of links aligned before, by their ends; those of new ones are added.
+        factors: of links and nodes aligned before; those of new ones are added.
     """
-    graph, values = _without_links(nodes, anchors, rig, noise)
-    fit = _Fit(graph, list(links), _factors_of(links, {} if factors is None else factors))
+    factors = Factors({}, {}) if factors is None else factors
+    graph, values = _without_links(nodes, anchors, rig, noise, factors.of_readings)
+    fit = _Fit(graph, list(links), _factors_of(links, factors.of_links))
     dropped: list[Link] = []
     found = fit.optimise(values, _FEW_ITERATIONS, marginals_of)
     for _ in range(_ROUNDS):
@@ -99,9 +103,8 @@ class _Fit(NamedTuple):
 
         The path's own chain always stands.
         """
-        covs = np.array([link.cov for link in self.links]).reshape(-1, 6, 6)
         chain = np.array([link.j - link.i == 1 for link in self.links], dtype=bool)
-        chi2 = np.where(chain, 0.0, pose_graph.chi2(self.of_links, covs, values))
+        chi2 = np.where(chain, 0.0, pose_graph.chi2(self.of_links, values, _HUBER))
         return chi2 > max(_OUTLIER_CHI2, _OF_THE_WORST * float(chi2.max(initial=0.0)))
 
     def without(self, wrong: Mask) -> _Fit:
@@ -109,21 +112,22 @@ class _Fit(NamedTuple):
         return _Fit(self.of_nodes, [self.links[k] for k in rows], [self.of_links[k] for k in rows])
 
 
-def _factors_of(links: Sequence[Link], known: Factors) -> list[gtsam.BetweenFactorPose3]:
-    """A factor of each link: windows share most of theirs."""
-    new = [link for link in links if (link.i, link.j) not in known]
-    known.update(zip(((link.i, link.j) for link in new), pose_graph.between_factors(new, _HUBER), strict=True))
-    return [known[link.i, link.j] for link in links]
+def _factors_of(
+    links: Sequence[Link], known: dict[tuple[int, int], gtsam.BetweenFactorPose3]
+) -> list[gtsam.BetweenFactorPose3]:
+    new = [link for link in links if link[:2] not in known]
+    known.update(zip((link[:2] for link in new), pose_graph.between_factors(new, _HUBER), strict=True))
+    return [known[link[:2]] for link in links]
 
 
-def _without_links(nodes, anchors, rig, noise) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def _without_links(nodes, anchors, rig, noise, known) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for node in nodes:
         pose = gtsam.Pose3(node.world_from_camera)
         start.insert(node.number, pose)
         if node.number in anchors:
             graph.add(gtsam.PriorFactorPose3(node.number, pose, pose_graph.gaussian(anchors[node.number])))
-    aiding.add_readings(graph, start, nodes, rig, noise)
+    aiding.add_readings(graph, start, nodes, rig, noise, known)
     return graph, start
 
 

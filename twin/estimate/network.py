@@ -54,14 +54,15 @@ def choose_links(
         poses: (n, 4, 4) of the earlier ones.
     """
     shares = overlaps(node, poses, rig, patch_px)
-    linked = [(earlier[k], float(shares[k])) for k in np.flatnonzero(shares >= min_overlap)[::-1]]
-    previous = [s for s in linked if s[0] in earlier[-_SAME_SWATH:]]
-    rest = [s for s in linked if s[0] not in earlier[-_SAME_SWATH:]]
-    same = _unbroken(rest, earlier)
-    others = sorted((s for s in rest if s not in same), key=lambda s: -s[1])
-    oldest = [min(others, key=lambda s: s[0].number)] if others else []
-    rest = [s for s in others if s not in oldest]
-    return (previous + same[-1:] + oldest + _spread(rest, max_links))[:max_links]
+    linked = np.flatnonzero(shares >= min_overlap)[::-1].tolist()
+    previous = [k for k in linked if k >= len(earlier) - _SAME_SWATH]
+    rest = linked[len(previous) :]
+    same = _unbroken(rest, len(earlier) - _SAME_SWATH - 1)
+    others = sorted(rest[len(same) :], key=lambda k: -shares[k])
+    oldest = [min(others)] if others else []
+    rest = [k for k in others if k not in oldest]
+    chosen = (previous + same[-1:] + oldest + _spread(rest, earlier, max_links))[:max_links]
+    return [(earlier[k], float(shares[k])) for k in chosen]
 
 
 def share_noise(links: Sequence[Link]) -> list[Link]:
@@ -73,25 +74,18 @@ def share_noise(links: Sequence[Link]) -> list[Link]:
     return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
-def _unbroken(linked: list[tuple[KeyPoint, float]], earlier: Sequence[KeyPoint]) -> list[tuple[KeyPoint, float]]:
-    """Those that follow one another without a gap, back from the node: its own swath."""
-    expected = len(earlier) - _SAME_SWATH - 1
-    run = []
-    for item in linked:
-        if expected < 0 or item[0] is not earlier[expected]:
-            break
-        run.append(item)
-        expected -= 1
-    return run
+def _unbroken(linked: list[int], newest: int) -> list[int]:
+    """Those that follow one another without a gap, back from the newest: the node's own swath."""
+    return [k for back, k in enumerate(linked) if k == newest - back]
 
 
-def _spread(others: list[tuple[KeyPoint, float]], count: int) -> list[tuple[KeyPoint, float]]:
+def _spread(others: list[int], earlier: Sequence[KeyPoint], count: int) -> list[int]:
     """The best of other swaths, no two of them neighbours on theirs as long as there is a choice."""
-    chosen: list[tuple[KeyPoint, float]] = []
-    for item in others:
-        if all(abs(item[0].number - c[0].number) > 1 for c in chosen):
-            chosen.append(item)
-    return (chosen + [o for o in others if o not in chosen])[:count]
+    chosen: list[int] = []
+    for k in others:
+        if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
+            chosen.append(k)
+    return (chosen + [k for k in others if k not in chosen])[:count]
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:

@@ -112,18 +112,17 @@ def linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline):
     predicted, by_point, by_motion = transfer(structure, a_from_b, baseline)
     n = len(a)
     error, information, size = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
-    cov = np.empty((3, 3))
+    cov, carried = np.empty((3, 3)), np.empty((3, 3))
     for i in range(n):
         g = by_point[i]
         for r in range(3):
             error[i, r] = a[i, r] - predicted[i, r]
             for k in range(3):
                 error[i, r] -= g[r, k] * (b[i, k] - structure[i, k])
-            for c in range(3):
-                cov[r, c] = cov_a[i, r, c]
-                for k in range(3):
-                    for m in range(3):
-                        cov[r, c] += g[r, k] * cov_b[i, k, m] * g[c, m]
+                carried[r, k] = g[r, 0] * cov_b[i, 0, k] + g[r, 1] * cov_b[i, 1, k] + g[r, 2] * cov_b[i, 2, k]
+            for c in range(r + 1):
+                off = carried[r, 0] * g[c, 0] + carried[r, 1] * g[c, 1] + carried[r, 2] * g[c, 2]
+                cov[r, c] = cov[c, r] = cov_a[i, r, c] + off
         _invert(cov, information[i])
         square = 0.0
         for r in range(3):
@@ -159,10 +158,12 @@ def reduced(error, by_motion, information, weight):
                 projected[p, c] *= weight[i]
                 right[p] += projected[p, c] * error[i, c]
                 by_common[p, c] += projected[p, c]
-        for p in range(6):
-            for q in range(6):
+            for q in range(p + 1):
                 for c in range(3):
                     normal[p, q] += projected[p, c] * by_motion[i, c, q]
+    for p in range(6):
+        for q in range(p):
+            normal[q, p] = normal[p, q]
     return normal, right, by_common
 
 

@@ -70,7 +70,7 @@ class Navigator:
         self.measuring: deque[Callable[[], list[Link]]] = deque()
         self.behind = ThreadPoolExecutor(1) if beside else None
         self.times_s, self.f2f_poses, self.online_poses = Rows(), Rows(4, 4), Rows(4, 4)
-        self.factors: Factors = {}
+        self.factors = Factors({}, {})
         self.dropped: list[Link] = []
         self.alignments: list[Alignment] = []
         self.before_ga: list[Array] = []
@@ -228,9 +228,9 @@ class Navigator:
             window = self.nodes[:oldest] + self.nodes[first:]
             poses = np.concatenate([self.node_poses[:oldest], self.node_poses[first:n]])
             chosen = network.choose_links(node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px)
-        others = [(replace(k), share) for k, share in chosen if k is not self.nodes[-1]]
+        others = [(k, share) for k, share in chosen if k is not self.nodes[-1]]
         bridge = self._bridge(node) if self.nodes and chain is None else None
-        measure = partial(self._links_of, replace(node), others, chain, bridge)
+        measure = partial(self._links_of, replace(node), others, chain, bridge)  # its points are given up below
         self.measuring.append(self.behind.submit(measure).result if self.behind else measure)
         self._take_links(all_but=_MOST_BEHIND)
         walked = self.velocity_log.at_node(node.number)

@@ -140,10 +140,14 @@ def _order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequen
     return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*(last or ()), *shared])
 
 
-def chi2(factors: Sequence[gtsam.BetweenFactorPose3], covs: Array, values: gtsam.Values) -> Array:
-    """(n,) squared residual of each link in units of its covariance (n, 6, 6), before any robust weight."""
-    residuals = np.array([factor.unwhitenedError(values) for factor in factors]).reshape(-1, 6)
-    return np.einsum("ni,ni->n", residuals, np.linalg.solve(covs, residuals[..., None])[..., 0])
+def chi2(
+    factors: Sequence[gtsam.BetweenFactorPose3], values: gtsam.Values, huber: float | None = None
+) -> Array:
+    """(n,) squared residual of each link in units of its covariance, before the weight of the kernel it was made with."""
+    losses = np.array([factor.error(values) for factor in factors])
+    if huber is None:
+        return 2 * losses
+    return np.where(losses <= huber**2 / 2, 2 * losses, (losses / huber + huber / 2) ** 2)
 
 
 def _values(poses: dict[int, Array]) -> gtsam.Values:

@@ -366,19 +366,19 @@ def _link(
         if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
             cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
             row, col = _floor_cell(here_pose, points[k], baseline, cell_m, len(relief))
-            askew, along = relief_size * relief[row, col]
-            a[n], b[n] = seen[k] + bias, points[k]
-            a[n, 0] += way[1] * askew
-            a[n, 1] += way[0] * askew + 2 * way[1] * along
+            askew, along = relief_size * relief[row, col, 0], relief_size * relief[row, col, 1]
             for r in range(3):
+                a[n, r], b[n, r] = seen[k, r] + bias[r], points[k, r]
                 for c in range(r + 1):
                     a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
                     b[n, r] += root[r, c] * here[k, c]
+            a[n, 0] += way[1] * askew
+            a[n, 1] += way[0] * askew + 2 * way[1] * along
             n += 1
-    a, b = a[:n], b[:n]
+    a, b, farther_cov = a[:n], b[:n], cov * (1 + farther)
     covs, farther_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for k in range(n):
-        covs[k], farther_covs[k] = cov, cov * (1 + farther)
+        covs[k], farther_covs[k] = cov, farther_cov
     error, _, by_motion, information, _ = observation.linearised(a, b, b, farther_covs, covs, there_from_here, baseline)
     normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
     if n < _LEAST_OF_RASTER:
