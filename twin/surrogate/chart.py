@@ -98,10 +98,10 @@ class Chart:
         last = next_true is None
         camera_from_world = np.stack([geometry.inverse(true), geometry.inverse(true if last else next_true)])
         shift = believed @ camera_from_world[0]
-        rotation = np.kron(np.eye(2), believed[:3, :3])
+        turn = geometry.adjoint(geometry.pose(believed[:3, :3], np.zeros(3)))
         depth_m = _hand_over(
             height, variance, common, self._height, self._slope, self._place, self._camera, camera_from_world, last,
-            shift, believed[:3, 3].copy(), rotation @ cov @ rotation.T, rng.standard_normal(shape, np.float32),
+            shift, believed[:3, 3].copy(), turn @ cov @ turn.T, rng.standard_normal(shape, np.float32),
             errors, row, col,
         )  # fmt: skip
         lateral = surface.LATERAL_PX * depth_m / self._rig.focal_px

@@ -32,8 +32,8 @@ def compiled(
     gauges, n_steps = sea.sensors.gauges(), round(1 / rate_hz / vehicle.body.timestep_s)
 
     def glide(course: Course, first: int, track: int) -> int:
-        errors = vision.following
-        end = first + int(np.argmax(np.append(course.key_point[first:], True)))
+        errors, ahead = vision.following, course.key_point[first:]
+        end = first + (int(np.argmax(ahead)) if ahead.any() else len(ahead))
         if errors is None or end == first:
             return first
         n, reference = end - first, tuple(np.asarray(part)[first:end] for part in course.reference)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,6 +30,14 @@ def cells_of(pose, points, baseline):
     return cells
 
 
+class Shares(NamedTuple):
+    """Numbers of key points, rising; where they are believed to be (n, 4, 4), and their parts (n,) of a view."""
+
+    numbers: list[int]
+    believed: Array
+    parts: Array
+
+
 class Owners:
     """Key points by the cells of floor that they laid first."""
 
@@ -46,11 +55,12 @@ class Owners:
         for cell in cells.tolist():
             self._owner.setdefault(cell, number)
 
-    def shares(self, cells: Cells) -> list[tuple[int, Array, float]] | None:
-        """Number, believed pose and share of each key point that laid what is in view; None where too little is."""
+    def shares(self, cells: Cells) -> Shares | None:
+        """Of the key points that laid what is in view; None where too little is."""
         counts = Counter(map(self._owner.get, cells.tolist()))
         counts.pop(None, None)
-        total = sum(counts.values())
-        if total < _LEAST_SHARE * len(cells):
+        if counts.total() < _LEAST_SHARE * len(cells):
             return None
-        return [(number, self._believed[number], n / total) for number, n in counts.items() if number is not None]
+        numbers = sorted(number for number in counts if number is not None)
+        parts = np.array([counts[number] for number in numbers]) / counts.total()
+        return Shares(numbers, np.array([self._believed[number] for number in numbers]), parts)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -120,8 +120,8 @@ class SurrogateVision:
         self._f2f: FrameErrors | None = None
         self._last_motion = np.eye(4)
         self._owners = Owners()
-        self._key, self._bits, self._drawing = int(rng.integers(2**63)), np.random.Philox(key=0), Lock()
-        self._begin = self._bits.state
+        self._key, self._own, self._drawing = int(rng.integers(2**63)), np.random.Generator(np.random.Philox(0)), Lock()
+        self._begin: Any = self._own.bit_generator.state
         self._drawn, self._used = np.zeros((0, 6)), 0
         self._relief = rng.standard_normal((_FIELD, _FIELD, 2))
         one = np.zeros((1, 2))
@@ -208,8 +208,8 @@ class SurrogateVision:
     def _shown(self, rows: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
         """Which of these points of the raster, whose depths are `depth_m[rows]`, both eyes see well inside."""
         shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[rows]
-        left_px = self._pixels[rows]
-        right_px = left_px - np.column_stack([shift_px, np.zeros(len(rows))])
+        left_px, right_px = self._pixels[rows], self._pixels[rows]
+        right_px[:, 0] -= shift_px
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
         return in_left & in_right
 
@@ -232,14 +232,12 @@ class SurrogateVision:
         shares = self._owners.shares(self._now.cells)
         if shares is None:
             return None
-        told = [believed for _, believed, _ in shares]
-        true = [self._seen[number].pose for number, _, _ in shares]
-        offset = _offset(np.stack(told), np.stack(true), np.array([s for *_, s in shares]), now, world_from_camera)
+        true = np.array([self._seen[number].pose for number in shares.numbers])
+        offset = _offset(shares.believed, true, shares.parts, now, world_from_camera)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
         error = root @ self.draw(1)[0] * self.model.mosaic_excess
         found = Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
-        older = np.cumsum([share for _, _, share in sorted(shares, key=lambda s: s[0])])
-        return Registration(found, sorted(number for number, _, _ in shares)[int(np.searchsorted(older, 0.5))])
+        return Registration(found, shares.numbers[int(np.searchsorted(np.cumsum(shares.parts), 0.5))])
 
     def lay(self, number: int, world_from_camera: Array) -> None:
         assert self._now is not None
@@ -287,8 +285,8 @@ class SurrogateVision:
         """Standard normal numbers (n, 3) of a link."""
         begin = self._begin | {"state": {"key": [self._key, 0], "counter": [0, 0, number, other]}}
         with self._drawing:  # links are measured by other threads
-            self._bits.state = begin  # pyright: ignore[reportAttributeAccessIssue]
-            return np.random.Generator(self._bits).standard_normal((n, 3))
+            self._own.bit_generator.state = begin
+            return self._own.standard_normal((n, 3))
 
     def map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
@@ -403,7 +401,7 @@ def _unit_motion(points: Array, baseline: float, n_weight: float) -> tuple[Array
     n = len(points)
     rows = observation.image_motion(points[:, 0], points[:, 1], baseline / points[:, 2])
     normal, _ = observation.normal_equations(rows, np.full(n, n_weight / n), np.zeros((n, 2)))
-    cov = np.linalg.inv(normal)
+    cov = np.ascontiguousarray(np.linalg.inv(normal))
     return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
 
 
