@@ -14,7 +14,7 @@ from twin.scenario_file import load_scenario
 from twin.surrogate import calibration, fit, witness
 from twin.surrogate.calibrate import fit_to
 from twin.surrogate.chart import CellErrors
-from twin.surrogate.conditions import bounds_px, unevenness_px
+from twin.surrogate.conditions import bounds_px, lamp_share, unevenness_px
 from twin.surrogate.floor import Floor
 from twin.surrogate.model import ErrorModel, Law
 from twin.surrogate.sea import SurrogateSea, vision_beside
@@ -70,6 +70,23 @@ def test_patches_are_placed_worse_in_murkier_water_from_farther_and_with_more_no
     assert bound(3.0, 'water.jerlov="3C"') > 2 * bound(2.0, 'water.jerlov="3C"')
     noisier = bound(2.0, "imaging.noise_sd=0.032", "imaging.shot_noise=0.024")
     assert noisier == pytest.approx(4 * base, rel=0.05)
+
+
+def test_the_lamps_share_of_the_light_falls_as_the_sun_rises():
+    def share(lux, *sets):
+        m = mission(f"sun.illuminance_lx={lux}", *sets)
+        return lamp_share(m.scenario, m.terrain)
+
+    lamps = "lamps=[{position_m=[0.3, 0.3, 0.0], intensity_cd=500.0}]"
+    shares = [share(lux, lamps) for lux in (0, 100, 1000, 10_000)]
+    assert shares[0] == 1
+    assert all(np.diff(shares) < 0) and 0 < shares[-1] < 0.5
+    # of two lights the radiances add up
+    assert shares[1] / (1 - shares[1]) == pytest.approx(10 * shares[2] / (1 - shares[2]), rel=0.01)
+    assert share(1000, "lamps=[]") == 0
+    dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
+    plan = dark.scenario.plan.model_copy(update={"altitude_m": 1000.0})
+    assert lamp_share(dark.scenario.model_copy(update={"plan": plan}), dark.terrain) == 1  # nothing comes back
 
 
 def test_the_floor_under_a_patch_lies_out_of_its_plane_as_its_curvature_tells():
@@ -294,20 +311,20 @@ def test_a_calibration_comes_back_from_disk_and_a_file_that_is_none_is_told(tmp_
 def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     """The images are played by a surrogate with other errors than the one that it is compared with.
 
-    What is steady, and relief, take longer paths than these two of 15 key points.
+    What is steady, and relief, take longer paths than these of 15 key points.
     """
     true = ErrorModel(
         place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_undone=0.4, steady=0.4,
-        mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5, apart=4.0, relief=0.3, lamps=0.5,
+        mosaic_px=Law(0.3, 1.0), depth_px=Law(0.02, 1.0), lateral_px=0.5, apart=4.0, relief=0.3, lamps=1.5,
     )  # fmt: skip
-    notes = [
-        witnessed(mission(water), true, seed) for seed, water in enumerate(('water.jerlov="I"', 'water.jerlov="III"'))
-    ]
+    waters = [['water.jerlov="I"'], ['water.jerlov="III"'], ["lamps=[]", "sun.illuminance_lx=2000"]]
+    notes = [witnessed(mission(*water), true, seed) for seed, water in enumerate(waters)]
     found = fit_to(notes, COMPARED).model
     bound_px = found.bound_px[1]
     for name in ("place_px", "f2f_px", "mosaic_px"):
         assert getattr(found, name)(bound_px) == pytest.approx(getattr(true, name)(bound_px), rel=0.05), name
-    under_lamps = found.place_excess * np.hypot(1, found.lamps)  # no survey without them
+    assert found.place_excess == pytest.approx(true.place_excess, rel=0.2)
+    under_lamps = found.place_excess * np.hypot(1, found.lamps)
     assert under_lamps == pytest.approx(true.place_excess * np.hypot(1, true.lamps), rel=0.2)
     assert found.f2f_excess == pytest.approx(true.f2f_excess, rel=0.1)
     assert found.f2f_undone == pytest.approx(true.f2f_undone, abs=0.1)

@@ -140,10 +140,8 @@ def _order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequen
     return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*(last or ()), *shared])
 
 
-def chi2(
-    factors: Sequence[gtsam.BetweenFactorPose3], values: gtsam.Values, huber: float | None = None
-) -> Array:
-    """(n,) squared residual of each link in units of its covariance, before the weight of the kernel it was made with."""
+def chi2(factors: Sequence[gtsam.BetweenFactorPose3], values: gtsam.Values, huber: float | None = None) -> Array:
+    """(n,) squared residual of each link in units of its covariance, before the weight of its kernel."""
     losses = np.array([factor.error(values) for factor in factors])
     if huber is None:
         return 2 * losses

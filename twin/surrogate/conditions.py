@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import terrains
 from twin.config import Scenario
 from twin.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
+from twin.imaging.camera import Depth
 from twin.imaging.light import Light, Moment
 from twin.imaging.photo_sensor import sensor_of
 from twin.records import Image, StereoRig
@@ -32,7 +33,7 @@ class Conditions:
     Attributes:
         depths_m: (m,).
         bounds_px: (m,) bound there.
-        unevens_px: (m,) how far the floor under a patch, seen from there, lies out of its plane.
+        unevenness_px: (m,) how far the floor under a patch, seen from there, lies out of its plane.
         lamp_share: how much of the light is the lamps', which move along.
     """
 
@@ -40,7 +41,7 @@ class Conditions:
         nearest = max(scenario.plan.altitude_m - terrain.highest_m, 0.3)
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (scenario.plan.altitude_m - terrain.lowest_m), _DEPTHS)
         self.bounds_px = bounds_px(scenario, terrain, self.depths_m)
-        self.unevens_px = unevenness_px(scenario, terrain, self.depths_m)
+        self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m)
         self.lamp_share = lamp_share(scenario, terrain)
 
     def bound_px(self, depth_m: float) -> float:
@@ -49,7 +50,7 @@ class Conditions:
 
     def uneven_px(self, depth_m: float) -> float:
         """How uneven the floor is from a depth [m]."""
-        return float(np.interp(depth_m, self.depths_m, self.unevens_px))
+        return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
 def bounds_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array) -> Array:
@@ -66,19 +67,22 @@ def lamp_share(scenario: Scenario, terrain: terrains.Terrain) -> float:
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
     sunlit, both = (_sent_back(s, terrain) for s in (scenario.model_copy(update={"lamps": ()}), scenario))
-    return 1 - sunlit / both
+    return 1 - sunlit / max(both, np.finfo(float).tiny)
 
 
 def _sent_back(scenario: Scenario, terrain: terrains.Terrain) -> float:
     """Mean radiance of a white floor at the planned altitude less that of a black one [cd/m2]."""
-    light, rig = Light(_plain(scenario), terrain, np.random.default_rng(0)), scenario.believed_rig()
-    depth = np.full((rig.height_px, rig.width_px), scenario.plan.altitude_m, np.float32)
-    world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, scenario.plan.altitude_m]))
-    white, black = (
-        light.radiance(np.full((*depth.shape, 3), level, np.uint8), depth, 0, Moment(world_from_left, 0.0))
-        for level in (255, 0)
-    )
+    light = Light(_plain(scenario), terrain, np.random.default_rng(0))
+    depth, moment = _level_floor(scenario, scenario.plan.altitude_m)
+    white, black = (light.radiance(np.full((*depth.shape, 3), level, np.uint8), depth, 0, moment) for level in (255, 0))
     return float(np.mean(white - black))
+
+
+def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, Moment]:
+    """A level floor as the camera sees it from the planned altitude."""
+    rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
+    world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
+    return np.full((rig.height_px, rig.width_px), depth_m, np.float32), Moment(world_from_left, 0.0)
 
 
 def _plain(scenario: Scenario) -> Scenario:
@@ -109,9 +113,8 @@ def unevenness_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array
 
 
 def _bound_px(scenario: Scenario, rig: StereoRig, light: Light, albedo: Image, depth_m: float, rng) -> float:
-    depth = np.full(albedo.shape[:2], depth_m, np.float32)
-    world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, scenario.plan.altitude_m]))
-    radiance = light.radiance(albedo, depth, 0, Moment(world_from_left, 0.0))
+    depth, moment = _level_floor(scenario, depth_m)
+    radiance = light.radiance(albedo, depth, 0, moment)
     sensor = sensor_of(scenario, rig)
     setting = sensor.meter(radiance)
     signal = _gray(np.minimum(255 * setting.gain * radiance, 255).astype(np.float32))

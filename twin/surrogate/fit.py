@@ -27,9 +27,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
     def ratio(name: str) -> np.ndarray:
         return np.array([np.median(s[name]) for s in surveys])
 
-    def excess(name: str, own: float) -> float:
-        return own * float(np.median(np.sqrt(ratio(f"{name}_nees") / ratio(f"{name}_nees_surrogate"))))
-
+    frames_err = np.sqrt(ratio("f2f_nees") / ratio("f2f_nees_surrogate"))
     place_px = ratio("place_ratio") * [model.place_px(b) for b in bounds]
     place = _law(bounds, place_px)
     f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
@@ -54,7 +52,7 @@ def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
         apart=apart,
         relief=relief,
         f2f_px=f2f,
-        f2f_excess=excess("f2f", model.f2f_excess),
+        f2f_excess=model.f2f_excess * float(np.median(frames_err)),
         f2f_undone=float(np.median([_undone(s) for s in surveys])),
         mosaic_px=mosaic,
         depth_px=_law(bounds, np.array(depth_px)),
@@ -119,11 +117,13 @@ def _link_parts(surveys: Sequence[Notes], own_relief: float) -> tuple[np.ndarray
     thirds = np.array([_squares_by_way(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
     own = max(own_relief / RELIEF, 0.5) ** 2
-    rows, wanted = [_THIRDS_ERR / own], [_THIRDS_ERR]
+    effects, wanted = [np.array([_THIRDS_ERR / own])], [np.array([_THIRDS_ERR])]
     for patch, more in zip(by_patches / images, by_relief / images, strict=True):
-        across = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # what patches leave
-        rows, wanted = [*rows, *(across @ more)], [*wanted, *across.sum(axis=1)]
-    relief = max(float(np.dot(rows, wanted) / np.dot(rows, rows)), 0.0)
+        left = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # by patches
+        effects.append(left @ more)
+        wanted.append(left.sum(axis=1))
+    effect = np.concatenate(effects)
+    relief = max(float(effect @ np.concatenate(wanted) / (effect @ effect)), 0.0)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
     chains = np.array([[np.mean(s[f"chain_{name}"]) for name in _LINK_PARTS] for s in surveys])
     steady = STEADY * np.sum((chains[:, 0] - relief * chains[:, 2]) / patches) / np.sum(chains[:, 1])

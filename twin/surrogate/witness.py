@@ -53,8 +53,11 @@ class Witness:
         last, self._last = self._last, self._truth()
         if last is not None and status == "ok" and seen.n_points:
             true = geometry.inverse(last) @ self._last
-            self._compare("f2f", seen, guessed, true)
-            self._walked.append((geometry.log(geometry.inverse(true) @ seen.a_from_b), seen.cov))
+            self.notes["f2f_claim"].append(_ratio(seen.cov, guessed.cov))
+            errors = [geometry.log(geometry.inverse(true) @ motion.a_from_b) for motion in (seen, guessed)]
+            self.notes["f2f_nees"].append(_chi2(errors[0], seen.cov) / 6)
+            self.notes["f2f_nees_surrogate"].append(_chi2(errors[1], guessed.cov) / 6)
+            self._walked.append((errors[0], seen.cov))
         return seen, status
 
     def look(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -159,12 +162,6 @@ class Witness:
                 off = error[known] - np.median(error[known])
                 self.notes[f"map_{name}_{whose}"].append(float((1.4826 * np.median(np.abs(off))) ** 2))
                 self.notes[f"map_{name}_{whose}_claimed"].append(float(np.median(mapped.sigma_m[known]) ** 2))
-
-    def _compare(self, name: str, seen: Motion, guessed: Motion, true: Array) -> None:
-        self.notes[f"{name}_claim"].append(_ratio(seen.cov, guessed.cov))
-        for whose, motion in (("nees", seen), ("nees_surrogate", guessed)):
-            error = geometry.log(geometry.inverse(true) @ motion.a_from_b)
-            self.notes[f"{name}_{whose}"].append(_chi2(error, motion.cov) / 6)
 
 
 def _chi2(error: Array, cov: Array) -> float:
