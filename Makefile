@@ -18,7 +18,7 @@ demo: env ## a small complete survey
 test: env ## style and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow
