@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from scipy import ndimage
 
 from terrains.terrain import Terrain, TerrainFault, texture_shape
 from terrains.textures import paint, read_image, tile
+
+if TYPE_CHECKING:
+    import rasterio
 
 FIELD = "terrain.height_file"
 ALLOWED = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height a cell"
@@ -84,6 +86,9 @@ def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]
 
 
 def _read_tiff(file: Path, height_spacing_m: float) -> tuple[NDArray[np.float64], float]:
+    import rasterio  # here: most floors need none of its 20 MB
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
     try:
         with warnings.catch_warnings(), rasterio.open(file) as source:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)

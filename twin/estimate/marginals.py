@@ -23,12 +23,11 @@ Columns = NDArray[np.int64]
 
 
 class _Row(NamedTuple):
-    """A variable of the eliminated graph: R (d, d), its parents in the order of their columns in S (d, k)."""
+    """A variable of the eliminated graph, its parents in the order of their columns in S, and who has R and S."""
 
     key: int
-    r: Array
     parents: tuple[int, ...]
-    s: Array
+    conditional: gtsam.GaussianConditional
 
 
 class _Supernode(NamedTuple):
@@ -46,7 +45,8 @@ class _Joint:
     """Covariance of a supernode's variables and of their parents, by that of the supernode above, which has these."""
 
     def __init__(self, node: _Supernode, above: _Joint | None):
-        sizes = {row.key: len(row.r) for row in node.rows}
+        matrices = [row.conditional.R() for row in node.rows]
+        sizes = {row.key: len(r) for row, r in zip(node.rows, matrices, strict=True)}
         n = sum(sizes.values())
         if above is not None:
             sizes |= {key: len(above.place[key]) for key in node.parents}
@@ -54,10 +54,10 @@ class _Joint:
         self.place = {key: np.arange(a, b) for key, a, b in zip(sizes, ends, ends[1:], strict=False)}
         self.cov = np.empty((ends[-1], ends[-1]))
         eliminated = np.zeros((n, ends[-1]))
-        for row in node.rows:
+        for row, r in zip(node.rows, matrices, strict=True):
             own = self.place[row.key]
-            eliminated[own[:, None], own] = row.r
-            eliminated[own[:, None], self._columns(row.parents)] = row.s
+            eliminated[own[:, None], own] = r
+            eliminated[own[:, None], self._columns(row.parents)] = row.conditional.S()
         inverse = solve_triangular(eliminated[:, :n], np.eye(n), check_finite=False)
         self.cov[:n, :n] = inverse @ inverse.T
         if above is not None:
@@ -94,7 +94,7 @@ def marginals(net: gtsam.GaussianBayesNet) -> dict[int, Array]:
 
 def _row(conditional: gtsam.GaussianConditional) -> _Row:
     key, *parents = conditional.keys()
-    return _Row(key, conditional.R(), tuple(parents), conditional.S())
+    return _Row(key, tuple(parents), conditional)
 
 
 def _supernodes(rows: Sequence[_Row]) -> list[_Supernode]:

@@ -104,8 +104,7 @@ def optimise(
     reached, eliminated = False, gtsam.GaussianBayesTree()
     while iterations > 0 and not reached:
         del eliminated  # one at a time is enough to hold
-        linear = graph.linearize(values)
-        eliminated = linear.eliminateSequential(order) if last is None else linear.eliminateMultifrontal(order)
+        eliminated = _eliminated(graph.linearize(values), order, by_variable=last is None)
         step = eliminated.optimize()
         moved, expected = values.retract(step), eliminated.error(gtsam.VectorValues.Zero(step))
         moved_cost, iterations = graph.error(moved), iterations - 1
@@ -115,6 +114,10 @@ def optimise(
         reached = abs(cost - moved_cost - expected) < _BEYOND_LINEAR
         values, cost = moved, moved_cost
     return Optimum(values, reached, eliminated)
+
+
+def _eliminated(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool) -> Eliminated:
+    return linear.eliminateSequential(order) if by_variable else linear.eliminateMultifrontal(order)
 
 
 def _damped(
