@@ -165,6 +165,17 @@ def test_marginals_are_gtsams(last):
         np.testing.assert_allclose(cov, expected, atol=1e-3 * np.diag(expected).max())
 
 
+def test_what_is_linear_is_eliminated_once(monkeypatch):
+    graph, start, eliminate, times = gtsam.NonlinearFactorGraph(), gtsam.Values(), pose_graph._eliminated, []
+    for measured in ([1.0, 2.0], [3.0, 8.0]):
+        graph.add(gtsam.PriorFactorVector(0, np.array(measured), gtsam.noiseModel.Unit.Create(2)))
+    start.insert(0, np.array([100.0, -100.0]))
+    monkeypatch.setattr(pose_graph, "_eliminated", lambda *a, **k: times.append(1) or eliminate(*a, **k))
+    found = pose_graph.optimise(graph, start)
+    np.testing.assert_allclose(found.values.atVector(0), [2.0, 5.0], atol=1e-9)
+    assert found.reached and len(times) == 1
+
+
 def test_a_start_that_leads_gauss_newton_up_ends_at_the_minimum_all_the_same():
     """Of arctan(x)^2 each step of Gauss-Newton from beyond 1.39 leads farther off, to the other side."""
 
