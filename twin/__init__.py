@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 __all__ = ["load_scenario", "run"]
 
-# Read when numpy is loaded. Its threads wait for each other over matrices as small as ours: the last alignment of 25
-# tracks takes twice as long with two.
+# Read when numpy is loaded. Its threads wait for each other over matrices as small as ours: with two, the last
+# alignment of 25 tracks takes more than twice as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 

@@ -59,13 +59,13 @@ def rigid(almost: Array) -> Array:
 def _rigid(almost):
     """Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986). (n, 4, 4) -> (n, 4, 4)."""
     result = almost.copy()
-    for pose in result:
+    for motion in result:
         change = np.inf
         while change > 1e-12:  # the next one is its square
-            a, b, c = pose[0, :3], pose[1, :3], pose[2, :3]
+            a, b, c = motion[0, :3], motion[1, :3], motion[2, :3]
             cofactors = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)))
-            step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - pose[:3, :3])
-            pose[:3, :3] += step
+            step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - motion[:3, :3])
+            motion[:3, :3] += step
             change = np.abs(step).max()
     return result
 
