@@ -250,7 +250,7 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
     return reached
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support):
     """Adds a row of neighbours at offset (i, j) to the normal equations; plain slices, so that it vectorises."""
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]

@@ -202,7 +202,7 @@ def _cut(source, centres, half):
     return energy, gradient, nuisance
 
 
-@njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_SUMS)
 def _describe(source, u0, v0, half, rows):
     """Fills `rows` (8, m): the orthonormal nuisances of a patch, and its gradient without them. -> its energy"""
     side = 2 * half + 1
@@ -241,7 +241,7 @@ def _describe(source, u0, v0, half, rows):
     return energy
 
 
-@njit(cache=True, nogil=True, fastmath=_SUMS)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_SUMS)
 def _dot(a, b):
     """Sum of products, in double precision."""
     total = 0.0
@@ -250,7 +250,7 @@ def _dot(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _weights(s):
     """Of four neighbours in a cubic B-spline, at a share s of the way between the middle two."""
     one, sixth = np.float32(1), np.float32(1 / 6)
@@ -259,7 +259,7 @@ def _weights(s):
     return left, middle, one - left - middle - right, right
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, seen):
     """Fills the patch (m,) as the target shows it at this place, by cubic B-spline.
 

@@ -68,7 +68,7 @@ def shade(albedo, depth, focal, lamps, beams, transmission, veil, sky, out, lit,
                 of_row[3 * u], of_row[3 * u + 1], of_row[3 * u + 2] = haze[0, u], haze[1, u], haze[2, u]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _surface(depth, v, y, focal, way, normal):
     """Range of a row's floor, and its unit normal (3, W) towards the eye, from the gradient of depth in the image.
 
@@ -93,7 +93,7 @@ def _surface(depth, v, y, focal, way, normal):
         way[u] = z * np.sqrt(x * x + y * y + one) if z < far else far
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _shine(lamp, here, y, focal, normal, out):
     """Of a lamp over a row: illuminance in clear water by an even beam, sqrt(1 - cos) off its axis, distance."""
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
@@ -115,7 +115,7 @@ def _shine(lamp, here, y, focal, normal, out):
         out[2, u] = distance
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, transmission, back, lamplight, places, light):
     """Adds to `light` (3, W) what a lamp of this beam sends to the floor, on its way there and back."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
@@ -140,7 +140,7 @@ def _add_lamp(lamp, beam, transmission, back, lamplight, places, light):
         light[2, u] += e * blue * (transmission[2, i] + w * (transmission[2, j] - transmission[2, i]))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _cast_waves(here, y, focal, waves, ground, places, share):
     """Fills `share` (W,) with the light of a row's floor against the mean: 0 where no floor is."""
     half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
@@ -167,7 +167,7 @@ def _cast_waves(here, y, focal, waves, ground, places, share):
         share[u] *= south + to_north[u] * (north - south)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(here, y, focal, daylight, loss, ground, back, share, light):
     """Adds to `light` (3, W) the daylight that falls on a row's floor, by a share of each pixel, on its way back."""
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
@@ -180,7 +180,7 @@ def _add_daylight(here, y, focal, daylight, loss, ground, back, share, light):
             light[c, u] += share[u] * surface * two_to(by_depth * deep + by_way * back[u])
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _blend_rows(veil, row, out):
     """The table of the veil for one row of pixels: between two rows of the grid."""
     j = min(int(row), veil.shape[0] - 2)
@@ -192,7 +192,7 @@ def _blend_rows(veil, row, out):
                 out[i, c, r] = lower[i, c, r] + w * (upper[i, c, r] - lower[i, c, r])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"}, error_model="numpy")
 def _look_into_veil(veil, way, places, haze):
     """The veil (3, W) in front of a row's floor.
 
@@ -223,7 +223,7 @@ def _look_into_veil(veil, way, places, haze):
         haze[2, u] = left + w * ((veil[j, 2, k] - left) + s * (veil[j, 2, m] - veil[j, 2, k]))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, haze, out):
     """Radiance (W, 3) of a Lambertian floor (albedo of 255) under this light, behind this veil."""
     reflected = np.float32(1 / (255 * np.pi))
