@@ -93,7 +93,7 @@ def test_track_rows_judge_whole_and_windowed_alignments_alike():
     up_to = keys[RESULT.track_of_key <= 2]
     expected = np.sqrt(np.mean(np.sum((wrong[up_to[-30:], :3, 3] - TRUE.positions[up_to[-30:]]) ** 2, axis=1)))
     result = copy.copy(RESULT)
-    result.before_ga = [RESULT.before_ga[0], wrong[up_to[-30:]]]
+    result.before_ga = [RESULT.before_ga[0], wrong[up_to[-30:], :3, 3]]
     rows = track_metrics(result, TRUTH)
     assert [row["track"] for row in rows] == [1, 2]
     assert rows[1]["before_ga_rmse_m"] == pytest.approx(expected)

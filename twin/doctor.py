@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NamedTuple
 
-_PACKAGES = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "gtsam", "rasterio", "rerun-sdk")
+_PACKAGES = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rasterio", "rerun-sdk")
 _ENOUGH_DISK_GB = 2.0
 _PROBE_LIMIT_S = 60
 

@@ -255,7 +255,7 @@ class SurveyResult:
 
     ``key_frames`` are the rows of the trajectories that are key points; ``track_of_key`` the track (from 1) of each.
     ``node_cov`` (n_keys, 6, 6) is the marginal covariance of each final key-point pose, in the camera.
-    ``before_ga``/``after_ga`` hold per track the key-point poses (n, 4, 4) just before and after its alignment.
+    ``before_ga``/``after_ga`` hold per track the key points' positions (n, 3) just before and after its alignment.
     ``looks`` are all with both eyes, also those that found too little for a key point.
     """
 

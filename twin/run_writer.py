@@ -140,7 +140,7 @@ class RunFolder:
 @cache
 def environment() -> dict[str, str]:
     """What the survey ran on."""
-    names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "gtsam", "rerun-sdk")
+    names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rerun-sdk")
     return {
         "twin": version("seabed-twin"),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""What the navigation sensors tell of the nodes (P17), as factors of the alignment's graph.
+"""What the navigation sensors tell of the nodes (P17), as terms of the alignment's graph.
 
 Pressure, acoustic fixes and the AHRS tell of one node each. Beacons stand where they were surveyed, and the nodes that
 see them are resected from their pixels. The DVL tells of pairs of nodes; its scale error is one unknown of the graph:
@@ -9,124 +9,108 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
+from numba import njit
 
 from twin import geometry
 from twin.estimate import pose_filter
 from twin.estimate.key_points import KeyPoint
-from twin.estimate.pose_graph import gaussian
-from twin.estimate.velocity_log import Displacement, body_displacement
+from twin.estimate.pose_graph import Pairs, Single, errors, inverses_of, log_derivatives
+from twin.estimate.velocity_log import body_displacement
 from twin.geometry import Array
 from twin.records import SensorNoise, StereoRig
 
-_FREE_M = 1e3  # standard deviation that leaves a coordinate free
-_SURVEYED_M = 1e-4  # standard deviation that holds a beacon
-_SCALE = gtsam.symbol("s", 0)
+
+def singles(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> list[Single]:
+    """What readings tell of one node each, by the nodes' places in their sequence."""
+    return [_heights(nodes, noise), _attitudes(nodes, rig, noise), _fixes(nodes, noise), _beacons(nodes, rig, noise)]
 
 
-def add_readings(
-    graph: gtsam.NonlinearFactorGraph,
-    start: gtsam.Values,
-    nodes: Sequence[KeyPoint],
-    rig: StereoRig,
-    noise: SensorNoise,
-    known: dict[int, gtsam.NonlinearFactorGraph],
-) -> None:
-    """Adds a factor for each reading of the nodes, and the beacons and the scale error that they tell of.
+def _heights(nodes: Sequence[KeyPoint], noise: SensorNoise) -> Single:
+    told = [k for k, node in enumerate(nodes) if node.readings.pressure_z_m is not None]
+    height_m = np.array([nodes[k].readings.pressure_z_m for k in told], dtype=np.float64)
 
-    Args:
-        known: what readings tell of one node each, by its number; that of new ones is added.
-    """
+    def derive(poses: Array, _: Array) -> Array:
+        by_pose = np.zeros((len(poses), 1, 6))
+        by_pose[:, 0, 3:] = poses[:, 2, :3]
+        return by_pose
+
+    information = np.full((len(told), 1, 1), noise.pressure_m**-2)
+    return Single(np.array(told, np.int64), information, lambda poses: poses[:, 2, 3:] - height_m[:, None], derive)
+
+
+def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> Single:
+    told = [k for k, node in enumerate(nodes) if node.readings.ahrs_rpy_rad is not None]
     camera_from_body = geometry.inverse(rig.body_from_camera)
-    height = gtsam.noiseModel.Diagonal.Sigmas(np.array([_FREE_M, _FREE_M, noise.pressure_m]))
-    attitude = gaussian(pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1])  # the same for every reading
-    for node in nodes:
-        if node.number not in known:
-            alone = known[node.number] = gtsam.NonlinearFactorGraph()
-            _add_height(alone, node, height)
-            _add_attitude(alone, node, camera_from_body, noise, attitude)
-            _add_fix(alone, node, noise)
-        graph.push_back(known[node.number])
-    _add_beacons(graph, start, nodes, rig, noise)
-    _add_displacements(graph, start, nodes, rig, noise)
+    camera_from_world = np.tile(np.eye(4), (len(told), 1, 1))
+    for row, k in zip(camera_from_world, told, strict=True):
+        row[:3, :3] = pose_filter.attitude(nodes[k].readings.ahrs_rpy_rad, camera_from_body, noise)[0].T
+    cov = pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1]  # the same for every reading
+
+    def observe(poses: Array) -> Array:
+        turned = poses.copy()
+        turned[:, :3, 3] = 0.0
+        return errors(camera_from_world, turned)[:, :3]
+
+    def derive(_: Array, residuals: Array) -> Array:
+        return log_derivatives(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
+
+    return Single(np.array(told, np.int64), np.tile(inverses_of(cov[None]), (len(told), 1, 1)), observe, derive)
 
 
-def _add_height(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, model: gtsam.noiseModel.Diagonal) -> None:
-    if node.readings.pressure_z_m is not None:
-        position = node.world_from_camera[:3, 3].copy()
-        position[2] = node.readings.pressure_z_m
-        graph.add(gtsam.GPSFactor(node.number, position, model))
+def _fixes(nodes: Sequence[KeyPoint], noise: SensorNoise) -> Single:
+    told = [k for k, node in enumerate(nodes) if node.readings.usbl_m is not None]
+    position_m = np.array([nodes[k].readings.usbl_m for k in told]).reshape(-1, 3)
+
+    def derive(poses: Array, _: Array) -> Array:
+        by_pose = np.zeros((len(poses), 3, 6))
+        by_pose[:, :, 3:] = poses[:, :3, :3]
+        return by_pose
+
+    information = np.tile(np.eye(3) * noise.usbl_m**-2, (len(told), 1, 1))
+    return Single(np.array(told, np.int64), information, lambda poses: poses[:, :3, 3] - position_m, derive)
 
 
-def _add_attitude(
-    graph: gtsam.NonlinearFactorGraph,
-    node: KeyPoint,
-    camera_from_body: Array,
-    noise: SensorNoise,
-    model: gtsam.noiseModel.Gaussian,
-) -> None:
-    if node.readings.ahrs_rpy_rad is not None:
-        rotation, _ = pose_filter.attitude(node.readings.ahrs_rpy_rad, camera_from_body, noise)
-        graph.add(gtsam.PoseRotationPrior3D(node.number, gtsam.Rot3(rotation), model))
+def _beacons(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> Single:
+    sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
+    beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
+    pixels = np.array([sighting.pixel for _, sighting in sightings]).reshape(-1, 2)
+
+    def seen(poses: Array) -> tuple[Array, Array]:
+        residuals, by_pose = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, 6))
+        for k, pose in enumerate(poses):
+            expected, jacobian = pose_filter.sight(pose, beacon_m[k], rig)
+            if np.isfinite(expected).all():  # one behind the camera says nothing
+                residuals[k], by_pose[k] = expected - pixels[k], jacobian
+        return residuals, by_pose
+
+    at = np.array([k for k, _ in sightings], np.int64)
+    information = np.tile(np.eye(2) * noise.beacon_px**-2, (len(at), 1, 1))
+    return Single(at, information, lambda poses: seen(poses)[0], lambda poses, _: seen(poses)[1])
 
 
-def _add_fix(graph: gtsam.NonlinearFactorGraph, node: KeyPoint, noise: SensorNoise) -> None:
-    if node.readings.usbl_m is not None:
-        graph.add(gtsam.GPSFactor(node.number, node.readings.usbl_m, gtsam.noiseModel.Isotropic.Sigma(3, noise.usbl_m)))
+def displacements(nodes: Sequence[KeyPoint], rig: StereoRig) -> Pairs:
+    """What the log tells of the way d of the body's origin from node to node: (1 + s) d = measured; s is shared."""
+    places = {node.number: k for k, node in enumerate(nodes)}
+    walked = [(k, node.walked) for k, node in enumerate(nodes) if node.walked and node.walked.since in places]
+    i = np.array([places[way.since] for _, way in walked], np.int64)
+    metres = np.array([way.metres for _, way in walked]).reshape(-1, 3)
+    information = inverses_of(np.array([way.cov for _, way in walked]).reshape(-1, 3, 3))
+
+    def observe(i_from_j: Array, scale: float) -> Array:
+        return (1 + scale) * _ways(i_from_j, rig.body_from_camera)[0] - metres
+
+    def derive(i_from_j: Array, scale: float, _: Array) -> tuple[Array, Array]:
+        ways, by_j = _ways(i_from_j, rig.body_from_camera)
+        return (1 + scale) * by_j, ways
+
+    return Pairs(i, np.array([k for k, _ in walked], np.int64), information, observe, derive)
 
 
-def _add_beacons(
-    graph: gtsam.NonlinearFactorGraph,
-    start: gtsam.Values,
-    nodes: Sequence[KeyPoint],
-    rig: StereoRig,
-    noise: SensorNoise,
-) -> None:
-    camera = gtsam.Cal3_S2(rig.focal_px, rig.focal_px, 0.0, rig.cx_px, rig.cy_px)
-    pixel_noise = gtsam.noiseModel.Isotropic.Sigma(2, noise.beacon_px)
-    sightings = [(node, sighting) for node in nodes for sighting in node.readings.beacons or ()]
-    for node, (beacon, pixel) in sightings:
-        key = gtsam.symbol("b", beacon)
-        graph.add(gtsam.GenericProjectionFactorCal3_S2(np.array(pixel), pixel_noise, node.number, key, camera))
-    for beacon in sorted({sighting.beacon for _, sighting in sightings}):
-        key, position = gtsam.symbol("b", beacon), np.array(noise.beacons_m[beacon])
-        start.insert(key, position)
-        graph.add(gtsam.PriorFactorPoint3(key, position, gtsam.noiseModel.Isotropic.Sigma(3, _SURVEYED_M)))
-
-
-def _add_displacements(
-    graph: gtsam.NonlinearFactorGraph,
-    start: gtsam.Values,
-    nodes: Sequence[KeyPoint],
-    rig: StereoRig,
-    noise: SensorNoise,
-) -> None:
-    numbers = {node.number for node in nodes}
-    pairs = [(node, node.walked) for node in nodes if node.walked is not None and node.walked.since in numbers]
-    if not pairs:
-        return
-    start.insert(_SCALE, np.zeros(1))
-    graph.add(gtsam.PriorFactorVector(_SCALE, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, noise.dvl_scale)))
-    for node, walked in pairs:
-        graph.add(_displacement_factor(node.number, walked, start, rig.body_from_camera))
-
-
-def _displacement_factor(
-    number: int, walked: Displacement, start: gtsam.Values, body_from_camera: Array
-) -> gtsam.LinearContainerFactor:
-    """Error (1 + s) d(a_from_b) - measured, of the way d of the body's origin from node a to node b = `number`.
-
-    Linear about the start: a common move of both nodes changes nothing, and of their relative correction only the
-    square is left out, 1e-6 of the way for 1 mrad. gtsam has no such factor, and one in Python copies all values at
-    each call.
-    """
-    a_from_b = start.atPose3(walked.since).between(start.atPose3(number)).matrix()
-    way, by_b = body_displacement(a_from_b, body_from_camera)
-    by_a = -by_b @ geometry.adjoint(geometry.inverse(a_from_b))  # moving a by m moves b in a by -Ad(b_from_a) m
-    whiten = np.linalg.inv(np.linalg.cholesky(walked.cov))
-    linear = gtsam.JacobianFactor(
-        walked.since, whiten @ by_a, number, whiten @ by_b, _SCALE, whiten @ way[:, None],
-        whiten @ (walked.metres - way), gtsam.noiseModel.Unit.Create(3),
-    )  # fmt: skip
-    return gtsam.LinearContainerFactor(linear, start)
+@njit(cache=True, nogil=True)
+def _ways(motions, body_from_camera):
+    """`body_displacement` of many."""
+    ways, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
+    for k in range(len(motions)):
+        ways[k], by_motion[k] = body_displacement(motions[k], body_from_camera)
+    return ways, by_motion

@@ -17,7 +17,7 @@ from twin import geometry
 from twin.config import Estimation
 from twin.errors import SurveyAborted
 from twin.estimate import network
-from twin.estimate.alignment import Aligned, Factors, align
+from twin.estimate.alignment import Aligned, align
 from twin.estimate.key_points import KeyPoint
 from twin.estimate.pose_filter import PoseFilter, carried, clipped
 from twin.estimate.reckoning import Instruments, Reckoning, reckon, said
@@ -70,7 +70,6 @@ class Navigator:
         self.measuring: deque[Callable[[], list[Link]]] = deque()
         self.behind = ThreadPoolExecutor(1) if beside else None
         self.times_s, self.f2f_poses, self.online_poses = Rows(), Rows(4, 4), Rows(4, 4)
-        self.factors = Factors({}, {})
         self.dropped: list[Link] = []
         self.alignments: list[Alignment] = []
         self.before_ga: list[Array] = []
@@ -115,14 +114,14 @@ class Navigator:
         """Global alignment over the window that ends with this track; the vehicle keeps station meanwhile."""
         if not self.settings.use_ga or len(self.nodes) < 2:
             return
-        self.before_ga.append(self._key_poses())
+        self.before_ga.append(self._key_poses()[:, :3, 3].copy())
         self._take_links()
         first = track - self.settings.window_tracks
         with self.watch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
         self._rebase(aligned)
         self.vision.relay([k for k in self.keys if k.track >= track])  # older ones are forgotten
-        self.after_ga.append(self._key_poses())
+        self.after_ga.append(self._key_poses()[:, :3, 3].copy())
 
     def finish(self) -> SurveyResult:
         """The truly global alignment over all tracks, and the trajectories.
@@ -288,8 +287,8 @@ class Navigator:
         anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
         begun = time.perf_counter()
         try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, self.factors)
-        except RuntimeError as error:  # gtsam: the links do not hold every node
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+        except np.linalg.LinAlgError as error:  # the links do not hold every node
             self.alignable = False
             raise SurveyAborted(f"global alignment failed: {str(error).strip().splitlines()[0]}") from None
         ms = (time.perf_counter() - begun) * 1e3

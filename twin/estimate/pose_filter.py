@@ -53,16 +53,9 @@ class PoseFilter:
             self._update(residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
         for sighting in readings.beacons or ():
             beacon = np.array(self.noise.beacons_m[sighting.beacon])
-            predicted, jacobian = self._sight(beacon)
+            predicted, jacobian = sight(self.world_from_camera, beacon, self.rig)
             if np.isfinite(predicted).all():
                 self._update(np.array(sighting.pixel) - predicted, jacobian, np.eye(2) * self.noise.beacon_px**2)
-
-    def _sight(self, beacon_m: Array) -> tuple[Array, Array]:
-        """Pixel (2,) where a beacon (3,) is to be seen, NaN behind the camera; its derivative (2, 6) by the motion."""
-        point = geometry.transform(geometry.inverse(self.world_from_camera), beacon_m[None])
-        x, y, depth = point[0]
-        by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * self.rig.focal_px / depth
-        return self.rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
         """Takes a pose and covariance from elsewhere: a measured motion, a global alignment."""
@@ -70,6 +63,14 @@ class PoseFilter:
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
         self.world_from_camera, self.cov = _updated(self.world_from_camera, self.cov, residual, jacobian, cov)
+
+
+def sight(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Pixel (2,) where a beacon (3,) is to be seen, NaN behind the camera; its derivative (2, 6) by the motion."""
+    point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
+    x, y, depth = point[0]
+    by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * rig.focal_px / depth
+    return rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
 
 class Level(NamedTuple):
@@ -98,7 +99,7 @@ def aided(world_from_camera, cov, level, height_m, rpy_rad):
 @njit(cache=True, nogil=True)
 def predicted(world_from_camera, cov, a_from_b, motion_cov):
     """Composes a relative motion with its covariance, eqs. (3) to (5)."""
-    return world_from_camera @ a_from_b, carried(cov, a_from_b) + motion_cov
+    return geometry.compose(world_from_camera, a_from_b), carried(cov, a_from_b) + motion_cov
 
 
 @njit(cache=True, nogil=True)
@@ -114,16 +115,50 @@ def clipped(cov: Array, other: Array, least: float = 0.0, most: float = np.inf) 
 @njit(cache=True, nogil=True)
 def carried(cov: Array, a_from_b: Array) -> Array:
     """The covariance (6, 6) of pose a, in the axes of b that it is carried to."""
-    carry = geometry.adjoint(geometry.inverse(a_from_b))
-    return carry @ cov @ carry.T
+    return geometry.sandwich(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
 @njit(cache=True, nogil=True)
 def _updated(world_from_camera, prior, residual, jacobian, cov):
     """Pose and covariance after an observation (k,) with its derivative (k, 6) and covariance (k, k); Joseph's form."""
-    gain = np.linalg.solve(jacobian @ prior @ jacobian.T + cov, jacobian @ prior).T.copy()
-    keep = np.eye(6) - gain @ jacobian
-    return world_from_camera @ geometry.exp(gain @ residual), keep @ prior @ keep.T + gain @ cov @ gain.T
+    gain = _gain(prior, jacobian, cov)
+    keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
+    for i in range(6):
+        for m in range(len(residual)):
+            step[i] += gain[i, m] * residual[m]
+            for k in range(6):
+                keep[i, k] -= gain[i, m] * jacobian[m, k]
+                for n in range(len(residual)):
+                    noise[i, k] += gain[i, m] * cov[m, n] * gain[k, n]
+    return geometry.compose(world_from_camera, geometry.exp(step)), geometry.sandwich(keep, prior) + noise
+
+
+@njit(cache=True, nogil=True)
+def _gain(prior, jacobian, cov):
+    """P J' (J P J' + R)^-1 (6, k), by elimination: k is three at most."""
+    size = len(cov)
+    gain, spread = np.zeros((6, size)), cov.copy()
+    for m in range(size):
+        for i in range(6):
+            for k in range(6):
+                gain[i, m] += prior[i, k] * jacobian[m, k]
+    for m in range(size):
+        for n in range(size):
+            for i in range(6):
+                spread[m, n] += jacobian[m, i] * gain[i, n]
+    for m in range(size):
+        for n in range(m + 1, size):
+            share = spread[m, n] / spread[m, m]
+            for k in range(m, size):
+                spread[k, n] -= share * spread[k, m]
+            for i in range(6):
+                gain[i, n] -= share * gain[i, m]
+    for m in range(size - 1, -1, -1):
+        for i in range(6):
+            gain[i, m] /= spread[m, m]
+            for n in range(m):
+                gain[i, n] -= spread[m, n] * gain[i, m]
+    return gain
 
 
 @njit(cache=True, nogil=True)

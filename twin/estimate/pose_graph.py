@@ -1,31 +1,348 @@
 """Pose graphs: the poses X that agree best with the motions Z measured between them, the core of the alignment (P15).
 
-F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance; rho is r^2 / 2, or
-Huber's function. Gauss-Newton on gtsam's factors minimises it, Levenberg-Marquardt where that leads
-up. Without good poses to start from, the start is chordal (Carlone et al. 2015): rotations by linear least squares,
-then positions. Raw odometry is none on a hard graph.
+F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance, and over what is said
+of single poses; rho is r^2 / 2, or Huber's function. Gauss-Newton minimises it, damped (Marquardt) where its step
+leads up. Errors of poses are motions in their own axes, X exp(d).
+
+What pairs share with all others (the scale of a log) is one unknown more, which borders the matrix of the poses: first
+the poses as if it were known, then its own equation.
+
+Without good poses to start from, the start is chordal (Carlone et al. 2015): rotations by linear least squares, then
+positions. Raw odometry is none on a hard graph.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
-from twin.estimate import marginals as selected
+from twin import geometry
+from twin.estimate import block_cholesky
 from twin.geometry import Array
 from twin.records import Link
+
+Indices = NDArray[np.int64]
 
 #: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
 _BEYOND_LINEAR = 5e-4
-_MANY = 2500  # poses from which on nested dissection saves more than it costs
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-6  # of the diagonal
 
 
-Eliminated = gtsam.GaussianBayesTree | gtsam.GaussianBayesNet
+class Single(NamedTuple):
+    """What is said of one pose each.
+
+    Args:
+        at: (m,) which.
+        information: (m, d, d).
+        observe: residuals (m, d) of poses (m, 4, 4).
+        derive: of poses and residuals the derivatives (m, d, 6) by the poses' motions.
+    """
+
+    at: Indices
+    information: Array
+    observe: Callable[[Array], Array]
+    derive: Callable[[Array, Array], Array]
+
+
+class Pairs(NamedTuple):
+    """What is said of the motion between two poses each.
+
+    Args:
+        i, j: (m,) which.
+        information: (m, d, d).
+        observe: residuals (m, d) of i_from_j (m, 4, 4) and what is shared.
+        derive: of these three the derivatives (m, d, 6) by the motions of j, (m, d) by what is shared, or None.
+        huber: residual [standard deviations] from which one counts linearly; None: squares throughout.
+    """
+
+    i: Indices
+    j: Indices
+    information: Array
+    observe: Callable[[Array, float], Array]
+    derive: Callable[[Array, float, Array], tuple[Array, Array | None]]
+    huber: float | None = None
+
+
+class Graph(NamedTuple):
+    """All that is said of n poses; deviation of what pairs share, about 0 (None: nothing is shared)."""
+
+    n: int
+    singles: Sequence[Single]
+    pairs: Sequence[Pairs]
+    shared_sigma: float | None = None
+
+
+class State(NamedTuple):
+    """Poses (n, 4, 4), and what pairs share."""
+
+    poses: Array
+    shared: float = 0.0
+
+
+class _Seen(NamedTuple):
+    """A graph at a state: the value of F; residuals (m, d) of singles; of pairs residuals, motions and weights."""
+
+    state: State
+    cost: float
+    singles: list[Array]
+    pairs: list[tuple[Array, Array, Array]]
+
+
+class _System(NamedTuple):
+    """Normal equations: blocks (n, 6, 6) and, by pair, (m, 6, 6), gradient (n, 6); border (n, 6), corner and gradient
+    of what is shared."""
+
+    diagonal: Array
+    off: Array
+    gradient: Array
+    border: Array
+    corner: float
+    shared_gradient: float
+
+
+class Optimum(NamedTuple):
+    """The state that minimises F, the value of F, whether it was reached, and the equations of the last step.
+
+    Args:
+        factor: of the poses' matrix.
+        border: (n, 6) its solution for the border, and what the shared unknown's own equation then holds; None: nothing
+            is shared.
+    """
+
+    state: State
+    cost: float
+    reached: bool
+    factor: block_cholesky.Factor
+    border: tuple[Array, float] | None
+
+    def marginals(self) -> Array:
+        """(n, 6, 6) covariance of all poses [rotation, translation] (rad, m), each in its own axes."""
+        return self._with_shared(self.factor.marginals(), slice(None))
+
+    def marginal(self, k: int) -> Array:
+        """(6, 6) of one."""
+        return self._with_shared(self.factor.marginal(k)[None], slice(k, k + 1))[0]
+
+    def _with_shared(self, covs: Array, rows: slice) -> Array:
+        if self.border is None:
+            return covs
+        by_shared, information = self.border
+        return covs + by_shared[rows, :, None] * by_shared[rows, None, :] / information
+
+
+def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
+    """The nearest minimum.
+
+    Args:
+        iterations: at most; at least one.
+
+    Raises:
+        LinAlgError: the graph does not hold every pose.
+    """
+    structure = block_cholesky.analyse(
+        graph.n, *(np.concatenate([np.empty(0, np.int64), *(p[k] for p in graph.pairs)]) for k in (0, 1))
+    )
+    seen, damping, reached = _look(graph, start), 0.0, False
+    system = _equations(graph, seen)
+    while True:
+        step = _step(structure, system, damping)
+        moved = State(_moved(seen.state.poses, step.poses), seen.state.shared + step.shared)
+        expected = -0.5 * (np.sum(system.gradient * step.poses) + system.shared_gradient * step.shared)
+        after, iterations = _look(graph, moved), iterations - 1
+        if after.cost <= seen.cost + _BEYOND_LINEAR:
+            reached = damping == 0 and abs(seen.cost - after.cost - expected) < _BEYOND_LINEAR
+            seen, damping = after, damping / 10 if damping > _LEAST_DAMPING else 0.0
+            if not reached and iterations > 0:
+                system = _equations(graph, seen)
+        else:
+            damping = max(10 * damping, _FIRST_DAMPING)
+        if reached or iterations <= 0:
+            return Optimum(seen.state, seen.cost, reached, step.factor, step.border)
+
+
+class _Step(NamedTuple):
+    poses: Array
+    shared: float
+    factor: block_cholesky.Factor
+    border: tuple[Array, float] | None
+
+
+def _step(structure: block_cholesky.Structure, system: _System, damping: float) -> _Step:
+    """Solves the bordered equations by the block below the corner."""
+    diagonal = system.diagonal
+    if damping:
+        axes = np.arange(6)
+        diagonal = diagonal.copy()
+        diagonal[:, axes, axes] *= 1 + damping
+    factor = block_cholesky.factorise(structure, diagonal, system.off)
+    poses = factor.solve(-system.gradient)
+    if not system.corner:
+        return _Step(poses, 0.0, factor, None)
+    by_shared = -factor.solve(system.border)
+    information = system.corner + float(np.sum(system.border * by_shared))
+    shared = (-system.shared_gradient - float(np.sum(system.border * poses))) / information
+    return _Step(poses + by_shared * shared, shared, factor, (by_shared, information))
+
+
+def _look(graph: Graph, state: State) -> _Seen:
+    """What the graph is at a state."""
+    cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
+    singles, pairs = [], []
+    for single in graph.singles:
+        residuals = single.observe(state.poses[single.at])
+        cost += float(_squares(residuals, single.information).sum()) / 2
+        singles.append(residuals)
+    for pair in graph.pairs:
+        i_from_j = _between(state.poses[pair.i], state.poses[pair.j])
+        residuals = pair.observe(i_from_j, state.shared)
+        losses, weights = _robust(_squares(residuals, pair.information), pair.huber)
+        cost += float(losses.sum())
+        pairs.append((residuals, i_from_j, weights))
+    return _Seen(state, cost, singles, pairs)
+
+
+def chi2(pairs: Pairs, state: State) -> Array:
+    """(m,) squared residual of each pair in units of its covariance, before its weight."""
+    i_from_j = _between(state.poses[pairs.i], state.poses[pairs.j])
+    return _squares(pairs.observe(i_from_j, state.shared), pairs.information)
+
+
+def _robust(chi2: Array, huber: float | None) -> tuple[Array, Array]:
+    """Losses (m,) and weights (m,) of squared residuals."""
+    if huber is None:
+        return chi2 / 2, np.ones(len(chi2))
+    length = np.sqrt(chi2)
+    within = length <= huber
+    weights = np.where(within, 1.0, huber / np.maximum(length, huber))
+    return np.where(within, chi2 / 2, huber * (length - huber / 2)), weights
+
+
+def _equations(graph: Graph, seen: _Seen) -> _System:
+    """Normal equations of all residuals."""
+    diagonal, gradient, border = np.zeros((graph.n, 6, 6)), np.zeros((graph.n, 6)), np.zeros((graph.n, 6))
+    corner = 0.0 if graph.shared_sigma is None else graph.shared_sigma**-2
+    shared_gradient, off = corner * seen.state.shared, [np.empty((0, 6, 6))]
+    for single, residuals in zip(graph.singles, seen.singles, strict=True):
+        by_pose = single.derive(seen.state.poses[single.at], residuals)
+        weighted = _turned(by_pose) @ single.information
+        diagonal += _summed(graph.n, single.at, weighted @ by_pose)
+        gradient += _summed(graph.n, single.at, _times(weighted, residuals))
+    for pair, (residuals, i_from_j, weights) in zip(graph.pairs, seen.pairs, strict=True):
+        by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
+        information = weights[:, None, None] * pair.information
+        weighted = _turned(by_j) @ information
+        matrix, slope = weighted @ by_j, _times(weighted, residuals)
+        to_i = -_turned(_adjoints(_inverses(i_from_j)))  # i moved by d moves j by -Ad(j_from_i) d
+        across = to_i @ matrix
+        off.append(across)
+        diagonal += _summed(graph.n, pair.j, matrix) + _summed(graph.n, pair.i, across @ _turned(to_i))
+        gradient += _summed(graph.n, pair.j, slope) + _summed(graph.n, pair.i, _times(to_i, slope))
+        if by_shared is not None:
+            mixed, shared = _times(weighted, by_shared), _times(information, by_shared)
+            border += _summed(graph.n, pair.j, mixed) + _summed(graph.n, pair.i, _times(to_i, mixed))
+            corner += float(np.sum(shared * by_shared))
+            shared_gradient += float(np.sum(shared * residuals))
+    return _System(diagonal, np.concatenate(off), gradient, border, corner, shared_gradient)
+
+
+def motions(links: Sequence[Link], places: dict[int, int], huber: float | None = None) -> Pairs:
+    """What links say of the poses at these places, by number of their nodes."""
+    measured = _inverses(np.array([link.i_from_j for link in links]).reshape(-1, 4, 4))
+    information = inverses_of(np.array([link.cov for link in links]).reshape(-1, 6, 6))
+    i, j = (np.array([places[link[k]] for link in links], dtype=np.int64) for k in (0, 1))
+
+    def observe(i_from_j: Array, _: float) -> Array:
+        return errors(measured, i_from_j)
+
+    return Pairs(i, j, information, observe, lambda _, __, residuals: (log_derivatives(residuals), None), huber)
+
+
+def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
+    """Poses (m, 4, 4) that are known with covariances (m, 6, 6) [rotation, translation], in their own axes."""
+    measured = _inverses(poses)
+    return Single(
+        np.asarray(at, np.int64), inverses_of(covs), lambda found: errors(measured, found),
+        lambda _, residuals: log_derivatives(residuals),
+    )  # fmt: skip
+
+
+def inverses_of(covs: Array) -> Array:
+    """Information of covariances (m, d, d), symmetric to the last bit."""
+    found = np.linalg.inv(covs)
+    return (found + _turned(found)) / 2
+
+
+@njit(cache=True, nogil=True)
+def errors(inverse, found):
+    """log(inverse found) of poses (m, 4, 4), (m, 6)."""
+    residuals = np.empty((len(found), 6))
+    for k in range(len(found)):
+        residuals[k] = geometry.log(geometry.compose(inverse[k], found[k]))
+    return residuals
+
+
+@njit(cache=True, nogil=True)
+def log_derivatives(residuals):
+    """Derivatives (m, 6, 6) of such errors (m, 6) by motions of what is found."""
+    derivatives = np.empty((len(residuals), 6, 6))
+    for k in range(len(residuals)):
+        derivatives[k] = geometry.log_derivative(residuals[k])
+    return derivatives
+
+
+@njit(cache=True, nogil=True)
+def _moved(poses, steps):
+    moved = np.empty_like(poses)
+    for k in range(len(poses)):
+        moved[k] = geometry.compose(poses[k], geometry.exp(steps[k]))
+    return moved
+
+
+def _between(a: Array, b: Array) -> Array:
+    """a_from_b (m, 4, 4) of poses in the world."""
+    return _inverses(a) @ b
+
+
+def _inverses(poses: Array) -> Array:
+    found = np.zeros_like(poses)
+    found[:, :3, :3] = _turned(poses[:, :3, :3])
+    found[:, :3, 3] = -_times(found[:, :3, :3], poses[:, :3, 3])
+    found[:, 3, 3] = 1.0
+    return found
+
+
+def _adjoints(poses: Array) -> Array:
+    """`geometry.adjoint` of many."""
+    found, rotations = np.zeros((len(poses), 6, 6)), poses[:, :3, :3]
+    found[:, :3, :3] = found[:, 3:, 3:] = rotations
+    found[:, 3:, :3] = np.cross(poses[:, None, :3, 3], rotations, axisb=1).transpose(0, 2, 1)
+    return found
+
+
+def _turned(matrices: Array) -> Array:
+    return matrices.transpose(0, 2, 1)
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return (matrices @ vectors[:, :, None])[:, :, 0]
+
+
+def _squares(residuals: Array, information: Array) -> Array:
+    return np.sum(residuals * _times(information, residuals), axis=1)
+
+
+def _summed(n: int, at: Indices, values: Array) -> Array:
+    """(n, ...) sums of the values (m, ...) that belong to each."""
+    picks = sparse.csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(n, len(at)))
+    return (picks @ values.reshape(len(at), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])
 
 
 class Solved(NamedTuple):
@@ -43,126 +360,46 @@ def solve(links: Sequence[Link], start: dict[int, Array] | None = None, huber: f
         start: (4, 4) pose of every number; by the chordal start, from the identity, if None.
         huber: residual [standard deviations] from which a link counts linearly; least squares if None.
     """
-    values = chordal_start(links) if start is None else _values(start)
-    numbers = sorted(values.keys())
-    graph = _held(numbers[0], values.atPose3(numbers[0]))
-    for factor in between_factors(links, huber):
-        graph.add(factor)
-    values = optimise(graph, values).values
-    return Solved({number: values.atPose3(number).matrix() for number in numbers}, graph.error(values))
+    start = chordal_start(links) if start is None else start
+    numbers = sorted(start)
+    poses = np.array([start[number] for number in numbers])
+    held = given([0], poses[:1], np.eye(6)[None] * _HELD_SIGMA**2)
+    places = {number: k for k, number in enumerate(numbers)}
+    found = optimise(Graph(len(poses), [held], [motions(links, places, huber)]), State(poses))
+    return Solved(dict(zip(numbers, found.state.poses, strict=True)), found.cost)
 
 
-def chordal_start(links: Sequence[Link]) -> gtsam.Values:
-    """Poses to start from, found from the links alone; the lowest number is at the identity."""
-    graph = _held(min(link.i for link in links), gtsam.Pose3())
-    for factor in between_factors(links):
-        graph.add(factor)
-    return gtsam.InitializePose3.initialize(graph)
+def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
+    """Poses (4, 4) to start from, found from the links alone; the lowest number is at the identity.
 
-
-def between_factors(links: Sequence[Link], huber: float | None = None) -> list[gtsam.BetweenFactorPose3]:
-    """A factor for each link, with Huber's weight from this many standard deviations on."""
-    kernel = None if huber is None else gtsam.noiseModel.mEstimator.Huber.Create(huber)
-    return [
-        gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), _noise(link.cov, kernel)) for link in links
-    ]
-
-
-def gaussian(cov: Array) -> gtsam.noiseModel.Gaussian:
-    """Noise of this covariance, made symmetric to the last bit."""
-    return gtsam.noiseModel.Gaussian.Covariance((cov + cov.T) / 2)
-
-
-class Optimum(NamedTuple):
-    """The values that minimise F, whether they were reached, and what the graph was eliminated to at the last step."""
-
-    values: gtsam.Values
-    reached: bool
-    eliminated: Eliminated
-
-    def marginals(self, numbers: Sequence[int]) -> Array:
-        """(n, 6, 6) covariance of poses [rotation, translation] (rad, m), each in its own axes."""
-        if isinstance(self.eliminated, gtsam.GaussianBayesNet):
-            covs = selected.marginals(self.eliminated)
-            return np.array([covs[number] for number in numbers]).reshape(-1, 6, 6)
-        return np.array([self.eliminated.marginalCovariance(number) for number in numbers]).reshape(-1, 6, 6)
-
-
-def optimise(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, iterations: int = 100, last: Sequence[int] | None = ()
-) -> Optimum:
-    """The nearest minimum by Gauss-Newton; where its step leads up, by Levenberg-Marquardt.
-
-    Args:
-        last: numbers of the few poses whose marginals will be wanted: eliminated last, theirs cost nothing. None: all,
-            for which the graph is eliminated variable by variable, not by the quicker tree.
-
-    Raises:
-        RuntimeError: the factors do not hold every variable.
+    Of rotations, R_j = R_i R_ij as of any matrices, by least squares; the nearest rotations to what that gives; then
+    positions, p_j = p_i + R_i t_ij. Links weigh by the information of their covariance's mean.
     """
-    order, values, cost = _order(graph, start, last), start, graph.error(start)
-    reached, eliminated = False, gtsam.GaussianBayesTree()
-    while iterations > 0 and not reached:
-        del eliminated  # one at a time is enough to hold
-        eliminated = _eliminated(graph.linearize(values), order, by_variable=last is None)
-        step = eliminated.optimize()
-        moved, expected = values.retract(step), eliminated.error(gtsam.VectorValues.Zero(step))
-        moved_cost, iterations = graph.error(moved), iterations - 1
-        if moved_cost > cost + _BEYOND_LINEAR:
-            moved, expected = _damped(graph, values, order, iterations), 0.0
-            moved_cost = graph.error(moved)
-        reached = abs(cost - moved_cost - expected) < _BEYOND_LINEAR
-        values, cost = moved, moved_cost
-    return Optimum(values, reached, eliminated)
+    numbers = sorted({number for link in links for number in link[:2]})
+    places = {number: k for k, number in enumerate(numbers)}
+    motion, cov = (np.array([link[k] for link in links]) for k in (2, 3))
+    i, j = (np.array([places[link[k]] for link in links]) for k in (0, 1))
+    of_turns, of_ways = (3 / np.trace(cov[:, a : a + 3, a : a + 3], axis1=1, axis2=2) for a in (0, 3))
+    turns, nothing = _turned(motion[:, :3, :3]), np.zeros((len(links), 3, 3))
+    u, _, v = np.linalg.svd(_turned(_least_squares(i, j, turns, nothing, np.eye(3), of_turns)))
+    u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, :3] = u @ v
+    ways = _times(poses[i, :3, :3], motion[:, :3, 3])[:, None]
+    poses[:, :3, 3] = _least_squares(i, j, np.ones((len(links), 1, 1)), ways, np.zeros((1, 3)), of_ways)[:, 0]
+    return dict(zip(numbers, poses, strict=True))
 
 
-def _eliminated(linear: gtsam.GaussianFactorGraph, order: gtsam.Ordering, by_variable: bool) -> Eliminated:
-    return linear.eliminateSequential(order) if by_variable else linear.eliminateMultifrontal(order)
-
-
-def _damped(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, order: gtsam.Ordering, iterations: int
-) -> gtsam.Values:
-    """The nearest minimum by Levenberg-Marquardt."""
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(0)
-    parameters.setAbsoluteErrorTol(_BEYOND_LINEAR)
-    parameters.setMaxIterations(iterations)
-    parameters.setOrdering(order)
-    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
-
-
-def _order(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int] | None) -> gtsam.Ordering:
-    """The order of elimination.
-
-    What has a letter for its name (a beacon, a scale error) comes last: first, it would join all poses that share it.
-    """
-    if values.size() > _MANY:
-        return gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-    shared = [key for key in values.keys() if gtsam.symbolChr(key)]
-    return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, [*(last or ()), *shared])
-
-
-def chi2(factors: Sequence[gtsam.BetweenFactorPose3], values: gtsam.Values, huber: float | None = None) -> Array:
-    """(n,) squared residual of each link in units of its covariance, before the weight of its kernel."""
-    losses = np.array([factor.error(values) for factor in factors])
-    if huber is None:
-        return 2 * losses
-    return np.where(losses <= huber**2 / 2, 2 * losses, (losses / huber + huber / 2) ** 2)
-
-
-def _values(poses: dict[int, Array]) -> gtsam.Values:
-    values = gtsam.Values()
-    for number, pose in poses.items():
-        values.insert(number, gtsam.Pose3(pose))
-    return values
-
-
-def _held(number: int, pose: gtsam.Pose3) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPose3(number, pose, gtsam.noiseModel.Isotropic.Sigma(6, _HELD_SIGMA)))
-    return graph
-
-
-def _noise(cov: Array, kernel: gtsam.noiseModel.mEstimator.Base | None) -> gtsam.noiseModel.Base:
-    return gaussian(cov) if kernel is None else gtsam.noiseModel.Robust.Create(kernel, gaussian(cov))
+def _least_squares(i: Indices, j: Indices, by_i: Array, right: Array, first: Array, weights: Array) -> Array:
+    """(n, d, 3) the x that best keep x_j = by_i x_i + right, of (m, d, d) and (m, d, 3), with x_0 = first (d, 3)."""
+    m, d, _ = right.shape
+    row = np.arange(m * d).reshape(m, d)
+    column_i, column_j = (d * k[:, None] + np.arange(d) for k in (i, j))
+    entries = np.concatenate([np.ones(m * d), -by_i.ravel()])
+    rows = np.concatenate([row.ravel(), np.repeat(row, d, axis=1).ravel()])
+    columns = np.concatenate([column_j.ravel(), np.repeat(column_i[:, None], d, axis=1).ravel()])
+    matrix = sparse.csc_array((entries, (rows, columns)), shape=(m * d, columns.max() + 1))
+    known, free = matrix[:, :d], matrix[:, d:]
+    weighted = free.T @ sparse.diags_array(np.repeat(weights, d))
+    rest = splu((weighted @ free).tocsc()).solve(weighted @ (right.reshape(-1, 3) - known @ first))
+    return np.concatenate([first, rest]).reshape(-1, d, 3)

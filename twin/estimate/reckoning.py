@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from twin import geometry
 from twin.estimate.pose_filter import Level, aided, predicted
 from twin.estimate.velocity_log import Beams, Way, logged
 from twin.geometry import Array
@@ -61,4 +62,4 @@ def reckon(last, instruments, a_from_b, cov, height_m, rpy_rad, velocity_mps):
     online, online_cov = predicted(last.online, last.cov, moved, moved_cov)
     online, online_cov = aided(online, online_cov, instruments.level, height_m, rpy_rad)
     walked, walked_cov = predicted(last.walked, last.walked_cov, moved, moved_cov)
-    return Reckoning(last.f2f @ a_from_b, online, online_cov, walked, walked_cov), moved
+    return Reckoning(geometry.compose(last.f2f, a_from_b), online, online_cov, walked, walked_cov), moved

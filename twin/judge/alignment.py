@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin import geometry
 from twin.judge.numbers import number, rms
 from twin.judge.trajectory import anchor, path_errors
 from twin.records import Alignment, Array, SurveyResult, Truth
@@ -19,7 +20,7 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     """`tracks[]` of metrics.json, a row for each alignment at the end of a track.
 
     `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`; an alignment beyond them (the truly global one at the
-    end) has no row. Their n poses are the last n key points up to the end of the track (all of them, or those of the
+    end) has no row. Their n positions are those of the last n key points up to the end of the track (all of them, or those of the
     moving window), anchored at the first true pose like the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
@@ -55,11 +56,11 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     return rms(error_m[frames[distance_m >= FAR_SHARE * distance_m.max()]])
 
 
-def _key_point_rmse(poses: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """RMSE of the last key points of `frames` whose poses are given [m]."""
-    n = min(len(poses), len(frames))
+def _key_point_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
+    """RMSE of the last key points of `frames` whose positions (n, 3) are given [m]."""
+    n = min(len(positions), len(frames))
     if n == 0:
         return None
     true_from_estimated = anchor(result.online.world_from_camera[0], truth.trajectory.world_from_camera[0])
-    moved = (true_from_estimated @ poses[-n:])[:, :3, 3]
+    moved = geometry.transform(true_from_estimated, positions[-n:])
     return rms(np.linalg.norm(moved - truth.trajectory.positions[frames[-n:]], axis=1))

@@ -16,7 +16,7 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin import config, geometry
 from twin.errors import SurveyAborted
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_of_free_joint
-from twin.simulate.thrusters import LaggedThrusters, Thrusters, pass_step, set_command
+from twin.simulate.thrusters import LaggedThrusters, Thrusters, pass_step, set_command, wrench_of
 from twin.simulate.vehicle import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 
 Array = NDArray[np.float64]
@@ -109,12 +109,14 @@ def advance(body, command, n_steps):
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     set_command(thrusters, command)
     for _ in range(n_steps):
-        wrench = thrusters.effects @ (thrusters.c @ thrusters.state)
         now = velocity + 0.5 * body.timestep_s * acceleration
-        rotation = pose[:3, :3].copy()
-        acceleration[:] = free_joint_acceleration(body.hull, rotation, now, body.current, wrench)
+        acceleration[:] = free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench_of(thrusters))
         velocity += body.kick[0] * body.timestep_s * acceleration
         body.kick[0] = 1.0
-        pose[:3, 3] += body.timestep_s * velocity[:3]
-        pose[:3, :3] = rotation @ geometry.so3_exp(body.timestep_s * velocity[3:])
+        turn = np.eye(4)
+        turn[:3, :3] = geometry.so3_exp(body.timestep_s * velocity[3:])
+        turned = geometry.compose(pose, turn)
+        for i in range(3):
+            turned[i, 3] += body.timestep_s * velocity[i]
+        pose[:] = turned
         pass_step(thrusters)

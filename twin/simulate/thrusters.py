@@ -71,7 +71,7 @@ class LaggedThrusters:
 
     def wrench(self) -> Array:
         """Their wrench on the body at this instant, [moment, force] in the body (6,) [N m, N]."""
-        return self.parts.effects @ self.thrust_n()
+        return wrench_of(self.parts)
 
     def command(self, command: Array) -> None:
         """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
@@ -92,7 +92,25 @@ def set_command(thrusters, command):
 @njit(cache=True, nogil=True)
 def pass_step(thrusters):
     """As `LaggedThrusters.step`."""
-    thrusters.state[:] = thrusters.a @ thrusters.state + thrusters.b * thrusters.steady_n
+    before, order = thrusters.state.copy(), len(thrusters.a)
+    for i in range(order):
+        for n in range(thrusters.state.shape[1]):
+            thrusters.state[i, n] = thrusters.b[i, 0] * thrusters.steady_n[n]
+            for k in range(order):
+                thrusters.state[i, n] += thrusters.a[i, k] * before[k, n]
+
+
+@njit(cache=True, nogil=True)
+def wrench_of(thrusters):
+    """As `LaggedThrusters.wrench`."""
+    wrench = np.zeros(6)
+    for n in range(thrusters.state.shape[1]):
+        thrust = 0.0
+        for k in range(len(thrusters.c)):
+            thrust += thrusters.c[k] * thrusters.state[k, n]
+        for i in range(6):
+            wrench[i] += thrusters.effects[i, n] * thrust
+    return wrench
 
 
 def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:

@@ -62,7 +62,7 @@ def _fly(last, last_numbers, body, gauges, errors, reckoned, instruments, helm, 
     n = len(positions)
     true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
     for k in range(n):
-        true[k] = body.pose @ gauges.body_from_camera
+        true[k] = geometry.compose(body.pose, gauges.body_from_camera)
         height, angles, velocity = read_gauges(gauges, body.pose, twist_of(body), of_gauges[k], of_log[k])
         a_from_b = moved(errors, last, true[k], of_vision[k], last_numbers if k == 0 else of_vision[k - 1])
         reckoned, aided = reckon(reckoned, instruments, a_from_b, errors.cov, height, angles, velocity)

@@ -329,7 +329,11 @@ def moved(errors, last, now, numbers, last_numbers):
     Args:
         last_numbers: those of the motion before.
     """
-    return geometry.inverse(last) @ now @ geometry.exp(errors.root @ (numbers - errors.undone * last_numbers))
+    error = np.zeros(6)
+    for i in range(6):
+        for k in range(6):
+            error[i] += errors.root[i, k] * (numbers[k] - errors.undone * last_numbers[k])
+    return geometry.compose(geometry.compose(geometry.inverse(last), now), geometry.exp(error))
 
 
 @njit(cache=True, nogil=True)
