@@ -1,6 +1,5 @@
 """Aiding sensors against closed forms, dense Kalman updates and finite differences."""
 
-import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -252,15 +251,37 @@ def test_true_displacements_return_the_true_poses_of_a_turning_vehicle():
 def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
     poses = [level(0), level(0.3) @ geometry.exp(np.array([0.02, -0.05, 0.1, 0, 0, 0]))]
     walked = [None, Displacement(0, np.array([0.301, 0.002, -0.001]), np.eye(3) * 1e-6)]
-    graph, start, moved = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()
     away = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
-    for k, pose in enumerate(poses):
-        start.insert(k, gtsam.Pose3(pose))
-        moved.insert(k, gtsam.Pose3(away @ pose))
-    aiding.add_readings(graph, start, key_points(poses, walked=walked), RIG, NOISE, {})
-    moved.insert(gtsam.symbol("s", 0), np.zeros(1))
-    assert graph.error(start) > 0.5
-    assert graph.error(moved) == pytest.approx(graph.error(start), rel=1e-9)
+    told = aiding.displacements(key_points(poses, walked=walked), RIG)
+    start, moved = (
+        told.observe((geometry.inverse(a) @ b)[None], 0.0) for a, b in (poses, [away @ pose for pose in poses])
+    )
+    assert np.linalg.norm(start) > 1e-3
+    np.testing.assert_allclose(moved, start, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.05])
+def test_what_displacements_change_by_agrees_with_finite_differences(scale):
+    motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
+    walked = [None, Displacement(0, np.array([0.3, 0.0, 0.0]), np.eye(3) * 1e-6)]
+    told = aiding.displacements(key_points([POSE, POSE @ motion], walked=walked), RIG)
+    by_j, by_scale = told.derive(motion[None], scale, told.observe(motion[None], scale))
+    by_motion = numeric(lambda m: told.observe((motion @ geometry.exp(m))[None], scale)[0], np.zeros(6))
+    np.testing.assert_allclose(by_j[0], by_motion, atol=1e-8)
+    np.testing.assert_allclose(
+        by_scale[0], numeric(lambda s: told.observe(motion[None], scale + s[0])[0], np.zeros(1))[:, 0], atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("kind", ["heights", "attitudes", "fixes", "beacons"])
+def test_what_readings_change_by_agrees_with_finite_differences(kind):
+    readings = Readings(2.3, np.array([0.05, -0.02, 0.45]), usbl_m=np.array([0.2, 0.0, 2.0]),
+                        beacons=sightings_of(pixels_of(POSE))[:1])  # fmt: skip
+    order = ["heights", "attitudes", "fixes", "beacons"]
+    told = aiding.singles(key_points([POSE], [readings]), RIG, NOISE)[order.index(kind)]
+    found = told.derive(POSE[None], told.observe(POSE[None]))
+    expected = numeric(lambda m: told.observe((POSE @ geometry.exp(m))[None])[0], np.zeros(6))
+    np.testing.assert_allclose(found[0], expected, rtol=1e-6, atol=1e-7)
 
 
 def test_a_displacement_from_a_node_outside_the_window_is_left_out():

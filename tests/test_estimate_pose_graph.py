@@ -10,7 +10,7 @@ from evo.core.metrics import APE, PoseRelation
 from evo.core.trajectory import PosePath3D
 
 from twin import geometry
-from twin.estimate import pose_graph
+from twin.estimate import block_cholesky, pose_graph
 from twin.exchange import posegraph
 from twin.records import Link
 
@@ -96,7 +96,7 @@ def test_the_chordal_start_needs_no_poses():
     start = pose_graph.chordal_start(exact)
     zero = geometry.inverse(poses[0])
     for k, pose in enumerate(poses):
-        np.testing.assert_allclose(start.atPose3(k).matrix(), zero @ pose, atol=1e-6)
+        np.testing.assert_allclose(start[k], zero @ pose, atol=1e-9)
     poses, links = ring(np.random.default_rng(1))
     by_chords, by_truth = (pose_graph.solve(links, start) for start in (None, dict(enumerate(poses))))
     assert by_chords.cost == pytest.approx(by_truth.cost, abs=1e-3)
@@ -112,7 +112,7 @@ def test_the_chordal_start_is_not_led_astray_by_odometry():
     turned = geometry.exp(np.array([0, 0, 0.3, 0, 0, 0]))
     links += [link._replace(i_from_j=link.i_from_j @ turned, cov=np.eye(6)) for link in exact if link.j == link.i + 1]
     start, zero = pose_graph.chordal_start(links), geometry.inverse(poses[0])
-    off = [np.linalg.norm(start.atPose3(k).matrix() - zero @ pose) for k, pose in enumerate(poses)]
+    off = [np.linalg.norm(start[k] - zero @ pose) for k, pose in enumerate(poses)]
     assert max(off) < 0.05
 
 
@@ -135,59 +135,145 @@ def test_a_robust_kernel_bends_less_to_a_wrong_link():
     assert off[1] < 0.5 * off[0]
 
 
+def graph_of(poses, links, huber=None):
+    """The graph of links between poses 0 to n - 1, the first one held."""
+    held = pose_graph.given([0], np.array(poses[:1]), np.eye(6)[None] * 1e-6)
+    return pose_graph.Graph(len(poses), [held], [pose_graph.motions(links, {k: k for k in range(len(poses))}, huber)])
+
+
 @pytest.mark.parametrize("huber", [None, 2.5])
 def test_chi2_is_the_squared_residual_in_units_of_the_covariance(huber):
-    poses, links = ring(np.random.default_rng(4))
-    start = gtsam.Values()
-    for k, pose in enumerate(poses):
-        start.insert(k, gtsam.Pose3(pose))
-    expected = []
+    """And F their half, but for those beyond Huber's limit, which count linearly."""
+    poses, links = ring(np.random.default_rng(4), share_of_sigma=2.5)
+    found = pose_graph.optimise(graph_of(poses, links, huber), pose_graph.State(np.array(poses)))
+    expected, losses = [], []
     for link in links:
-        error = geometry.log(geometry.inverse(link.i_from_j) @ geometry.inverse(poses[link.i]) @ poses[link.j])
+        between = geometry.inverse(found.state.poses[link.i]) @ found.state.poses[link.j]
+        error = geometry.log(geometry.inverse(link.i_from_j) @ between)
         expected.append(error @ np.linalg.inv(link.cov) @ error)
+        size = np.sqrt(expected[-1])
+        losses.append(size**2 / 2 if huber is None or size <= huber else huber * (size - huber / 2))
     assert min(expected) < 2.5**2 < max(expected)
-    found = pose_graph.chi2(pose_graph.between_factors(links, huber), start, huber)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(found.chi2[0], expected, rtol=1e-9)
+    assert found.cost == pytest.approx(sum(losses), abs=1e-6)
 
 
-@pytest.mark.parametrize("last", [[11, 3], None])
-def test_marginals_are_gtsams(last):
+def test_marginals_are_gtsams():
     _, links = ring(np.random.default_rng(5))
-    graph, start = gtsam.NonlinearFactorGraph(), pose_graph.chordal_start(links)
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
-    for factor in pose_graph.between_factors(links):
-        graph.add(factor)
-    found = pose_graph.optimise(graph, start, last=last)
-    oracle = gtsam.Marginals(graph, found.values)
-    numbers = range(12) if last is None else last
-    for number, cov in zip(numbers, found.marginals(numbers), strict=True):
-        expected = oracle.marginalCovariance(number)
-        np.testing.assert_allclose(cov, expected, atol=1e-3 * np.diag(expected).max())
+    start = pose_graph.solve(links).poses
+    found = pose_graph.optimise(
+        graph_of([start[k] for k in range(12)], links), pose_graph.State(np.array(list(start.values())))
+    )
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for link in links:
+        noise = gtsam.noiseModel.Gaussian.Covariance(link.cov)
+        graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), noise))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    for k, pose in enumerate(found.state.poses):
+        values.insert(k, gtsam.Pose3(pose))
+    oracle, covs = gtsam.Marginals(graph, values), found.marginals()
+    for k in range(12):
+        expected = oracle.marginalCovariance(k)
+        np.testing.assert_allclose(covs[k], expected, atol=1e-5 * np.diag(expected).max())
+        np.testing.assert_allclose(found.marginal(k), covs[k], rtol=1e-9, atol=1e-9 * np.diag(expected).max())
+
+
+def along_x(measured_m, reading=lambda way_m: way_m):
+    """Two poses on the x axis, the first held, and readings of the way between them."""
+    held = pose_graph.given([0], np.eye(4)[None], np.eye(6)[None] * 1e-12)
+    on_axis = pose_graph.given([1], np.eye(4)[None], np.diag([1e-6] * 3 + [1e6, 1e-6, 1e-6])[None])
+
+    def derive(i_from_j, shared, residuals):
+        way_m, step = i_from_j[:, 0, 3], 1e-6
+        by_j = np.zeros((len(way_m), 1, 6))
+        by_j[:, 0, 3] = (reading(way_m + step) - reading(way_m - step)) / (2 * step)
+        return by_j, None
+
+    n = len(measured_m)
+    ways = pose_graph.Pairs(
+        np.zeros(n, int), np.ones(n, int), np.ones((n, 1, 1)),
+        lambda i_from_j, shared: (reading(i_from_j[:, 0, 3]) - measured_m)[:, None], derive,
+    )  # fmt: skip
+    return pose_graph.Graph(2, [held, on_axis], [ways])
+
+
+def start_at(x):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = x
+    return pose_graph.State(poses)
 
 
 def test_what_is_linear_is_eliminated_once(monkeypatch):
-    graph, start, eliminate, times = gtsam.NonlinearFactorGraph(), gtsam.Values(), pose_graph._eliminated, []
-    for measured in ([1.0, 2.0], [3.0, 8.0]):
-        graph.add(gtsam.PriorFactorVector(0, np.array(measured), gtsam.noiseModel.Unit.Create(2)))
-    start.insert(0, np.array([100.0, -100.0]))
-    monkeypatch.setattr(pose_graph, "_eliminated", lambda *a, **k: times.append(1) or eliminate(*a, **k))
-    found = pose_graph.optimise(graph, start)
-    np.testing.assert_allclose(found.values.atVector(0), [2.0, 5.0], atol=1e-9)
+    factorise, times = block_cholesky.factorise, []
+    monkeypatch.setattr(block_cholesky, "factorise", lambda *a: times.append(1) or factorise(*a))
+    found = pose_graph.optimise(along_x(np.array([1.0, 3.0])), start_at(100.0))
+    assert found.state.poses[1, 0, 3] == pytest.approx(2.0, abs=1e-5)
     assert found.reached and len(times) == 1
 
 
 def test_a_start_that_leads_gauss_newton_up_ends_at_the_minimum_all_the_same():
     """Of arctan(x)^2 each step of Gauss-Newton from beyond 1.39 leads farther off, to the other side."""
-
-    def arctan(_, values, jacobians):
-        x = values.atVector(0)
-        if jacobians is not None:
-            jacobians[0] = np.array([[1 / (1 + x[0] ** 2)]], order="F")
-        return np.arctan(x)
-
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [0], arctan))
-    start.insert(0, np.array([3.0]))
-    found = pose_graph.optimise(graph, start)
+    found = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0))
     assert found.reached
-    assert found.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-3)
+    assert found.state.poses[1, 0, 3] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_an_unknown_that_all_pairs_share_is_solved_with_the_poses():
+    """Ways of a chain, some also measured with one common scale: the border against the dense equations."""
+    n, sigma = 6, 0.3
+    rng = np.random.default_rng(8)
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, 0, 3] = np.arange(n)
+    cov = np.diag([1e-6] * 3 + [0.01] * 3)
+    links = [Link(k, k + 1, poses[1] @ geometry.exp(rng.normal(size=6) * 1e-4), cov, 1.0, 9) for k in range(n - 1)]
+    i, measured = np.arange(n - 1), 1.1 + 0.01 * rng.normal(size=n - 1)
+    information = np.full((n - 1, 1, 1), 0.02**-2)
+
+    def derive(i_from_j, shared, residuals):
+        by_j = np.zeros((n - 1, 1, 6))
+        by_j[:, 0, 3:] = (1 + shared) * i_from_j[:, 0, :3]
+        return by_j, i_from_j[:, :1, 3]
+
+    scaled = pose_graph.Pairs(
+        i, i + 1, information,
+        lambda i_from_j, shared: ((1 + shared) * i_from_j[:, 0, 3] - measured)[:, None], derive,
+    )  # fmt: skip
+    alone = graph_of(poses, links)
+    found = pose_graph.optimise(
+        alone._replace(pairs=[*alone.pairs, scaled], shared_sigma=sigma), pose_graph.State(poses)
+    )
+
+    def cost(unknown):
+        moved = np.array(
+            [pose @ geometry.exp(step) for pose, step in zip(poses, unknown[:-1].reshape(n, 6), strict=True)]
+        )
+        total = np.sum(unknown[:6] ** 2) / 1e-6 + (unknown[-1] / sigma) ** 2
+        for link in links:
+            error = geometry.log(geometry.inverse(link.i_from_j) @ geometry.inverse(moved[link.i]) @ moved[link.j])
+            total += error @ np.linalg.inv(cov) @ error
+        between = [geometry.inverse(a) @ b for a, b in zip(moved, moved[1:], strict=False)]
+        off = (1 + unknown[-1]) * np.array([motion[0, 3] for motion in between]) - measured
+        return (total + np.sum(off**2) / 0.02**2) / 2
+
+    steps = [geometry.log(geometry.inverse(a) @ b) for a, b in zip(poses, found.state.poses, strict=True)]
+    at = np.append(np.concatenate(steps), found.state.shared)
+    assert cost(at) == pytest.approx(found.cost, rel=1e-6)
+    assert 0.05 < found.state.shared < 0.15
+    for k in range(len(at)):
+        nudge = np.zeros(len(at))
+        nudge[k] = 1e-3
+        assert min(cost(at + nudge), cost(at - nudge)) > found.cost
+
+
+def test_a_graph_that_holds_not_every_pose_is_told():
+    """A pose without a link; a ring that may move as a whole along one axis, where only rounding is left to divide by."""
+    poses, links = ring(np.random.default_rng(9))
+    loose = graph_of([*poses, np.eye(4)], links)
+    with pytest.raises(np.linalg.LinAlgError):
+        pose_graph.optimise(loose, pose_graph.State(np.array([*poses, np.eye(4)])))
+    for seed in range(10):
+        poses, links = ring(np.random.default_rng(seed))
+        held = pose_graph.given([0], np.array(poses[:1]), np.diag([1e-6] * 5 + [1e30])[None])
+        adrift = graph_of(poses, links)._replace(singles=[held])
+        with pytest.raises(np.linalg.LinAlgError):
+            pose_graph.optimise(adrift, pose_graph.State(np.array(poses)))

@@ -1,6 +1,7 @@
 """Rigid motions: laws, also near identity and near half a turn, and MuJoCo and scipy as oracles."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -49,6 +50,37 @@ def test_log_undoes_exp(motion):
 @given(poses())
 def test_exp_undoes_log(pose):
     np.testing.assert_allclose(g.exp(g.log(pose)), pose, atol=1e-8)
+
+
+@given(motions())
+def test_the_derivative_of_log_agrees_with_finite_differences(motion):
+    motion[:3] *= 0.9  # away from half a turn, where log jumps
+    step = 1e-6
+    around = [[g.log(g.exp(motion) @ g.exp(sign * d)) for sign in (1, -1)] for d in np.eye(6) * step]
+    numeric = np.column_stack([(ahead - behind) / (2 * step) for ahead, behind in around])
+    np.testing.assert_allclose(g.log_derivative(motion), numeric, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0999999, 0.1000001])
+def test_the_derivative_of_log_is_the_same_on_both_sides_of_where_its_series_ends(angle):
+    motion = np.array([0.6, -0.48, 0.64, 3.0, -2.0, 1.0])
+    motion[:3] *= angle
+    other = motion.copy()
+    other[:3] *= 0.1 / angle
+    np.testing.assert_allclose(g.log_derivative(motion), g.log_derivative(other), atol=1e-6)
+
+
+@given(poses(), poses())
+def test_poses_compose_as_matrices_multiply(a, b):
+    np.testing.assert_allclose(g.compose(a, b), a @ b, atol=1e-12)
+
+
+def test_a_covariance_carried_by_a_matrix_is_the_product_and_symmetric():
+    rng = np.random.default_rng(0)
+    matrix, root = rng.normal(size=(2, 6, 6))
+    carried = g.sandwich(matrix, root @ root.T)
+    np.testing.assert_allclose(carried, matrix @ root @ root.T @ matrix.T, atol=1e-12)
+    np.testing.assert_array_equal(carried, carried.T)
 
 
 def test_half_a_turn_has_a_log():

@@ -81,5 +81,6 @@ class RovPilot:
 def steer(helm, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
     """Commands for an estimated pose (4, 4) and twist (6,) of the camera, and its reference."""
     helm.twist[:] = helm.twist + helm.smoothing * (helm.to_body @ camera_velocity - helm.twist)
-    body, place = geometry.compose(world_from_camera, helm.camera_from_body), position - level_arm(yaw, helm.lever_arm_m)
+    body = geometry.compose(world_from_camera, helm.camera_from_body)
+    place = position - level_arm(yaw, helm.lever_arm_m)
     return commanded(helm.steering, body, helm.twist, place, velocity, acceleration, yaw)

@@ -41,11 +41,10 @@ def _heights(nodes: Sequence[KeyPoint], noise: SensorNoise) -> Single:
 
 def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> Single:
     told = [k for k, node in enumerate(nodes) if node.readings.ahrs_rpy_rad is not None]
+    angles = np.array([nodes[k].readings.ahrs_rpy_rad for k in told]).reshape(-1, 3)
     camera_from_body = geometry.inverse(rig.body_from_camera)
-    camera_from_world = np.tile(np.eye(4), (len(told), 1, 1))
-    for row, k in zip(camera_from_world, told, strict=True):
-        row[:3, :3] = pose_filter.attitude(nodes[k].readings.ahrs_rpy_rad, camera_from_body, noise)[0].T
     cov = pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1]  # the same for every reading
+    camera_from_world = _turned_back(angles, rig.body_from_camera)
 
     def observe(poses: Array) -> Array:
         turned = poses.copy()
@@ -56,6 +55,17 @@ def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) ->
         return log_derivatives(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
 
     return Single(np.array(told, np.int64), np.tile(inverses_of(cov[None]), (len(told), 1, 1)), observe, derive)
+
+
+@njit(cache=True, nogil=True)
+def _turned_back(angles, body_from_camera):
+    """(m, 4, 4) camera_from_world of attitudes (m, 3) of the body, at the world's origin."""
+    inverses, at_origin = np.empty((len(angles), 4, 4)), body_from_camera.copy()
+    at_origin[:3, 3] = 0.0
+    for k in range(len(angles)):
+        body = geometry.pose(geometry.rotation_from_rpy(angles[k, 0], angles[k, 1], angles[k, 2]), np.zeros(3))
+        inverses[k] = geometry.inverse(geometry.compose(body, at_origin))
+    return inverses
 
 
 def _fixes(nodes: Sequence[KeyPoint], noise: SensorNoise) -> Single:

@@ -61,7 +61,7 @@ def align(
     dropped: list[Link] = []
     found = fit.optimise(pose_graph.State(np.array([node.world_from_camera for node in nodes])), _FEW_ITERATIONS)
     for _ in range(_ROUNDS):
-        wrong = fit.contradictions(found.state)
+        wrong = fit.contradictions(found.chi2[0])
         if not wrong.any():
             break
         dropped += [link for link, out in zip(fit.links, wrong, strict=True) if out]
@@ -82,13 +82,13 @@ class _Fit(NamedTuple):
     def optimise(self, start: pose_graph.State, iterations: int) -> pose_graph.Optimum:
         return pose_graph.optimise(self.graph, start, iterations)
 
-    def contradictions(self, state: pose_graph.State) -> Mask:
-        """(n,) links that contradict the rest, but for those small beside the worst, which may be its doing.
+    def contradictions(self, chi2: Array) -> Mask:
+        """(n,) links that contradict the rest by their chi2 (n,).
 
-        The path's own chain always stands.
+        Those small beside the worst may be its doing, and stay for now. The path's own chain always stands.
         """
         chain = np.array([link.j - link.i == 1 for link in self.links], dtype=bool)
-        chi2 = np.where(chain, 0.0, pose_graph.chi2(self.graph.pairs[0], state))
+        chi2 = np.where(chain, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _OF_THE_WORST * float(chi2.max(initial=0.0)))
 
     def without(self, wrong: Mask) -> _Fit:

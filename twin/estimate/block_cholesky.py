@@ -209,9 +209,10 @@ def factorise(structure: Structure, diagonal: Array, off: Array) -> Factor:
         LinAlgError: it is not positive definite, to rounding.
     """
     s = structure
-    panels = np.zeros(s.at[-1])
+    panels, whole = np.zeros(s.at[-1]), np.empty((len(s.place), _D))
+    whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
     _place(s.place, s.pairs, s.turned, s.first, s.below, s.rows, s.at, s.panel_of, diagonal, off, panels)
-    if not _eliminate(s.first, s.below, s.rows, s.at, s.panel_of, panels):
+    if not _eliminate(s.first, s.below, s.rows, s.at, s.panel_of, whole.reshape(-1), panels):
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     return Factor(structure, panels)
 
@@ -238,13 +239,13 @@ def _place(place, pairs, turned, first, below, rows, at, panel_of, diagonal, off
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(first, below, rows, at, panel_of, panels):
-    """Turns each panel into L1^-1 over L2; whether every node is held."""
+def _eliminate(first, below, rows, at, panel_of, whole, panels):
+    """Turns each panel into L1^-1 over L2; whether every node is held, by the diagonal (6 n,) as it was."""
     for p in range(len(first) - 1):
         n = _D * (first[p + 1] - first[p])
         panel = panels[at[p] : at[p + 1]].reshape(-1, n)
         inverse = np.zeros((n, n))
-        if not _invert_root(panel[:n], inverse):
+        if not _invert_root(panel[:n], whole[_D * first[p] : _D * first[p + 1]], inverse):
             return False
         panel[:n] = inverse
         if len(panel) > n:
@@ -255,10 +256,11 @@ def _eliminate(first, below, rows, at, panel_of, panels):
 
 
 @njit(cache=True, nogil=True)
-def _invert_root(matrix, inverse):
+def _invert_root(matrix, whole, inverse):
     """Fills `inverse` (n, n) with that of the lower triangular root of a matrix (n, n), of which the lower half counts.
 
-    Row by row: what the rows before leave of a row is its part of the root. False where a pivot is but rounding.
+    Row by row: what the rows before leave of a row is its part of the root. False where a pivot is but rounding of what
+    had been on the diagonal (n,).
     """
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
@@ -270,7 +272,7 @@ def _invert_root(matrix, inverse):
         pivot = matrix[i, i]
         for m in range(i):
             pivot -= root[i, m] * root[i, m]
-        if not pivot > _LEAST_PIVOT * matrix[i, i]:
+        if not pivot > _LEAST_PIVOT * whole[i]:
             return False
         per_pivot = 1 / np.sqrt(pivot)
         for k in range(i):

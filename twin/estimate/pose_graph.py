@@ -1,7 +1,7 @@
 """Pose graphs: the poses X that agree best with the motions Z measured between them, the core of the alignment (P15).
 
-F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance, and over what is said
-of single poses; rho is r^2 / 2, or Huber's function. Gauss-Newton minimises it, damped (Marquardt) where its step
+F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance, and over what is
+said of single poses; rho is r^2 / 2, or Huber's function. Gauss-Newton minimises it, damped (Marquardt) where its step
 leads up. Errors of poses are motions in their own axes, X exp(d).
 
 What pairs share with all others (the scale of a log) is one unknown more, which borders the matrix of the poses: first
@@ -88,12 +88,13 @@ class State(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """A graph at a state: the value of F; residuals (m, d) of singles; of pairs residuals, motions and weights."""
+    """A graph at a state: F, residuals (m, d) of singles; of pairs residuals, motions and weights; their chi2 (m,)."""
 
     state: State
     cost: float
     singles: list[Array]
     pairs: list[tuple[Array, Array, Array]]
+    chi2: list[Array]
 
 
 class _System(NamedTuple):
@@ -112,6 +113,7 @@ class Optimum(NamedTuple):
     """The state that minimises F, the value of F, whether it was reached, and the equations of the last step.
 
     Args:
+        chi2: (m,) squared residuals of each pairs in units of their covariance, before their weights.
         factor: of the poses' matrix.
         border: (n, 6) its solution for the border, and what the shared unknown's own equation then holds; None: nothing
             is shared.
@@ -119,6 +121,7 @@ class Optimum(NamedTuple):
 
     state: State
     cost: float
+    chi2: list[Array]
     reached: bool
     factor: block_cholesky.Factor
     border: tuple[Array, float] | None
@@ -165,7 +168,7 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
         else:
             damping = max(10 * damping, _FIRST_DAMPING)
         if reached or iterations <= 0:
-            return Optimum(seen.state, seen.cost, reached, step.factor, step.border)
+            return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
 
 
 class _Step(NamedTuple):
@@ -195,7 +198,7 @@ def _step(structure: block_cholesky.Structure, system: _System, damping: float) 
 def _look(graph: Graph, state: State) -> _Seen:
     """What the graph is at a state."""
     cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
-    singles, pairs = [], []
+    singles, pairs, chi2 = [], [], []
     for single in graph.singles:
         residuals = single.observe(state.poses[single.at])
         cost += float(_squares(residuals, single.information).sum()) / 2
@@ -203,16 +206,11 @@ def _look(graph: Graph, state: State) -> _Seen:
     for pair in graph.pairs:
         i_from_j = _between(state.poses[pair.i], state.poses[pair.j])
         residuals = pair.observe(i_from_j, state.shared)
-        losses, weights = _robust(_squares(residuals, pair.information), pair.huber)
+        chi2.append(_squares(residuals, pair.information))
+        losses, weights = _robust(chi2[-1], pair.huber)
         cost += float(losses.sum())
         pairs.append((residuals, i_from_j, weights))
-    return _Seen(state, cost, singles, pairs)
-
-
-def chi2(pairs: Pairs, state: State) -> Array:
-    """(m,) squared residual of each pair in units of its covariance, before its weight."""
-    i_from_j = _between(state.poses[pairs.i], state.poses[pairs.j])
-    return _squares(pairs.observe(i_from_j, state.shared), pairs.information)
+    return _Seen(state, cost, singles, pairs, chi2)
 
 
 def _robust(chi2: Array, huber: float | None) -> tuple[Array, Array]:
@@ -237,20 +235,64 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
         gradient += _summed(graph.n, single.at, _times(weighted, residuals))
     for pair, (residuals, i_from_j, weights) in zip(graph.pairs, seen.pairs, strict=True):
         by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
+        across = np.empty((len(pair.i), 6, 6))
         information = weights[:, None, None] * pair.information
-        weighted = _turned(by_j) @ information
-        matrix, slope = weighted @ by_j, _times(weighted, residuals)
-        to_i = -_turned(_adjoints(_inverses(i_from_j)))  # i moved by d moves j by -Ad(j_from_i) d
-        across = to_i @ matrix
+        _add_pairs(pair.i, pair.j, by_j, information, residuals, i_from_j, diagonal, across, gradient)
         off.append(across)
-        diagonal += _summed(graph.n, pair.j, matrix) + _summed(graph.n, pair.i, across @ _turned(to_i))
-        gradient += _summed(graph.n, pair.j, slope) + _summed(graph.n, pair.i, _times(to_i, slope))
         if by_shared is not None:
-            mixed, shared = _times(weighted, by_shared), _times(information, by_shared)
-            border += _summed(graph.n, pair.j, mixed) + _summed(graph.n, pair.i, _times(to_i, mixed))
-            corner += float(np.sum(shared * by_shared))
-            shared_gradient += float(np.sum(shared * residuals))
+            informed = _times(information, by_shared)
+            _add_border(pair.i, pair.j, by_j, informed, i_from_j, border)
+            corner += float(np.sum(informed * by_shared))
+            shared_gradient += float(np.sum(informed * residuals))
     return _System(diagonal, np.concatenate(off), gradient, border, corner, shared_gradient)
+
+
+@njit(cache=True, nogil=True)
+def _add_pairs(first, second, by_j, information, residuals, i_from_j, diagonal, across, gradient):
+    """Adds the normal equations of pairs to blocks and gradient of both their poses, and fills the blocks between.
+
+    A motion d of i is one of -Ad(j_from_i) d of j.
+    """
+    n = residuals.shape[1]
+    half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
+    for m in range(len(first)):
+        i, j, derivative = first[m], second[m], by_j[m]
+        for a in range(6):
+            slope[a] = 0.0
+            for k in range(n):
+                half[a, k] = 0.0
+                for b in range(n):
+                    half[a, k] += derivative[b, a] * information[m, b, k]
+                slope[a] += half[a, k] * residuals[m, k]
+            for b in range(a + 1):
+                total = 0.0
+                for k in range(n):
+                    total += half[a, k] * derivative[k, b]
+                matrix[a, b] = matrix[b, a] = total
+        to_i[:] = geometry.adjoint(geometry.inverse(i_from_j[m])).T
+        for a in range(6):
+            for b in range(6):
+                across[m, a, b] = 0.0
+                for k in range(6):
+                    across[m, a, b] -= to_i[a, k] * matrix[k, b]
+                diagonal[j, a, b] += matrix[a, b]
+                gradient[i, a] -= to_i[a, b] * slope[b]
+            gradient[j, a] += slope[a]
+        diagonal[i] += geometry.sandwich(to_i, matrix)
+
+
+@njit(cache=True, nogil=True)
+def _add_border(first, second, by_j, informed, i_from_j, border):
+    """Adds what pairs hold together of their poses and what is shared."""
+    for m in range(len(first)):
+        slope = np.zeros(6)
+        for k in range(informed.shape[1]):
+            slope += informed[m, k] * by_j[m, k]
+        border[second[m]] += slope
+        carry = geometry.adjoint(geometry.inverse(i_from_j[m]))
+        for a in range(6):
+            for b in range(6):
+                border[first[m], a] -= carry[b, a] * slope[b]
 
 
 def motions(links: Sequence[Link], places: dict[int, int], huber: float | None = None) -> Pairs:
@@ -316,14 +358,6 @@ def _inverses(poses: Array) -> Array:
     found[:, :3, :3] = _turned(poses[:, :3, :3])
     found[:, :3, 3] = -_times(found[:, :3, :3], poses[:, :3, 3])
     found[:, 3, 3] = 1.0
-    return found
-
-
-def _adjoints(poses: Array) -> Array:
-    """`geometry.adjoint` of many."""
-    found, rotations = np.zeros((len(poses), 6, 6)), poses[:, :3, :3]
-    found[:, :3, :3] = found[:, 3:, 3:] = rotations
-    found[:, 3:, :3] = np.cross(poses[:, None, :3, 3], rotations, axisb=1).transpose(0, 2, 1)
     return found
 
 

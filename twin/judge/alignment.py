@@ -20,8 +20,8 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     """`tracks[]` of metrics.json, a row for each alignment at the end of a track.
 
     `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`; an alignment beyond them (the truly global one at the
-    end) has no row. Their n positions are those of the last n key points up to the end of the track (all of them, or those of the
-    moving window), anchored at the first true pose like the trajectories.
+    end) has no row. Their n positions are those of the last n key points up to the end of the track (all of
+    them, or those of the moving window), anchored at the first true pose like the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
     error_m = path_errors(result.final, truth.trajectory).distance_m

@@ -1,0 +1,102 @@
+"""Sparse factors against dense algebra."""
+
+import numpy as np
+import pytest
+
+from twin.estimate import block_cholesky
+
+
+def normal_equations(rng, n, i, j):
+    """Blocks (n, 6, 6), (m, 6, 6) of normal equations of pairs (i, j), the first node held; the dense matrix."""
+    rows = np.eye(6) * np.array([1.0, -1.0])[:, None, None] + 0.2 * rng.normal(size=(len(i), 2, 6, 6))
+    diagonal, dense = np.zeros((n, 6, 6)), np.zeros((n, 6, n, 6))
+    off = rows[:, 0].transpose(0, 2, 1) @ rows[:, 1]
+    for k, ends in enumerate(zip(i, j, strict=True)):
+        for a, node in enumerate(ends):
+            diagonal[node] += rows[k, a].T @ rows[k, a]
+        dense[i[k], :, j[k]] += off[k]
+        dense[j[k], :, i[k]] += off[k].T
+    diagonal[0] += np.eye(6)
+    dense[np.arange(n), :, np.arange(n)] += diagonal
+    return diagonal, off, dense.reshape(6 * n, 6 * n)
+
+
+def chain(n):
+    return np.arange(n - 1), np.arange(1, n)
+
+
+def raster(rows, cols):
+    """Legs that are linked with the leg before."""
+    k = np.arange(rows * cols)
+    along, across = k[k % cols > 0], k[k >= cols]
+    return np.concatenate([along - 1, across - cols]), np.concatenate([along, across])
+
+
+def web(n):
+    """Links at random both ways round, some of them twice, and a chain that holds all."""
+    rng = np.random.default_rng(0)
+    i, j = rng.integers(0, n, (2, 4 * n))
+    i, j = i[i != j], j[i != j]
+    return np.concatenate([chain(n)[0], i, j[:9]]), np.concatenate([chain(n)[1], j, i[:9]])
+
+
+NETWORKS = {
+    "one node": (1, (np.empty(0, int), np.empty(0, int))),
+    "chain": (40, chain(40)),
+    "raster": (96, raster(8, 12)),
+    "web": (50, web(50)),
+    "complete": (30, np.triu_indices(30, 1)),
+}
+
+
+@pytest.fixture(params=NETWORKS, ids=list(NETWORKS))
+def factored(request):
+    n, (i, j) = NETWORKS[request.param]
+    diagonal, off, dense = normal_equations(np.random.default_rng(1), n, i, j)
+    return block_cholesky.factorise(block_cholesky.analyse(n, i, j), diagonal, off), dense
+
+
+def test_a_system_is_solved_as_dense_algebra_does(factored):
+    factor, dense = factored
+    right = np.random.default_rng(2).normal(size=len(dense))
+    found = factor.solve(right.reshape(-1, 6))
+    np.testing.assert_allclose(dense @ found.ravel(), right, atol=1e-9)
+
+
+def test_marginals_are_blocks_of_the_dense_inverse(factored):
+    factor, dense = factored
+    n = len(dense) // 6
+    expected = np.linalg.inv(dense).reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
+    np.testing.assert_allclose(factor.marginals(), expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
+    for node in {0, n // 2, n - 1}:
+        np.testing.assert_allclose(factor.marginal(node), expected[node], atol=1e-9 * np.abs(expected).max())
+
+
+def test_no_block_is_kept_that_a_raster_does_not_need():
+    """Least degree on a raster of legs: a small part of the dense triangle."""
+    n, (i, j) = 1200, raster(20, 60)
+    structure = block_cholesky.analyse(n, i, j)
+    assert structure.at[-1] / 36 < 0.03 * n * (n + 1) / 2
+
+
+def test_nodes_that_nothing_ties_together_are_factored_side_by_side():
+    i, j = np.array([0, 2]), np.array([1, 3])
+    diagonal, off, dense = normal_equations(np.random.default_rng(3), 4, i, j)
+    diagonal[2] += np.eye(6)
+    dense[12:18, 12:18] += np.eye(6)
+    factor = block_cholesky.factorise(block_cholesky.analyse(4, i, j), diagonal, off)
+    np.testing.assert_allclose(factor.marginal(3), np.linalg.inv(dense)[18:, 18:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("free", [0, 7])
+def test_a_network_that_nothing_holds_is_told(free):
+    """Of links between poses alone a common move changes nothing."""
+    n, (i, j) = 12, chain(12)
+    off = np.tile(-np.eye(6), (n - 1, 1, 1))
+    diagonal = np.tile(2 * np.eye(6), (n, 1, 1))
+    diagonal[[0, -1]] = np.eye(6)
+    structure = block_cholesky.analyse(n, i, j)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        block_cholesky.factorise(structure, diagonal, off)
+    diagonal[free] += 1e-6 * np.eye(6)
+    block_cholesky.factorise(structure, diagonal, off)
