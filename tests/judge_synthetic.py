@@ -101,8 +101,8 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     result = SurveyResult(
         f2f, online, final, keys, track[keys], np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (len(keys), 1, 1)), links,
         [Alignment(t, 100.0 * t, n, 3 * n, 2) for t, n in enumerate(ends, 1)],
-        [online.world_from_camera[keys[:n]] for n in ends],
-        [final.world_from_camera[keys[:n]] for n in ends],
+        [online.positions[keys[:n]] for n in ends],
+        [final.positions[keys[:n]] for n in ends],
     )  # fmt: skip
     truth = Truth(Trajectory(times, poses), reference, holding, track, height, seen)
     return result, ElevationMap(grid, estimate, np.where(np.isfinite(estimate), sigma, np.nan), mosaic), truth, rig

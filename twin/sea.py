@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import scenes.builder
+from twin import geometry
 from twin.estimate.pipeline import Navigator
 from twin.estimate.vision import Vision
 from twin.geometry import Array
@@ -83,7 +84,7 @@ class Sea(ABC):
     @property
     def world_from_camera(self) -> Array:
         """(4, 4) true pose of the left camera."""
-        return self.vehicle.world_from_body @ self.mission.rig.body_from_camera
+        return geometry.compose(self.vehicle.world_from_body, self.mission.rig.body_from_camera)
 
     def observe(self, step: Step, track: int) -> Frame:
         """What the vehicle sees now; the truth of it is kept here."""

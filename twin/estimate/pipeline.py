@@ -288,9 +288,9 @@ class Navigator:
         begun = time.perf_counter()
         try:
             aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
-        except np.linalg.LinAlgError as error:  # the links do not hold every node
+        except np.linalg.LinAlgError as error:
             self.alignable = False
-            raise SurveyAborted(f"global alignment failed: {str(error).strip().splitlines()[0]}") from None
+            raise SurveyAborted(f"global alignment failed: {error}") from None
         ms = (time.perf_counter() - begun) * 1e3
         self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
         self.dropped += aligned.dropped

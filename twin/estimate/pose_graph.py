@@ -6,9 +6,6 @@ leads up. Errors of poses are motions in their own axes, X exp(d).
 
 What pairs share with all others (the scale of a log) is one unknown more, which borders the matrix of the poses: first
 the poses as if it were known, then its own equation.
-
-Without good poses to start from, the start is chordal (Carlone et al. 2015): rotations by linear least squares, then
-positions. Raw odometry is none on a hard graph.
 """
 
 from __future__ import annotations
@@ -20,7 +17,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from twin import geometry
 from twin.estimate import block_cholesky
@@ -32,7 +28,6 @@ Indices = NDArray[np.int64]
 #: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
 _BEYOND_LINEAR = 5e-4
-_HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-6  # of the diagonal
 
 
@@ -150,9 +145,9 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
     Raises:
         LinAlgError: the graph does not hold every pose.
     """
-    structure = block_cholesky.analyse(
-        graph.n, *(np.concatenate([np.empty(0, np.int64), *(p[k] for p in graph.pairs)]) for k in (0, 1))
-    )
+    nobody = np.empty(0, np.int64)
+    i, j = np.concatenate([nobody, *(p.i for p in graph.pairs)]), np.concatenate([nobody, *(p.j for p in graph.pairs)])
+    structure = block_cholesky.analyse(graph.n, i, j)
     seen, damping, reached = _look(graph, start), 0.0, False
     system = _equations(graph, seen)
     while True:
@@ -185,7 +180,10 @@ def _step(structure: block_cholesky.Structure, system: _System, damping: float) 
         axes = np.arange(6)
         diagonal = diagonal.copy()
         diagonal[:, axes, axes] *= 1 + damping
-    factor = block_cholesky.factorise(structure, diagonal, system.off)
+    try:
+        factor = block_cholesky.factorise(structure, diagonal, system.off)
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError("not every pose is held") from None
     poses = factor.solve(-system.gradient)
     if not system.corner:
         return _Step(poses, 0.0, factor, None)
@@ -230,9 +228,9 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
     shared_gradient, off = corner * seen.state.shared, [np.empty((0, 6, 6))]
     for single, residuals in zip(graph.singles, seen.singles, strict=True):
         by_pose = single.derive(seen.state.poses[single.at], residuals)
-        weighted = _turned(by_pose) @ single.information
+        weighted = turned(by_pose) @ single.information
         diagonal += _summed(graph.n, single.at, weighted @ by_pose)
-        gradient += _summed(graph.n, single.at, _times(weighted, residuals))
+        gradient += _summed(graph.n, single.at, times(weighted, residuals))
     for pair, (residuals, i_from_j, weights) in zip(graph.pairs, seen.pairs, strict=True):
         by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
         across = np.empty((len(pair.i), 6, 6))
@@ -240,7 +238,7 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
         _add_pairs(pair.i, pair.j, by_j, information, residuals, i_from_j, diagonal, across, gradient)
         off.append(across)
         if by_shared is not None:
-            informed = _times(information, by_shared)
+            informed = times(information, by_shared)
             _add_border(pair.i, pair.j, by_j, informed, i_from_j, border)
             corner += float(np.sum(informed * by_shared))
             shared_gradient += float(np.sum(informed * residuals))
@@ -299,7 +297,7 @@ def motions(links: Sequence[Link], places: dict[int, int], huber: float | None =
     """What links say of the poses at these places, by number of their nodes."""
     measured = _inverses(np.array([link.i_from_j for link in links]).reshape(-1, 4, 4))
     information = inverses_of(np.array([link.cov for link in links]).reshape(-1, 6, 6))
-    i, j = (np.array([places[link[k]] for link in links], dtype=np.int64) for k in (0, 1))
+    i, j = np.array([(places[link.i], places[link.j]) for link in links], np.int64).reshape(-1, 2).T.copy()
 
     def observe(i_from_j: Array, _: float) -> Array:
         return errors(measured, i_from_j)
@@ -318,8 +316,8 @@ def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
 
 def inverses_of(covs: Array) -> Array:
     """Information of covariances (m, d, d), symmetric to the last bit."""
-    found = np.linalg.inv(covs)
-    return (found + _turned(found)) / 2
+    found = np.asarray(np.linalg.inv(covs), np.float64)
+    return (found + turned(found)) / 2
 
 
 @njit(cache=True, nogil=True)
@@ -355,85 +353,25 @@ def _between(a: Array, b: Array) -> Array:
 
 def _inverses(poses: Array) -> Array:
     found = np.zeros_like(poses)
-    found[:, :3, :3] = _turned(poses[:, :3, :3])
-    found[:, :3, 3] = -_times(found[:, :3, :3], poses[:, :3, 3])
+    found[:, :3, :3] = turned(poses[:, :3, :3])
+    found[:, :3, 3] = -times(found[:, :3, :3], poses[:, :3, 3])
     found[:, 3, 3] = 1.0
     return found
 
 
-def _turned(matrices: Array) -> Array:
+def turned(matrices: Array) -> Array:
     return matrices.transpose(0, 2, 1)
 
 
-def _times(matrices: Array, vectors: Array) -> Array:
+def times(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _squares(residuals: Array, information: Array) -> Array:
-    return np.sum(residuals * _times(information, residuals), axis=1)
+    return np.sum(residuals * times(information, residuals), axis=1)
 
 
 def _summed(n: int, at: Indices, values: Array) -> Array:
     """(n, ...) sums of the values (m, ...) that belong to each."""
     picks = sparse.csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(n, len(at)))
     return (picks @ values.reshape(len(at), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])
-
-
-class Solved(NamedTuple):
-    """Poses (4, 4) by number, and the value of F."""
-
-    poses: dict[int, Array]
-    cost: float
-
-
-def solve(links: Sequence[Link], start: dict[int, Array] | None = None, huber: float | None = None) -> Solved:
-    """Solves a pose graph; its lowest number stays where it starts.
-
-    Args:
-        links: measured motions, every pose held by them.
-        start: (4, 4) pose of every number; by the chordal start, from the identity, if None.
-        huber: residual [standard deviations] from which a link counts linearly; least squares if None.
-    """
-    start = chordal_start(links) if start is None else start
-    numbers = sorted(start)
-    poses = np.array([start[number] for number in numbers])
-    held = given([0], poses[:1], np.eye(6)[None] * _HELD_SIGMA**2)
-    places = {number: k for k, number in enumerate(numbers)}
-    found = optimise(Graph(len(poses), [held], [motions(links, places, huber)]), State(poses))
-    return Solved(dict(zip(numbers, found.state.poses, strict=True)), found.cost)
-
-
-def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
-    """Poses (4, 4) to start from, found from the links alone; the lowest number is at the identity.
-
-    Of rotations, R_j = R_i R_ij as of any matrices, by least squares; the nearest rotations to what that gives; then
-    positions, p_j = p_i + R_i t_ij. Links weigh by the information of their covariance's mean.
-    """
-    numbers = sorted({number for link in links for number in link[:2]})
-    places = {number: k for k, number in enumerate(numbers)}
-    motion, cov = (np.array([link[k] for link in links]) for k in (2, 3))
-    i, j = (np.array([places[link[k]] for link in links]) for k in (0, 1))
-    of_turns, of_ways = (3 / np.trace(cov[:, a : a + 3, a : a + 3], axis1=1, axis2=2) for a in (0, 3))
-    turns, nothing = _turned(motion[:, :3, :3]), np.zeros((len(links), 3, 3))
-    u, _, v = np.linalg.svd(_turned(_least_squares(i, j, turns, nothing, np.eye(3), of_turns)))
-    u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, :3] = u @ v
-    ways = _times(poses[i, :3, :3], motion[:, :3, 3])[:, None]
-    poses[:, :3, 3] = _least_squares(i, j, np.ones((len(links), 1, 1)), ways, np.zeros((1, 3)), of_ways)[:, 0]
-    return dict(zip(numbers, poses, strict=True))
-
-
-def _least_squares(i: Indices, j: Indices, by_i: Array, right: Array, first: Array, weights: Array) -> Array:
-    """(n, d, 3) the x that best keep x_j = by_i x_i + right, of (m, d, d) and (m, d, 3), with x_0 = first (d, 3)."""
-    m, d, _ = right.shape
-    row = np.arange(m * d).reshape(m, d)
-    column_i, column_j = (d * k[:, None] + np.arange(d) for k in (i, j))
-    entries = np.concatenate([np.ones(m * d), -by_i.ravel()])
-    rows = np.concatenate([row.ravel(), np.repeat(row, d, axis=1).ravel()])
-    columns = np.concatenate([column_j.ravel(), np.repeat(column_i[:, None], d, axis=1).ravel()])
-    matrix = sparse.csc_array((entries, (rows, columns)), shape=(m * d, columns.max() + 1))
-    known, free = matrix[:, :d], matrix[:, d:]
-    weighted = free.T @ sparse.diags_array(np.repeat(weights, d))
-    rest = splu((weighted @ free).tocsc()).solve(weighted @ (right.reshape(-1, 3) - known @ first))
-    return np.concatenate([first, rest]).reshape(-1, d, 3)
