@@ -25,37 +25,32 @@ def compiled_functions():
     return list(found.values())
 
 
-FUNCTIONS = compiled_functions()
-FREE = [function for function in FUNCTIONS if function.targetoptions.get("fastmath")]
-
-
 def name_of(function):
     return f"{function.py_func.__module__}.{function.py_func.__name__}"
 
 
-def callers(function):
-    """Names of the compiled functions that call this one."""
-    name = function.py_func.__name__
-    return [name_of(other) for other in FUNCTIONS if name in other.py_func.__code__.co_names and other is not function]
+def free_sums(functions):
+    """Those whose sums may take any order: for each, whether it is part of who calls it, and who does."""
+    for function in functions:
+        options, name = function.targetoptions, function.py_func.__name__
+        if options.get("fastmath"):
+            inlined = options.get("forceinline", False) or options.get("inline") == "always"
+            others = [f for f in functions if name in f.py_func.__code__.co_names and f is not function]
+            yield name_of(function), inlined, [name_of(other) for other in others]
 
 
-@pytest.mark.parametrize("function", FREE, ids=name_of)
-def test_sums_in_free_order_are_part_of_who_calls_them(function):
+def test_sums_in_free_order_are_part_of_who_calls_them():
     """Where fastmath leaves the order of a sum open, each copy of a function may take another.
 
     A function that others call is compiled by itself and again into each of them. Which copy a call reaches is whose
     code was loaded first: in the process that compiles another than in those that read the cache, and images differed
     in the last bit, paths by 0.6 mm. Put into its callers it has no copy to be mistaken for.
     """
-    options = function.targetoptions
-    inlined = options.get("forceinline") or options.get("inline") == "always"
-    assert inlined or not callers(function), f"{name_of(function)} wants forceinline=True: {callers(function)} call it"
-
-
-def test_functions_with_sums_in_free_order_are_found_with_their_callers():
-    assert {name_of(function) for function in FREE} >= {"twin.imaging.shading.shade", "twin.imaging.shading._shine"}
-    shine = next(function for function in FREE if function.py_func.__name__ == "_shine")
-    assert callers(shine) == ["twin.imaging.shading.shade"]
+    found = {name: (inlined, callers) for name, inlined, callers in free_sums(compiled_functions())}
+    assert found["twin.imaging.shading._shine"] == (True, ["twin.imaging.shading.shade"])
+    assert found["twin.imaging.shading.shade"] == (False, [])
+    wrong = [name for name, (inlined, callers) in found.items() if callers and not inlined]
+    assert not wrong, f"want forceinline=True, as others call them: {', '.join(wrong)}"
 
 
 @pytest.mark.slow

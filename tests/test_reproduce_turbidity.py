@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from twin.reproduce import turbidity
+from twin.reproduce import turbidity, turbidity_sheet
 from twin.reproduce.block import BLOCK_M, CORE_M, HEIGHT_M, block_on_sand
 from twin.reproduce.turbidity import SETTINGS, climb, contrast_left, table, write
 from twin.scenario_file import load_scenario
@@ -35,7 +35,8 @@ def test_without_backscatter_contrast_is_what_was_never_scattered_forward():
 
 
 def test_the_ladder_is_climbed_and_drawn(tmp_path, monkeypatch):
-    monkeypatch.setattr(turbidity, "RANGES_M", np.array([0.5, 1.0, 3.0, 8.0]))
+    for module in (turbidity, turbidity_sheet):
+        monkeypatch.setattr(module, "RANGES_M", np.array([0.5, 1.0, 3.0, 8.0]))
     levels = climb((0.0, 4.0), SMALL)
     told = write(levels, tmp_path / "below")
     picture = cv2.imread(str(tmp_path / "below" / "turbidity.png"))
