@@ -63,11 +63,9 @@ class Structure(NamedTuple):
         return int(self.panel_of[below[0]]) if len(below) else None
 
     def columns(self, panel: int, places: Indices) -> Indices:
-        """Where these places lie among a panel's nodes and those below it, number by number."""
+        """Where these places lie among a panel's nodes and those below it."""
         first, end = self.first[panel], self.first[panel + 1]
-        after = end - first + np.searchsorted(self.below_of(panel), places)
-        blocks = np.where(places < end, places - first, after)
-        return (_D * blocks[:, None] + np.arange(_D)).ravel()
+        return np.where(places < end, places - first, end - first + np.searchsorted(self.below_of(panel), places))
 
 
 def analyse(n: int, i: Indices, j: Indices) -> Structure:
@@ -193,8 +191,7 @@ class Factor(NamedTuple):
         joint = np.empty((own + len(rest), own + len(rest)))
         joint[:own, :own] = inverse.T @ inverse
         if above is not None and of_above is not None:
-            known = self.structure.columns(above, self.structure.below_of(panel))
-            joint[own:, own:] = of_above.take(known, 0).take(known, 1)
+            _pick(of_above, self.structure.columns(above, self.structure.below_of(panel)), joint[own:, own:])
             weight = rest @ inverse
             joint[own:, :own] = -joint[own:, own:] @ weight
             joint[:own, own:] = joint[own:, :own].T
@@ -282,6 +279,17 @@ def _invert_root(matrix, whole, inverse):
             inverse[i, m] *= per_pivot
         inverse[i, i] = per_pivot
     return True
+
+
+@njit(cache=True, nogil=True)
+def _pick(matrix, blocks, out):
+    """Fills `out` with rows and columns of these blocks of a matrix."""
+    for a in range(len(blocks)):
+        for i in range(_D):
+            row, into = matrix[_D * blocks[a] + i], out[_D * a + i]
+            for b in range(len(blocks)):
+                for j in range(_D):
+                    into[_D * b + j] = row[_D * blocks[b] + j]
 
 
 @njit(cache=True, nogil=True)
