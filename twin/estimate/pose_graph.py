@@ -225,7 +225,8 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
     """Normal equations of all residuals."""
     diagonal, gradient, border = np.zeros((graph.n, 6, 6)), np.zeros((graph.n, 6)), np.zeros((graph.n, 6))
     corner = 0.0 if graph.shared_sigma is None else graph.shared_sigma**-2
-    shared_gradient, off = corner * seen.state.shared, [np.empty((0, 6, 6))]
+    shared_gradient = corner * seen.state.shared
+    off, done = np.empty((sum(len(pair.i) for pair in graph.pairs), 6, 6)), 0
     for single, residuals in zip(graph.singles, seen.singles, strict=True):
         by_pose = single.derive(seen.state.poses[single.at], residuals)
         weighted = turned(by_pose) @ single.information
@@ -233,20 +234,18 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
         gradient += _summed(graph.n, single.at, times(weighted, residuals))
     for pair, (residuals, i_from_j, weights) in zip(graph.pairs, seen.pairs, strict=True):
         by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
-        across = np.empty((len(pair.i), 6, 6))
-        information = weights[:, None, None] * pair.information
-        _add_pairs(pair.i, pair.j, by_j, information, residuals, i_from_j, diagonal, across, gradient)
-        off.append(across)
+        across, done = off[done : done + len(pair.i)], done + len(pair.i)
+        _add_pairs(pair.i, pair.j, by_j, pair.information, weights, residuals, i_from_j, diagonal, across, gradient)
         if by_shared is not None:
-            informed = times(information, by_shared)
+            informed = weights[:, None] * times(pair.information, by_shared)
             _add_border(pair.i, pair.j, by_j, informed, i_from_j, border)
             corner += float(np.sum(informed * by_shared))
             shared_gradient += float(np.sum(informed * residuals))
-    return _System(diagonal, np.concatenate(off), gradient, border, corner, shared_gradient)
+    return _System(diagonal, off, gradient, border, corner, shared_gradient)
 
 
 @njit(cache=True, nogil=True)
-def _add_pairs(first, second, by_j, information, residuals, i_from_j, diagonal, across, gradient):
+def _add_pairs(first, second, by_j, information, weights, residuals, i_from_j, diagonal, across, gradient):
     """Adds the normal equations of pairs to blocks and gradient of both their poses, and fills the blocks between.
 
     A motion d of i is one of -Ad(j_from_i) d of j.
@@ -260,7 +259,7 @@ def _add_pairs(first, second, by_j, information, residuals, i_from_j, diagonal, 
             for k in range(n):
                 half[a, k] = 0.0
                 for b in range(n):
-                    half[a, k] += derivative[b, a] * information[m, b, k]
+                    half[a, k] += weights[m] * derivative[b, a] * information[m, b, k]
                 slope[a] += half[a, k] * residuals[m, k]
             for b in range(a + 1):
                 total = 0.0
@@ -317,7 +316,9 @@ def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
 def inverses_of(covs: Array) -> Array:
     """Information of covariances (m, d, d), symmetric to the last bit."""
     found = np.asarray(np.linalg.inv(covs), np.float64)
-    return (found + turned(found)) / 2
+    found = found + turned(found)
+    found /= 2
+    return found
 
 
 @njit(cache=True, nogil=True)
