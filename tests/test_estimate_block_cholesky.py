@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.estimate import block_cholesky
+from twin.estimate import block_cholesky, elimination
 
 
 def normal_equations(rng, n, i, j):
@@ -53,7 +53,7 @@ NETWORKS = {
 def factored(request):
     n, (i, j) = NETWORKS[request.param]
     diagonal, off, dense = normal_equations(np.random.default_rng(1), n, i, j)
-    return block_cholesky.factorise(block_cholesky.analyse(n, i, j), diagonal, off), dense
+    return block_cholesky.factorise(elimination.analyse(n, i, j), diagonal, off), dense
 
 
 def test_a_system_is_solved_as_dense_algebra_does(factored):
@@ -75,7 +75,7 @@ def test_marginals_are_blocks_of_the_dense_inverse(factored):
 def test_no_block_is_kept_that_a_raster_does_not_need():
     """Least degree on a raster of legs: a small part of the dense triangle."""
     n, (i, j) = 1200, raster(20, 60)
-    structure = block_cholesky.analyse(n, i, j)
+    structure = elimination.analyse(n, i, j)
     assert structure.at[-1] / 36 < 0.03 * n * (n + 1) / 2
 
 
@@ -84,7 +84,7 @@ def test_nodes_that_nothing_ties_together_are_factored_side_by_side():
     diagonal, off, dense = normal_equations(np.random.default_rng(3), 4, i, j)
     diagonal[2] += np.eye(6)
     dense[12:18, 12:18] += np.eye(6)
-    factor = block_cholesky.factorise(block_cholesky.analyse(4, i, j), diagonal, off)
+    factor = block_cholesky.factorise(elimination.analyse(4, i, j), diagonal, off)
     np.testing.assert_allclose(factor.marginal(3), np.linalg.inv(dense)[18:, 18:], rtol=1e-9)
 
 
@@ -95,7 +95,7 @@ def test_a_network_that_nothing_holds_is_told(free):
     off = np.tile(-np.eye(6), (n - 1, 1, 1))
     diagonal = np.tile(2 * np.eye(6), (n, 1, 1))
     diagonal[[0, -1]] = np.eye(6)
-    structure = block_cholesky.analyse(n, i, j)
+    structure = elimination.analyse(n, i, j)
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         block_cholesky.factorise(structure, diagonal, off)
     diagonal[free] += 1e-6 * np.eye(6)

@@ -1,8 +1,7 @@
 """Cholesky factors of a sparse symmetric matrix of 6 x 6 blocks, and as much of its inverse as they tell.
 
-Supernodal and right-looking (Davis 2006, chapter 4): nodes that follow one another in the elimination with the same
-nodes after them share a panel, a dense matrix. A panel that is done subtracts its square from the panels after it, so
-that beside the panels nothing is kept. The order is the least degree that SuperLU finds.
+Supernodal and right-looking (Davis 2006, chapter 4): a panel of nodes that is done subtracts its square from the panels
+after it, so that beside the panels nothing is kept.
 
 Marginals by Takahashi et al. (1973): from the last panel back, of W = L2 L1^-1 with L1 the panel's triangle, L2 the
 rows below it, cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. What is below is in the
@@ -12,123 +11,16 @@ panel of the first node below, or below that.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
+from twin.estimate.elimination import BLOCK as _D
+from twin.estimate.elimination import Structure
 from twin.geometry import Array
 
-Indices = NDArray[np.int64]
-
-_D = 6  # of a block
-_WIDEST = 12  # nodes of a panel: its triangle is inverted by plain loops
-_ZEROS = 8  # blocks that a node may bring into a panel for nothing
 _LEAST_PIVOT = 1e-13  # of what stood on the diagonal: less is rounding, the node is not held
-
-
-class Structure(NamedTuple):
-    """Where everything lies, of one pattern; places count nodes in the order of their elimination.
-
-    Args:
-        place: (n,) of each node.
-        first: (s + 1,) first place of each panel.
-        below, rows: places below panel s are rows[below[s] : below[s + 1]], rising.
-        at: (s + 1,) where panels begin in one long array; (own + below, own) blocks each, row by row.
-        panel_of: (n,) by place.
-        pairs: (m, 2) row and column of each block off the diagonal, by place, the row later.
-        turned: (m,) which of them are given the other way round.
-    """
-
-    place: Indices
-    first: Indices
-    below: Indices
-    rows: Indices
-    at: Indices
-    panel_of: Indices
-    pairs: Indices
-    turned: NDArray[np.bool_]
-
-    def below_of(self, panel: int) -> Indices:
-        """Places below a panel, rising."""
-        return self.rows[self.below[panel] : self.below[panel + 1]]
-
-    def above(self, panel: int) -> int | None:
-        """The panel of the first node below: eliminated later, it knows of all others below."""
-        below = self.below_of(panel)
-        return int(self.panel_of[below[0]]) if len(below) else None
-
-    def columns(self, panel: int, places: Indices) -> Indices:
-        """Where these places lie among a panel's nodes and those below it."""
-        first, end = self.first[panel], self.first[panel + 1]
-        return np.where(places < end, places - first, end - first + np.searchsorted(self.below_of(panel), places))
-
-
-def analyse(n: int, i: Indices, j: Indices) -> Structure:
-    """The structure of a matrix of n x n blocks with blocks (i, j) (m,) off the diagonal; a pair may come twice."""
-    place = _least_degree(n, i, j)
-    panels = _panels(n, np.minimum(place[i], place[j]).tolist(), np.maximum(place[i], place[j]).tolist())
-    again = np.empty(n, np.int64)  # a panel's nodes one after the other
-    again[[node for own, _ in panels for node in own]] = np.arange(n)
-    place = again[place]
-    first = np.cumsum([0] + [len(own) for own, _ in panels])
-    rows = [np.sort(again[list(after)]) for _, after in panels]
-    below = np.cumsum([0] + [len(row) for row in rows])
-    width = np.diff(first)
-    at = np.cumsum(np.append(0, _D * _D * width * (width + np.diff(below))))
-    pairs = np.column_stack([np.maximum(place[i], place[j]), np.minimum(place[i], place[j])])
-    panel_of = np.repeat(np.arange(len(panels)), width)
-    every_row = np.concatenate([np.empty(0, np.int64), *rows])
-    return Structure(place, first, below, every_row, at, panel_of, pairs, place[i] < place[j])
-
-
-def _least_degree(n: int, i: Indices, j: Indices) -> Indices:
-    """(n,) place of each node in the order of least degree."""
-    off = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
-    pattern = ((off + off.T) > 0).astype(np.float64)
-    dominant = sparse.diags_array(np.asarray(pattern.sum(axis=1)).ravel() + 1.0)
-    found = splu((pattern + dominant).tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
-    return found.perm_c.astype(np.int64)
-
-
-def _panels(n: int, early: Sequence[int], late: Sequence[int]) -> list[tuple[list[int], set[int]]]:
-    """Nodes of each panel and those below it, of pairs of nodes in an order of elimination.
-
-    A panel comes right after all that it is above of: so few joint covariances are needed at a time.
-    """
-    after: list[set[int]] = [set() for _ in range(n)]
-    for a, b in zip(early, late, strict=True):
-        after[a].add(b)
-    parent = [-1] * n
-    for node in range(n):
-        if after[node]:
-            parent[node] = min(after[node])
-            after[parent[node]] |= after[node]
-            after[parent[node]].discard(parent[node])
-    panels: list[list[int]] = []
-    home = [0] * n
-    for node in reversed(range(n)):
-        above = panels[home[parent[node]]] if parent[node] >= 0 else []
-        follows = above and above[-1] == parent[node] and len(above) < _WIDEST
-        if follows and len(above) + len(after[above[0]]) - len(after[node]) <= _ZEROS:
-            home[node] = home[parent[node]]
-            above.append(node)
-        else:
-            home[node] = len(panels)
-            panels.append([node])
-    under: list[list[int]] = [[] for _ in panels]
-    roots: list[int] = []
-    for panel, own in enumerate(panels):
-        (under[home[parent[own[0]]]] if parent[own[0]] >= 0 else roots).append(panel)
-    last_to_first, waiting = [], roots
-    while waiting:
-        last_to_first.append(panels[waiting.pop()])
-        waiting += under[home[last_to_first[-1][0]]]
-    return [(own[::-1], after[own[0]]) for own in reversed(last_to_first)]
 
 
 class Factor(NamedTuple):
@@ -142,7 +34,7 @@ class Factor(NamedTuple):
         s = self.structure
         x = np.empty_like(right)
         x[s.place] = right
-        _substitute(s.first, s.below, s.rows, s.at, self.panels, x.reshape(-1))
+        _substitute(s, self.panels, x.reshape(-1))
         return x[s.place]
 
     def marginal(self, node: int) -> Array:
@@ -208,47 +100,47 @@ def factorise(structure: Structure, diagonal: Array, off: Array) -> Factor:
     s = structure
     panels, whole = np.zeros(s.at[-1]), np.empty((len(s.place), _D))
     whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
-    _place(s.place, s.pairs, s.turned, s.first, s.below, s.rows, s.at, s.panel_of, diagonal, off, panels)
-    if not _eliminate(s.first, s.below, s.rows, s.at, s.panel_of, whole.reshape(-1), panels):
+    _place(s, diagonal, off, panels)
+    if not _eliminate(s, whole.reshape(-1), panels):
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     return Factor(structure, panels)
 
 
 @njit(cache=True, nogil=True)
-def _place(place, pairs, turned, first, below, rows, at, panel_of, diagonal, off, panels):
+def _place(s, diagonal, off, panels):
     """Adds the blocks of the matrix to the panels."""
     for k in range(len(diagonal)):
-        p = panel_of[place[k]]
-        width, x = first[p + 1] - first[p], place[k] - first[p]
-        panel = panels[at[p] : at[p + 1]].reshape(-1, _D * width)
+        p = s.panel_of[s.place[k]]
+        width, x = s.first[p + 1] - s.first[p], s.place[k] - s.first[p]
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width)
         panel[_D * x : _D * x + _D, _D * x : _D * x + _D] += diagonal[k]
     for k in range(len(off)):
-        row, column = pairs[k]
-        p = panel_of[column]
-        width, x = first[p + 1] - first[p], column - first[p]
-        y = row - first[p]
+        row, column = s.pairs[k]
+        p = s.panel_of[column]
+        width, x = s.first[p + 1] - s.first[p], column - s.first[p]
+        y = row - s.first[p]
         if y >= width:
-            y = width + np.searchsorted(rows[below[p] : below[p + 1]], row)
-        panel = panels[at[p] : at[p + 1]].reshape(-1, _D * width)
+            y = width + np.searchsorted(s.rows[s.below[p] : s.below[p + 1]], row)
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width)
         for i in range(_D):
             for j in range(_D):
-                panel[_D * y + i, _D * x + j] += off[k, j, i] if turned[k] else off[k, i, j]
+                panel[_D * y + i, _D * x + j] += off[k, j, i] if s.turned[k] else off[k, i, j]
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(first, below, rows, at, panel_of, whole, panels):
+def _eliminate(s, whole, panels):
     """Turns each panel into L1^-1 over L2; whether every node is held, by the diagonal (6 n,) as it was."""
-    for p in range(len(first) - 1):
-        n = _D * (first[p + 1] - first[p])
-        panel = panels[at[p] : at[p + 1]].reshape(-1, n)
+    for p in range(len(s.first) - 1):
+        n = _D * (s.first[p + 1] - s.first[p])
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, n)
         inverse = np.zeros((n, n))
-        if not _invert_root(panel[:n], whole[_D * first[p] : _D * first[p + 1]], inverse):
+        if not _invert_root(panel[:n], whole[_D * s.first[p] : _D * s.first[p + 1]], inverse):
             return False
         panel[:n] = inverse
         if len(panel) > n:
             panel[n:] = np.dot(panel[n:], inverse.T)
             square = np.dot(panel[n:], panel[n:].T)
-            _subtract(square, rows[below[p] : below[p + 1]], first, below, rows, at, panel_of, panels)
+            _subtract(square, s.rows[s.below[p] : s.below[p + 1]], s, panels)
     return True
 
 
@@ -293,23 +185,23 @@ def _pick(matrix, blocks, out):
 
 
 @njit(cache=True, nogil=True)
-def _subtract(square, places, first, below, rows, at, panel_of, panels):
+def _subtract(square, places, s, panels):
     """Takes what a panel's square says of the places below it from the panels that have them."""
     start = 0
     while start < len(places):
-        p = panel_of[places[start]]
-        width, end = first[p + 1] - first[p], start
-        while end < len(places) and places[end] < first[p + 1]:
+        p = s.panel_of[places[start]]
+        width, end = s.first[p + 1] - s.first[p], start
+        while end < len(places) and places[end] < s.first[p + 1]:
             end += 1
-        panel, row = panels[at[p] : at[p + 1]].reshape(-1, _D * width), below[p]
+        panel, row = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width), s.below[p]
         for b in range(start, len(places)):
-            y = places[b] - first[p]
+            y = places[b] - s.first[p]
             if y >= width:
-                while rows[row] != places[b]:
+                while s.rows[row] != places[b]:
                     row += 1
-                y = width + row - below[p]
+                y = width + row - s.below[p]
             for a in range(start, min(b + 1, end)):
-                x = places[a] - first[p]
+                x = places[a] - s.first[p]
                 for i in range(_D):
                     for j in range(_D):
                         panel[_D * y + i, _D * x + j] -= square[_D * b + i, _D * a + j]
@@ -317,23 +209,23 @@ def _subtract(square, places, first, below, rows, at, panel_of, panels):
 
 
 @njit(cache=True, nogil=True)
-def _substitute(first, below, rows, at, panels, x):
+def _substitute(s, panels, x):
     """Solves in place, x (6 n,) by place: forwards by L, backwards by its transpose."""
-    for p in range(len(first) - 1):
-        own = x[_D * first[p] : _D * first[p + 1]]
-        panel = panels[at[p] : at[p + 1]].reshape(-1, len(own))
+    for p in range(len(s.first) - 1):
+        own = x[_D * s.first[p] : _D * s.first[p + 1]]
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, len(own))
         own[:] = np.dot(panel[: len(own)], own)
         if len(panel) > len(own):
             known = np.dot(panel[len(own) :], own)
-            for k in range(below[p], below[p + 1]):
+            for k in range(s.below[p], s.below[p + 1]):
                 for i in range(_D):
-                    x[_D * rows[k] + i] -= known[_D * (k - below[p]) + i]
-    for p in range(len(first) - 2, -1, -1):
-        own = x[_D * first[p] : _D * first[p + 1]]
-        panel = panels[at[p] : at[p + 1]].reshape(-1, len(own))
+                    x[_D * s.rows[k] + i] -= known[_D * (k - s.below[p]) + i]
+    for p in range(len(s.first) - 2, -1, -1):
+        own = x[_D * s.first[p] : _D * s.first[p + 1]]
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, len(own))
         if len(panel) > len(own):
             later = np.empty(len(panel) - len(own))
-            for k in range(below[p], below[p + 1]):
-                later[_D * (k - below[p]) : _D * (k - below[p]) + _D] = x[_D * rows[k] : _D * rows[k] + _D]
+            for k in range(s.below[p], s.below[p + 1]):
+                later[_D * (k - s.below[p]) : _D * (k - s.below[p]) + _D] = x[_D * s.rows[k] : _D * s.rows[k] + _D]
             own -= np.dot(panel[len(own) :].T, later)
         own[:] = np.dot(panel[: len(own)].T, own)

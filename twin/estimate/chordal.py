@@ -13,7 +13,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from twin.estimate.pose_graph import Graph, Indices, State, given, motions, optimise, times, turned
+from twin.estimate.elimination import Indices
+from twin.estimate.pose_graph import Graph, State, given, motions, optimise, times, turned
 from twin.geometry import Array
 from twin.records import Link
 

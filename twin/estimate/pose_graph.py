@@ -15,15 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy import sparse
 
 from twin import geometry
-from twin.estimate import block_cholesky
+from twin.estimate import block_cholesky, elimination
+from twin.estimate.elimination import Indices
 from twin.geometry import Array
 from twin.records import Link
-
-Indices = NDArray[np.int64]
 
 #: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
@@ -147,7 +145,7 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
     """
     nobody = np.empty(0, np.int64)
     i, j = np.concatenate([nobody, *(p.i for p in graph.pairs)]), np.concatenate([nobody, *(p.j for p in graph.pairs)])
-    structure = block_cholesky.analyse(graph.n, i, j)
+    structure = elimination.analyse(graph.n, i, j)
     seen, damping, reached = _look(graph, start), 0.0, False
     system = _equations(graph, seen)
     while True:
@@ -173,7 +171,7 @@ class _Step(NamedTuple):
     border: tuple[Array, float] | None
 
 
-def _step(structure: block_cholesky.Structure, system: _System, damping: float) -> _Step:
+def _step(structure: elimination.Structure, system: _System, damping: float) -> _Step:
     """Solves the bordered equations by the block below the corner."""
     diagonal = system.diagonal
     if damping:
