@@ -14,9 +14,10 @@ from controllers.tracking import body_reference, commanded_velocity
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin import config, geometry
 from twin.simulate.autopilot import nominal_pilot, top_speed_mps
+from twin.simulate.hull import hull_of
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
-from twin.simulate.vehicle import Vehicle, hull_of
+from twin.simulate.vehicle import Vehicle
 
 RATE_HZ = 30.0
 LEVER_M = np.array([0.0, 0.075, -0.15])

@@ -9,8 +9,8 @@ import pytest
 
 from twin import geometry
 from twin.mission import prepare
+from twin.rendered_sea import RenderedSea
 from twin.scenario_file import load_scenario
-from twin.sea import RenderedSea
 from twin.timing import Stopwatch
 
 LARGE = ("rig.image_width_px=640", "rig.image_height_px=480")

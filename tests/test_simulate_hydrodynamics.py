@@ -9,8 +9,9 @@ from twin import geometry
 from twin.config import Vehicle as Section
 from twin.errors import SurveyAborted
 from twin.simulate.free_body import FreeBody
+from twin.simulate.hull import hull_of, physics_timestep_s
 from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
-from twin.simulate.vehicle import Vehicle, hull_of, physics_timestep_s
+from twin.simulate.vehicle import Vehicle
 
 STEP_S = 1 / 120
 HULL = hull_of(Section(buoyancy_n=0.0))

@@ -1,5 +1,7 @@
 """The surrogate: rays, what key points show, drawn measurements, and a calibration that finds where they came from."""
 
+import subprocess
+import sys
 from collections import defaultdict
 from itertools import pairwise
 
@@ -394,3 +396,18 @@ def test_where_the_physics_diverges_frames_at_once_end_and_say_so():
         with pytest.raises(SurveyAborted, match="the physics diverged at"):
             glide(course, 1, 1)
         assert len(sea) == len(navigator.times_s) == 2  # the frame that showed it is kept
+
+
+def test_a_survey_for_its_figures_loads_nothing_that_draws(tmp_path):
+    """A worker of a study holds what it needs: MuJoCo, OpenGL and what draws pictures are 100 MB."""
+    line = f"""
+import sys
+from pathlib import Path
+from twin import survey
+from twin.scenario_file import load_scenario
+result = survey.run(load_scenario("quickstart", {SHORT!r}), Path({str(tmp_path / "run")!r}), shows=None)
+assert result.status == "complete"
+print(*(name for name in ("mujoco", "OpenGL", "matplotlib", "rerun", "rasterio", "trimesh") if name in sys.modules))
+"""
+    done = subprocess.run([sys.executable, "-c", line], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

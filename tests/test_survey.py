@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin import records, scenario_file, sea, survey
+from twin import records, rendered_sea, scenario_file, survey
 from twin.errors import ScenarioError, SurveyAborted
 from twin.mission import prepare
 from twin.timing import Stopwatch
@@ -70,7 +70,7 @@ def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
 def first_frame(*overrides):
     """What a survey's first key point sees and reads."""
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, *overrides]))
-    with sea.RenderedSea(mission, Stopwatch()) as world:
+    with rendered_sea.RenderedSea(mission, Stopwatch()) as world:
         return world.observe(next(step for step in mission.fly(1) if step.key_point), 1)
 
 
@@ -100,7 +100,7 @@ def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
     mission, watch = prepare(scenario), Stopwatch()
     recorder = Recorder(survey.make_navigator(mission, survey.image_vision(mission, tmp_path / "first", watch), watch))
-    with sea.RenderedSea(mission, watch) as world:
+    with rendered_sea.RenderedSea(mission, watch) as world:
         survey.fly(mission, world, recorder, lambda *_: None)
     first = recorder.navigator.finish()
 
@@ -138,7 +138,7 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
     images = survey.image_vision(mission, tmp_path, Stopwatch())
     navigator, estimates = survey.make_navigator(mission, images, Stopwatch()), []
-    with sea.RenderedSea(mission, Stopwatch()) as world:
+    with rendered_sea.RenderedSea(mission, Stopwatch()) as world:
         survey.fly(mission, world, navigator, lambda _, estimate, __: estimates.append(estimate))
         true = world.truth().trajectory
     result = navigator.finish()

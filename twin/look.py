@@ -14,7 +14,7 @@ from twin.imaging.camera import Anatomy, Shot
 from twin.imaging.renderer import NEAR_M
 from twin.judge.wording import DASH, percent
 from twin.mission import Mission
-from twin.sea import RenderedSea
+from twin.rendered_sea import RenderedSea
 from twin.timing import Stopwatch
 
 #: Side of the window in which contrast is told, as a share of the image's width.

@@ -5,28 +5,25 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-import scenes.builder
 from twin import geometry
 from twin.estimate.pipeline import Navigator
 from twin.estimate.vision import Vision
 from twin.geometry import Array
-from twin.imaging.camera import StereoCamera
-from twin.imaging.light import Light
-from twin.imaging.renderer import Renderer
-from twin.judge.coverage import Coverage, true_heights
+from twin.judge.coverage import true_heights
 from twin.mission import Course, Mission, Step
 from twin.pilot import PilotOfEstimates
 from twin.records import Frame, Image, Rows, Trajectory, Truth
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
 from twin.simulate.sensors import NavigationSensors
-from twin.simulate.vehicle import Vehicle, physics_timestep_s
+
+if TYPE_CHECKING:
+    from twin.simulate.vehicle import Vehicle
 
 #: Streams of randomness, in this order for ever: a draw of one never depends on another.
 _STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
@@ -128,44 +125,6 @@ class Sea(ABC):
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
         )
-
-
-class RenderedSea(Sea):
-    """Rendered by MuJoCo and lit by the project's own optics; it holds a GL context."""
-
-    def __init__(self, mission: Mission, watch: Watch):
-        scenario, view = mission.scenario, mission.view
-        rig, rng = view.rig, streams(scenario.seed)
-        vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
-        world = scenes.builder.build(
-            mission.terrain, rig.width_px, rig.height_px, vfov_deg, rig.baseline_m, rig.body_from_camera,
-            physics_timestep_s(rig.frame_rate_hz), [lamp.position_m for lamp in scenario.lamps],
-        )  # fmt: skip
-        vehicle = (
-            Vehicle(world, scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body)
-            if scenario.vehicle.dynamics == "rigid"
-            else Carrier(mission.start_of_body)
-        )
-        noise, believed = scenario.believed_noise(), mission.rig
-        super().__init__(
-            mission, watch, vehicle, NavigationSensors(scenario.navigation, noise, believed, rng, view.project)
-        )
-        self.renderer = Renderer(world, rig.width_px, rig.height_px, vfov_deg)
-        light = Light(scenario, mission.terrain, rng["snow"], rig)
-        self.camera = StereoCamera(self.renderer, light, scenario, rng["left_eye"], rng["right_eye"], watch, view)
-        self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m))
-
-    def close(self) -> None:
-        self.renderer.close()
-
-    def look(self, step: Step) -> Sight:
-        shot = self.camera.shoot(self.world_from_camera, step.key_point, self.vehicle.twist_body)
-        if shot.depth_right is not None:
-            self.coverage.add(self.world_from_camera, shot.depth_left, shot.depth_right)
-        return Sight(shot.left, shot.right, lambda: shot.depth_left)
-
-    def seen(self) -> NDArray[np.bool_]:
-        return self.coverage.seen
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:

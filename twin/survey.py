@@ -16,7 +16,7 @@ from twin.pilot import make_pilot
 from twin.records import Estimate
 from twin.results import RunResult, conclude
 from twin.run_writer import PICTURES, RunFolder
-from twin.sea import RenderedSea, Sea, Watch
+from twin.sea import Sea, Watch
 from twin.timing import Stopwatch
 
 _PATIENCE_S = 2.0  # without vision for longer, the vehicle is lost
@@ -88,6 +88,8 @@ def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Ste
 def open_sea(mission: Mission, watch: Stopwatch) -> Sea:
     """The world of a mission, as real as its scenario asks."""
     if mission.scenario.imaging.fidelity == "rendered":
+        from twin.rendered_sea import RenderedSea  # only here: MuJoCo and OpenGL are 25 MB
+
         return RenderedSea(mission, watch)
     from twin.surrogate import calibration
     from twin.surrogate.sea import SurrogateSea

@@ -9,9 +9,9 @@ from controllers.allocation import allocation
 from controllers.tracking import HullModel, Pilot
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin import config
+from twin.simulate.hull import hull_of
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
-from twin.simulate.vehicle import hull_of
 
 Array = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin import config, geometry
 from twin.errors import SurveyAborted
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_of_free_joint
 from twin.simulate.thrusters import LaggedThrusters, Thrusters, pass_step, set_command, wrench_of
-from twin.simulate.vehicle import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 
 Array = NDArray[np.float64]
 

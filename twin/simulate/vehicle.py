@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import Protocol
 
@@ -13,14 +12,11 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from scenes.gl import MjModel, mujoco
 from twin import config, geometry
 from twin.errors import SurveyAborted
-from twin.simulate.hydrodynamics import Hull, angular_first, free_joint_acceleration, twist_of_free_joint
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
+from twin.simulate.hydrodynamics import free_joint_acceleration, twist_of_free_joint
 from twin.simulate.thrusters import LaggedThrusters
 
 Array = NDArray[np.float64]
-
-COARSEST_STEP_S = 1 / 120
-GRAVITY_MPS2 = 9.81
-SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far beyond anything that swims: the physics has diverged
 
 
 class HasModel(Protocol):
@@ -28,26 +24,6 @@ class HasModel(Protocol):
 
     @property
     def model(self) -> MjModel: ...
-
-
-def physics_timestep_s(frame_rate_hz: float) -> float:
-    """The longest step up to 1/120 s of which a whole number makes a frame."""
-    return 1 / (frame_rate_hz * math.ceil(1 / (frame_rate_hz * COARSEST_STEP_S) - 1e-9))
-
-
-def hull_of(vehicle: config.Vehicle) -> Hull:
-    """The trimmed hull of a scenario."""
-    rov = BLUEROV2_HEAVY
-    weight_n = rov.mass_kg * GRAVITY_MPS2
-    return Hull(
-        inertia=np.array([*rov.inertia_kgm2, rov.mass_kg, rov.mass_kg, rov.mass_kg]),
-        added=vehicle.added_mass_factor * angular_first(rov.added_mass),
-        linear_drag=vehicle.drag_factor * angular_first(rov.linear_damping),
-        quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_damping),
-        centre_of_buoyancy_m=np.array(rov.centre_of_buoyancy_m),
-        weight_n=weight_n,
-        buoyancy_n=weight_n + vehicle.buoyancy_n,
-    )
 
 
 class Vehicle:

@@ -10,8 +10,8 @@ from twin import survey
 from twin.config import Scenario
 from twin.errors import SurveyAborted, TwinError
 from twin.mission import Mission, prepare
+from twin.rendered_sea import RenderedSea
 from twin.results import make_map
-from twin.sea import RenderedSea
 from twin.surrogate.calibration import Calibration
 from twin.surrogate.fit import Notes, fitted, misfit
 from twin.surrogate.model import ErrorModel

@@ -15,8 +15,8 @@ from twin.pilot import PilotOfEstimates, RovPilot
 from twin.sea import Glide, Sea, Sight, Watch, streams
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
+from twin.simulate.hull import physics_timestep_s
 from twin.simulate.sensors import NavigationSensors
-from twin.simulate.vehicle import physics_timestep_s
 from twin.surrogate.calibration import Calibration
 from twin.surrogate.chart import Chart
 from twin.surrogate.conditions import Conditions

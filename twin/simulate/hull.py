@@ -1,0 +1,35 @@
+"""Our vehicle as a body in water: its trimmed hull, and the step and the limits of its physics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from scenes.bluerov2 import BLUEROV2_HEAVY
+from twin import config
+from twin.simulate.hydrodynamics import Hull, angular_first
+
+COARSEST_STEP_S = 1 / 120
+GRAVITY_MPS2 = 9.81
+SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far beyond anything that swims: the physics has diverged
+
+
+def physics_timestep_s(frame_rate_hz: float) -> float:
+    """The longest step up to 1/120 s of which a whole number makes a frame."""
+    return 1 / (frame_rate_hz * math.ceil(1 / (frame_rate_hz * COARSEST_STEP_S) - 1e-9))
+
+
+def hull_of(vehicle: config.Vehicle) -> Hull:
+    """The trimmed hull of a scenario."""
+    rov = BLUEROV2_HEAVY
+    weight_n = rov.mass_kg * GRAVITY_MPS2
+    return Hull(
+        inertia=np.array([*rov.inertia_kgm2, rov.mass_kg, rov.mass_kg, rov.mass_kg]),
+        added=vehicle.added_mass_factor * angular_first(rov.added_mass),
+        linear_drag=vehicle.drag_factor * angular_first(rov.linear_damping),
+        quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_damping),
+        centre_of_buoyancy_m=np.array(rov.centre_of_buoyancy_m),
+        weight_n=weight_n,
+        buoyancy_n=weight_n + vehicle.buoyancy_n,
+    )
