@@ -116,6 +116,14 @@ def test_the_chordal_start_is_not_led_astray_by_odometry():
     assert max(off) < 0.05
 
 
+def test_the_chordal_start_is_a_rotation_where_links_average_to_a_reflection():
+    """Half turns about three axes have the mean -I / 3."""
+    turns = [geometry.exp(np.append(np.pi * axis, np.zeros(3))) for axis in np.eye(3)]
+    found = chordal.chordal_start([Link(0, 1, turn, np.eye(6), 1.0, 9) for turn in turns])[1][:3, :3]
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+
+
 def test_the_lowest_number_stays_where_it_starts():
     poses, links = ring(np.random.default_rng(2))
     moved = geometry.exp(np.array([0.3, -0.2, 1.0, 4.0, 5.0, 6.0]))
@@ -216,6 +224,13 @@ def test_a_start_that_leads_gauss_newton_up_ends_at_the_minimum_all_the_same():
     found = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0))
     assert found.reached
     assert found.state.poses[1, 0, 3] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_search_that_ends_damped_tells_the_covariance_of_the_equations_as_they_are():
+    """At 3 m arctan has the slope 1/10; six steps lead up or go nowhere."""
+    found = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0), iterations=6)
+    assert not found.reached and found.state.poses[1, 0, 3] == 3.0
+    assert found.marginal(1)[3, 3] == pytest.approx(1 / (0.1**2 + 1e-6), rel=1e-4)
 
 
 def test_an_unknown_that_all_pairs_share_is_solved_with_the_poses():

@@ -161,10 +161,16 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
         else:
             damping = max(10 * damping, _FIRST_DAMPING)
         if reached or iterations <= 0:
-            return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
+            break
+    if step.damping:  # covariances are those of the equations as they are
+        step = _step(structure, system, 0.0)
+    return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
 
 
 class _Step(NamedTuple):
+    """The solution of damped equations, the factor of the poses' matrix, and the border as `Optimum` has it."""
+
+    damping: float
     poses: Array
     shared: float
     factor: block_cholesky.Factor
@@ -184,11 +190,11 @@ def _step(structure: elimination.Structure, system: _System, damping: float) -> 
         raise np.linalg.LinAlgError("not every pose is held") from None
     poses = factor.solve(-system.gradient)
     if not system.corner:
-        return _Step(poses, 0.0, factor, None)
+        return _Step(damping, poses, 0.0, factor, None)
     by_shared = -factor.solve(system.border)
     information = system.corner + float(np.sum(system.border * by_shared))
     shared = (-system.shared_gradient - float(np.sum(system.border * poses))) / information
-    return _Step(poses + by_shared * shared, shared, factor, (by_shared, information))
+    return _Step(damping, poses + by_shared * shared, shared, factor, (by_shared, information))
 
 
 def _look(graph: Graph, state: State) -> _Seen:
@@ -359,10 +365,12 @@ def _inverses(poses: Array) -> Array:
 
 
 def turned(matrices: Array) -> Array:
+    """Each of matrices (m, a, b) transposed, a view."""
     return matrices.transpose(0, 2, 1)
 
 
 def times(matrices: Array, vectors: Array) -> Array:
+    """Matrices (m, a, b) times vectors (m, b), one by one: (m, a)."""
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
