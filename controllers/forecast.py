@@ -53,13 +53,13 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     With d = f b / Z the depth noise is sigma_Z = Z^2 / (f b) sigma_d.
     """
     tracks = range(1, plan.n_tracks + 1)
-    key_points = [is_key for track in tracks for _, is_key in plan.frames_of_track(track)]
+    key_points = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
     key_spacing_m = plan.n_frames_per_key * plan.speed_mps / plan.frame_rate_hz
     return Forecast(
         n_frames_per_key=plan.n_frames_per_key,
         keys_per_swath=max(1, round(plan.swath_length_m / key_spacing_m)),
         n_tracks=plan.n_tracks,
-        n_keys=sum(key_points),
+        n_keys=int(key_points.sum()),
         n_frames=len(key_points),
         duration_s=sum(plan.track_duration_s(t) for t in tracks),
         path_m=sum(plan.track_length_m(t) for t in tracks),

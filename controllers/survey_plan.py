@@ -109,13 +109,13 @@ class SurveyPlan:
         """Time to fly a track (from 1), without the station keeping after it."""
         return sum(segment.profile.duration_s for segment in self.paths[track - 1])
 
-    def frames_of_track(self, track: int) -> list[tuple[float, bool]]:
-        """Time since the start of a track (from 1) [s] of each frame and whether it is a key point.
+    def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Time (n,) since the start of a track (from 1) [s] of each frame and whether it is a key point (n,).
 
         Every N-th is one, and the last.
         """
-        last = round(self.track_duration_s(track) * self.frame_rate_hz)
-        return [(k / self.frame_rate_hz, k % self.n_frames_per_key == 0 or k == last) for k in range(last + 1)]
+        frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
+        return frames / self.frame_rate_hz, (frames % self.n_frames_per_key == 0) | (frames == frames[-1])
 
     def reference(self, track: int, time_s: float) -> Reference:
         """Where the left camera shall be at a time since the start of a track (from 1); at rest before and after it."""

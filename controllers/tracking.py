@@ -132,7 +132,7 @@ def commanded(steering, pose, twist, position, velocity, acceleration, yaw):
         pose, twist, position, velocity, acceleration, yaw, steering.hull, steering.gains, steering.integral
     )
     commands, share = share_out(steering.allocation, wrench)
-    steering.integral[:] = _integrated(steering.integral, steering.gains.integral * steering.period_s, error, share < 1)
+    _integrate(steering.integral, steering.gains.integral * steering.period_s, error, share < 1)
     return commands
 
 
@@ -154,14 +154,12 @@ def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, int
 
 
 @njit(cache=True, nogil=True)
-def _integrated(integral, gain, error, saturated):
-    """The integral grown within its limits; while the thrusters saturate it may only shrink (anti-windup)."""
-    result = integral.copy()
+def _integrate(integral, gain, error, saturated):
+    """Lets the integral grow within its limits; while the thrusters saturate it may only shrink (anti-windup)."""
     for k in range(6):
         grown = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
         if not (saturated and abs(grown) > abs(integral[k])):
-            result[k] = grown
-    return result
+            integral[k] = grown
 
 
 @njit(cache=True, nogil=True)

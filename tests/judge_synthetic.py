@@ -17,6 +17,7 @@ from twin.records import (
     Alignment,
     ElevationMap,
     Link,
+    Links,
     MapGrid,
     StereoRig,
     SurveyResult,
@@ -96,7 +97,7 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     estimate[40:48, 60:70] = np.nan
     shade = np.clip(90 + 200 * height + rng.normal(0, 8, height.shape), 0, 255)[..., None] * [1.0, 0.95, 0.8]
     mosaic = np.where(np.isfinite(estimate)[..., None], shade, 0).astype(np.uint8)
-    links = [link_between(poses[keys], i, i + d, rng) for d in (1, 2, 4) for i in range(len(keys) - d)]
+    links = Links(link_between(poses[keys], i, i + d, rng) for d in (1, 2, 4) for i in range(len(keys) - d))
     ends = [int((track[keys] <= t).sum()) for t in (1, 2)]
     result = SurveyResult(
         f2f, online, final, keys, track[keys], np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (len(keys), 1, 1)), links,

@@ -73,7 +73,7 @@ def test_the_images_at_key_points_cover_the_disc(diameter_m, overlap):
     keys = [
         p.reference(track, time_s).position[:2]
         for track in range(1, p.n_tracks + 1)
-        for time_s, is_key in p.frames_of_track(track)
+        for time_s, is_key in zip(*p.frames_of_track(track), strict=True)
         if is_key
     ]
     angle, share = np.random.default_rng(0).uniform(0, [2 * np.pi, 1], (2000, 2)).T
@@ -123,7 +123,7 @@ def test_the_forecast_counts_what_is_flown():
     p = plan(tracks=2)
     numbers = forecast(p, 0.3048, 0.2)
     assert numbers.path_m == pytest.approx(2 * np.pi * 5)
-    assert numbers.n_frames == sum(len(p.frames_of_track(t)) for t in (1, 2))
+    assert numbers.n_frames == sum(len(p.frames_of_track(t)[0]) for t in (1, 2))
     # M counts at cruise speed; both ramps double theirs (0.59 / 0.14 s each), then the start and the end
     assert numbers.n_keys / 2 == pytest.approx(numbers.keys_per_swath + 0.595 / 0.141 * 30 / 16 + 2, abs=1.5)
     assert numbers.overlap_across == pytest.approx(1 - p.swath_spacing_m / p.footprint_m[1])  # the shorter side

@@ -179,11 +179,12 @@ def test_marginals_are_gtsams():
     graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
     for k, pose in enumerate(found.state.poses):
         values.insert(k, gtsam.Pose3(pose))
-    oracle, covs = gtsam.Marginals(graph, values), found.marginals()
+    oracle, single = gtsam.Marginals(graph, values), [found.marginal(k) for k in range(12)]
+    covs = found.into_marginals()
     for k in range(12):
         expected = oracle.marginalCovariance(k)
         np.testing.assert_allclose(covs[k], expected, atol=1e-5 * np.diag(expected).max())
-        np.testing.assert_allclose(found.marginal(k), covs[k], rtol=1e-9, atol=1e-9 * np.diag(expected).max())
+        np.testing.assert_allclose(single[k], covs[k], rtol=1e-9, atol=1e-9 * np.diag(expected).max())
 
 
 def along_x(measured_m, reading=lambda way_m: way_m):

@@ -391,7 +391,7 @@ class Script:
 
     def __init__(self, poses, blind=(), correction=None, rng=None):
         self.poses, self.blind, self.correction, self.rng = poses, blind, correction, rng
-        self.row, self.looks = -1, []
+        self.row, self.looks, self.forgotten = -1, [], set()
 
     def step(self, frame):
         self.row = frame.index
@@ -413,7 +413,11 @@ class Script:
     def relay(self, keys):
         pass
 
+    def forget(self, numbers):
+        self.forgotten |= set(numbers)
+
     def measure(self, node, others):
+        assert self.forgotten.isdisjoint(k.number for k in others)
         true = [geometry.inverse(self.poses[k.number]) @ self.poses[node.number] for k in others]
         if self.rng is not None:
             true = [t @ geometry.exp(e) for t, e in zip(true, self.rng.normal(0, 1e-3, (len(true), 6)), strict=True)]
@@ -441,6 +445,13 @@ def test_a_loop_that_comes_back_after_many_tracks_is_tied_to_the_reference_posit
     links = navigated(Script(poses), tracks, window_tracks=1).finish().links
     assert 0 in {link.i for link in links if link.j == 10}
     assert 5 not in {link.i for link in links if link.j == 8}  # in view, but older than the window
+
+
+def test_key_points_that_no_link_will_reach_back_to_are_given_up():
+    """Those out of the window, but the first four; `Script` sees to it that no link with them is asked for."""
+    camera, tracks = Script(line(np.zeros(24))), np.repeat(np.arange(1, 9), 3).tolist()
+    navigated(camera, tracks, window_tracks=2)
+    assert camera.forgotten == set(range(4, 15))  # tracks 2 to 5 of 8, but key point 3
 
 
 def test_where_stereo_pairs_do_not_tell_the_motion_frame_to_frame_stands_in():

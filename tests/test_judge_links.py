@@ -9,7 +9,7 @@ from judge_synthetic import link_between, survey
 from twin import geometry
 from twin.judge.links import link_metrics
 from twin.judge.stages import compose_chain, stage_metrics
-from twin.records import Link, Trajectory
+from twin.records import Link, Links, Trajectory
 
 RESULT, _, TRUTH, _ = survey()
 KEYS = TRUTH.trajectory.world_from_camera[RESULT.key_frames]
@@ -19,7 +19,7 @@ ROTATED, MOVED = np.array([0.003, 0.0, -0.004]), np.array([0.02, -0.01, 0.02])  
 
 
 def with_links(links):
-    return dataclasses.replace(RESULT, links=links)
+    return dataclasses.replace(RESULT, links=Links(links))
 
 
 def linked(pairs, error=(0.0,) * 6, **fields):
@@ -84,7 +84,7 @@ def test_nothing_depends_on_where_the_estimates_have_their_world():
 
 
 def test_the_chain_of_true_motions_is_the_true_path():
-    poses = compose_chain(linked(CHAIN), np.arange(N))
+    poses = compose_chain(Links(linked(CHAIN)), np.arange(N))
     np.testing.assert_allclose(KEYS[0] @ poses, KEYS, atol=1e-9)
     assert stage_metrics(with_links(linked(CHAIN)), TRUTH)["chain"]["ate_max_m"] == pytest.approx(0, abs=1e-9)
 
@@ -113,7 +113,7 @@ def test_every_stage_is_judged_at_the_same_key_points():
 def test_a_chain_with_a_gap_has_no_error_rather_than_that_of_its_first_piece():
     gap = [pair for pair in CHAIN if pair != CHAIN[50]]
     links = linked([*gap, (50, 52), (49, 51)])
-    assert len(compose_chain(links, np.arange(N))) == 0
+    assert len(compose_chain(Links(links), np.arange(N))) == 0
     figures = stage_metrics(with_links(links), TRUTH)
     assert figures["chain"] == {"ate_rmse_m": None, "ate_max_m": None}
     assert figures["final"]["ate_rmse_m"] is not None

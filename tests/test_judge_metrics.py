@@ -17,7 +17,7 @@ from twin.judge.metrics import check_require, evaluate, unflown
 from twin.judge.overlap import overlap_metrics
 from twin.judge.path import leg_numbers, travel_direction
 from twin.judge.require import more_is_better, number_paths
-from twin.records import ElevationMap, MapGrid, Trajectory, Truth
+from twin.records import ElevationMap, Links, MapGrid, Trajectory, Truth
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 
@@ -235,7 +235,7 @@ def broken_off(n_frames: int, n_keys: int):
            if isinstance(t, Trajectory)}  # fmt: skip
     result = dataclasses.replace(
         RESULT, **cut, key_frames=RESULT.key_frames[:n_keys], track_of_key=RESULT.track_of_key[:n_keys],
-        node_cov=np.zeros((0, 6, 6)), links=[], alignments=[], before_ga=[], after_ga=[],
+        node_cov=np.zeros((0, 6, 6)), links=Links(), alignments=[], before_ga=[], after_ga=[],
     )  # fmt: skip
     flown = TRUTH.trajectory
     truth = dataclasses.replace(

@@ -386,15 +386,38 @@ def test_frames_at_once_are_what_they_are_one_by_one(aiding, monkeypatch, tmp_pa
         np.testing.assert_array_equal(ours.world_from_camera, theirs.world_from_camera)
 
 
+def test_the_truth_knows_of_every_frame_its_track_its_plan_and_whether_it_keeps_station():
+    flown = mission("plan.tracks=2", "plan.area_m=[1.2, 1.2]")
+    with survey.open_sea(flown, Stopwatch()) as sea:
+        navigator = survey.make_navigator(flown, sea.vision, Stopwatch())
+        survey.fly(flown, sea, navigator, lambda *_: None)
+        truth, first, hold = sea.truth(), flown.fly(1), len(flown.hold(1))
+    n = len(first)
+    assert len(truth.reference) == len(truth.holding) == len(truth.track) == len(sea) == flown.n_frames
+    np.testing.assert_array_equal(truth.reference[:n], first.reference.position)
+    np.testing.assert_array_equal(truth.holding[: n + 2 * hold + 1], [False] * n + [True] * 2 * hold + [False])
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(truth.track)), [n + 2 * hold - 1])
+    np.testing.assert_allclose(truth.reference[n : n + 2 * hold], first.reference.position[-1:].repeat(2 * hold, 0))
+
+
+def test_what_is_kept_of_key_points_does_not_grow_with_the_survey():
+    flown = mission("plan.tracks=6", "plan.area_m=[1.2, 1.2]", "plan.overlap_across=0.95", "estimate.window_tracks=1")
+    with survey.open_sea(flown, Stopwatch()) as sea:
+        navigator = survey.make_navigator(flown, sea.vision, Stopwatch())
+        survey.fly(flown, sea, navigator, lambda *_: None)
+        last_two = [key.number for key in navigator.keys if key.track >= 5]
+        assert sorted(sea.vision._seen) == [0, 1, 2, 3, *last_two]
+
+
 def test_where_the_physics_diverges_frames_at_once_end_and_say_so():
     flown = mission()
     with survey.open_sea(flown, Stopwatch()) as sea:
         navigator, pilot = survey.make_navigator(flown, sea.vision, Stopwatch()), survey.make_pilot(flown)
         course, glide = flown.fly(1), sea.glide(navigator, pilot)
-        navigator.update(sea.observe(course[0], 1), 1)
+        navigator.update(sea.observe(course[0]), 1)
         sea.vehicle.body.velocity[0] = np.nan
         with pytest.raises(SurveyAborted, match="the physics diverged at"):
-            glide(course, 1, 1)
+            glide(course, 1)
         assert len(sea) == len(navigator.times_s) == 2  # the frame that showed it is kept
 
 

@@ -71,7 +71,7 @@ def first_frame(*overrides):
     """What a survey's first key point sees and reads."""
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, *overrides]))
     with rendered_sea.RenderedSea(mission, Stopwatch()) as world:
-        return world.observe(next(step for step in mission.fly(1) if step.key_point), 1)
+        return world.observe(next(step for step in mission.fly(1) if step.key_point))
 
 
 def test_another_seed_gives_another_floor_and_another_noise():

@@ -20,6 +20,20 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 
 
 @njit(cache=True, nogil=True)
+def put(target: Array, values: Array) -> None:
+    """target[...] = values, both of one shape (n,) or (n, m).
+
+    numba's own brings the text of an error that cannot happen here into all who call it: a third of all compiled code.
+    """
+    for i in range(target.shape[0]):
+        if target.ndim == 1:
+            target[i] = values[i]
+        else:
+            for k in range(target.shape[1]):
+                target[i, k] = values[i, k]
+
+
+@njit(cache=True, nogil=True)
 def skew(v: Array) -> Array:
     """The matrix whose product with x is the cross product v x x. (3,) -> (3, 3)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
@@ -29,8 +43,8 @@ def skew(v: Array) -> Array:
 def pose(rotation: Array, position: Array) -> Array:
     """A pose from a (3, 3) rotation and a (3,) position [m]."""
     result = np.zeros((4, 4))
-    result[:3, :3] = rotation
-    result[:3, 3] = position
+    put(result[:3, :3], rotation)
+    put(result[:3, 3], position)
     result[3, 3] = 1.0
     return result
 
@@ -80,6 +94,17 @@ def sandwich(matrix: Array, cov: Array) -> Array:
     return result
 
 
+@njit(cache=True, nogil=True)
+def product(a: Array, b: Array) -> Array:
+    """a b, of matrices as small as a rotation. (n, m), (m, k) -> (n, k)."""
+    result = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(b.shape[1]):
+            for m in range(a.shape[1]):
+                result[i, k] += a[i, m] * b[m, k]
+    return result
+
+
 def rigid(almost: Array) -> Array:
     """The rigid motion nearest to a product of many: `inverse` doubles what a rotation lacks of orthogonality.
 
@@ -98,7 +123,7 @@ def _rigid(almost):
             a, b, c = motion[0, :3], motion[1, :3], motion[2, :3]
             cofactors = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)))
             step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - motion[:3, :3])
-            motion[:3, :3] += step
+            put(motion[:3, :3], motion[:3, :3] + step)
             change = np.abs(step).max()
     return result
 
@@ -170,7 +195,7 @@ def exp(motion: Array) -> Array:
     """Pose reached by a twist [rotation, translation] (rad, m) held for unit time. (6,) -> (4, 4)."""
     w, result = motion[:3], np.zeros((4, 4))
     jacobian = _left_jacobian(w)
-    result[:3, :3] = so3_exp(w)
+    put(result[:3, :3], so3_exp(w))
     for i in range(3):
         for k in range(3):
             result[i, 3] += jacobian[i, k] * motion[3 + k]
@@ -201,14 +226,16 @@ def log_derivative(motion: Array) -> Array:
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
     c, slope = _of_half_turn(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     along = w[0] * v[0] + w[1] * v[1] + w[2] * v[2]
-    result[:3, :3] = result[3:, 3:] = _of_powers(w, 0.5, c)
+    of_rotation = _of_powers(w, 0.5, c)
     square = _of_powers(w, 0.0, 2.0 * slope * along)
     lever = 0.5 * skew(v)
     for i in range(3):
         for k in range(3):
             lever[i, k] += c * (v[i] * w[k] + w[i] * v[k]) + square[i, k]
         lever[i, i] -= 2.0 * c * along + 1.0
-    result[3:, :3] = lever
+    put(result[:3, :3], of_rotation)
+    put(result[3:, 3:], of_rotation)
+    put(result[3:, :3], lever)
     return result
 
 

@@ -79,8 +79,8 @@ class Mission:
 
     def fly(self, track: int) -> Course:
         """The frames of a track (from 1); every N-th is a key point, and the last one."""
-        times_s, key_points = zip(*self.plan.frames_of_track(track), strict=True)
-        return Course(self.plan.references(track, np.array(times_s)), np.array(key_points), holding=False)
+        times_s, key_points = self.plan.frames_of_track(track)
+        return Course(self.plan.references(track, times_s), key_points, holding=False)
 
     def hold(self, track: int) -> Course:
         """The frames of half the station keeping after a track."""
@@ -95,7 +95,7 @@ class Mission:
     @property
     def n_frames(self) -> int:
         """Frames of the whole survey."""
-        return sum(len(self.plan.frames_of_track(t)) + 2 * self._n_holding for t in self.tracks)
+        return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
     @property
     def tracks(self) -> range:

@@ -80,7 +80,7 @@ class RovPilot:
 @njit(cache=True, nogil=True)
 def steer(helm, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
     """Commands for an estimated pose (4, 4) and twist (6,) of the camera, and its reference."""
-    helm.twist[:] = helm.twist + helm.smoothing * (helm.to_body @ camera_velocity - helm.twist)
+    geometry.put(helm.twist, helm.twist + helm.smoothing * (helm.to_body @ camera_velocity - helm.twist))
     body = geometry.compose(world_from_camera, helm.camera_from_body)
     place = position - level_arm(yaw, helm.lever_arm_m)
     return commanded(helm.steering, body, helm.twist, place, velocity, acceleration, yaw)

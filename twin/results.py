@@ -72,9 +72,8 @@ def make_map(
 def _step_cov(result: SurveyResult) -> Array:
     """(n, 6, 6) covariance of each key point relative to the one before, as their link measured it."""
     cov = np.zeros((len(result.key_frames), 6, 6))
-    for link in result.links:
-        if link.j == link.i + 1:
-            cov[link.j] = link.own_cov
+    chain = result.links.j == result.links.i + 1
+    cov[result.links.j[chain]] = result.links.own_cov[chain]
     return cov
 
 

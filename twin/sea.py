@@ -30,8 +30,8 @@ _STREAMS = ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons", "sn
 
 
 Watch = Callable[[str], AbstractContextManager[None]]
-#: Flies the frames of a course from this one on, up to the next key point, on this track; returns the next frame.
-Glide = Callable[[Course, int, int], int]
+#: Flies the frames of a course from this one on, up to the next key point; returns the next frame.
+Glide = Callable[[Course, int], int]
 
 
 class Sight(NamedTuple):
@@ -57,8 +57,8 @@ class Sea(ABC):
         self, mission: Mission, watch: Watch, vehicle: Vehicle | FreeBody | Carrier, sensors: NavigationSensors
     ):
         self.mission, self.watch, self.vehicle, self.sensors = mission, watch, vehicle, sensors
-        self._true_poses, self._references = Rows(4, 4), Rows(3)
-        self._holding, self._tracks = Rows(kind=bool), Rows(kind=int)
+        self._true_poses = Rows(4, 4)
+        self._courses: list[tuple[Array, bool, int]] = []  # planned positions (n, 3), station keeping, track
 
     def __enter__(self) -> Self:
         return self
@@ -83,10 +83,14 @@ class Sea(ABC):
         """(4, 4) true pose of the left camera."""
         return geometry.compose(self.vehicle.world_from_body, self.mission.rig.body_from_camera)
 
-    def observe(self, step: Step, track: int) -> Frame:
+    def begin(self, course: Course, track: int) -> None:
+        """The frames that follow are those of this course, all of them unless the survey breaks off."""
+        self._courses.append((course.reference.position, course.holding, track))
+
+    def observe(self, step: Step) -> Frame:
         """What the vehicle sees now; the truth of it is kept here."""
         index, sight = len(self), self.look(step)
-        self.record(self.world_from_camera, step.reference.position, step.holding, track)
+        self.record(self.world_from_camera)
         time_s = index / self.mission.rig.frame_rate_hz
         depth_m = sight.depth_m if step.key_point else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
@@ -101,14 +105,9 @@ class Sea(ABC):
         """Frames so far."""
         return len(self._true_poses)
 
-    def record(self, poses: Array, references: Array, holding: bool, track: int) -> None:
-        """Keeps the truth of one frame or more: true poses (4, 4) or (n, 4, 4), planned positions (3,) or (n, 3)."""
-        n = len(self)
+    def record(self, poses: Array) -> None:
+        """Keeps the truth of one frame or more: true poses (4, 4) or (n, 4, 4)."""
         self._true_poses.add(poses)
-        n = len(self) - n
-        self._references.add(references)
-        self._holding.add(np.full(n, holding))
-        self._tracks.add(np.full(n, track))
 
     def glide(self, navigator: Navigator, pilot: PilotOfEstimates) -> Glide | None:
         """The closed loop over many frames at once, for a world that needs no image of them; None: frame by frame."""
@@ -116,12 +115,13 @@ class Sea(ABC):
 
     def truth(self) -> Truth:
         """All that the judge needs."""
-        n = len(self)
+        n, courses = len(self), [(np.empty((0, 3)), False, 0), *self._courses]
+        lengths = [len(positions) for positions, _, _ in courses]
         return Truth(
             trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
-            reference=self._references.array,
-            holding=self._holding.array,
-            track=self._tracks.array,
+            reference=np.concatenate([positions for positions, _, _ in courses])[:n],
+            holding=np.repeat([holding for _, holding, _ in courses], lengths)[:n],
+            track=np.repeat([track for _, _, track in courses], lengths)[:n],
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
         )

@@ -71,12 +71,13 @@ def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Ste
 
     def follow(course: Course, track: int) -> None:
         k = 0
+        sea.begin(course, track)
         while k < len(course):
-            frame = sea.observe(course[k], track)
+            frame = sea.observe(course[k])
             estimate = navigator.update(frame, track)
             watcher(course[k], estimate, frame)
             sea.act(pilot(estimate, course[k].reference))
-            k = k + 1 if glide is None else glide(course, k + 1, track)
+            k = k + 1 if glide is None else glide(course, k + 1)
 
     for track in mission.tracks:
         follow(mission.fly(track), track)

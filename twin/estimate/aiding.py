@@ -15,10 +15,10 @@ from numba import njit
 from twin import geometry
 from twin.estimate import pose_filter
 from twin.estimate.key_points import KeyPoint
-from twin.estimate.pose_graph import Pairs, Single, errors, inverses_of, log_derivatives
+from twin.estimate.pose_graph import Pairs, Single, errors, log_derivatives
 from twin.estimate.velocity_log import body_displacement
 from twin.geometry import Array
-from twin.records import SensorNoise, StereoRig
+from twin.records import SensorNoise, StereoRig, inverses
 
 
 def singles(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> list[Single]:
@@ -54,7 +54,7 @@ def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) ->
     def derive(_: Array, residuals: Array) -> Array:
         return log_derivatives(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
 
-    return Single(np.array(told, np.int64), np.tile(inverses_of(cov[None]), (len(told), 1, 1)), observe, derive)
+    return Single(np.array(told, np.int64), np.tile(inverses(cov[None]), (len(told), 1, 1)), observe, derive)
 
 
 @njit(cache=True, nogil=True)
@@ -64,7 +64,7 @@ def _turned_back(angles, body_from_camera):
     at_origin[:3, 3] = 0.0
     for k in range(len(angles)):
         body = geometry.pose(geometry.rotation_from_rpy(angles[k, 0], angles[k, 1], angles[k, 2]), np.zeros(3))
-        inverses[k] = geometry.inverse(geometry.compose(body, at_origin))
+        geometry.put(inverses[k], geometry.inverse(geometry.compose(body, at_origin)))
     return inverses
 
 
@@ -105,7 +105,7 @@ def displacements(nodes: Sequence[KeyPoint], rig: StereoRig) -> Pairs:
     walked = [(k, node.walked) for k, node in enumerate(nodes) if node.walked and node.walked.since in places]
     i = np.array([places[way.since] for _, way in walked], np.int64)
     metres = np.array([way.metres for _, way in walked]).reshape(-1, 3)
-    information = inverses_of(np.array([way.cov for _, way in walked]).reshape(-1, 3, 3))
+    information = inverses(np.array([way.cov for _, way in walked]).reshape(-1, 3, 3))
 
     def observe(i_from_j: Array, scale: float) -> Array:
         return (1 + scale) * _ways(i_from_j, rig.body_from_camera)[0] - metres
@@ -122,5 +122,7 @@ def _ways(motions, body_from_camera):
     """`body_displacement` of many."""
     ways, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
-        ways[k], by_motion[k] = body_displacement(motions[k], body_from_camera)
+        way, derivative = body_displacement(motions[k], body_from_camera)
+        geometry.put(ways[k], way)
+        geometry.put(by_motion[k], derivative)
     return ways, by_motion

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from twin.estimate import aiding, pose_graph
 from twin.estimate.key_points import KeyPoint
 from twin.geometry import Array
-from twin.records import Link, SensorNoise, StereoRig
+from twin.records import Link, Links, SensorNoise, StereoRig
 
 Mask = NDArray[np.bool_]
 
@@ -57,14 +57,14 @@ def align(
         LinAlgError: the links do not hold every node.
     """
     places = {node.number: k for k, node in enumerate(nodes)}
-    fit = _Fit(list(links), places, _graph(nodes, links, anchors, places, rig, noise))
+    fit = _Fit(Links.of(links), places, _graph(nodes, links, anchors, places, rig, noise))
     dropped: list[Link] = []
     found = fit.optimise(pose_graph.State(np.array([node.world_from_camera for node in nodes])), _FEW_ITERATIONS)
     for _ in range(_ROUNDS):
         wrong = fit.contradictions(found.chi2[0])
         if not wrong.any():
             break
-        dropped += [link for link, out in zip(fit.links, wrong, strict=True) if out]
+        dropped += fit.links.kept(wrong)
         fit = fit.without(wrong)
         found = fit.optimise(found.state, _FEW_ITERATIONS)
     if not found.reached:
@@ -75,7 +75,7 @@ def align(
 class _Fit(NamedTuple):
     """What a window knows: its links, places of the nodes by number, and the graph whose first pairs the links are."""
 
-    links: list[Link]
+    links: Links
     places: dict[int, int]
     graph: pose_graph.Graph
 
@@ -87,12 +87,11 @@ class _Fit(NamedTuple):
 
         Those small beside the worst may be its doing, and stay for now. The path's own chain always stands.
         """
-        chain = np.array([link.j - link.i == 1 for link in self.links], dtype=bool)
-        chi2 = np.where(chain, 0.0, chi2)
+        chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _OF_THE_WORST * float(chi2.max(initial=0.0)))
 
     def without(self, wrong: Mask) -> _Fit:
-        kept = [link for link, out in zip(self.links, wrong, strict=True) if not out]
+        kept = self.links.kept(~wrong)
         pairs = [pose_graph.motions(kept, self.places, _HUBER), *self.graph.pairs[1:]]
         return _Fit(kept, self.places, self.graph._replace(pairs=pairs))
 
@@ -113,7 +112,7 @@ def _graph(nodes, links, anchors, places, rig, noise) -> pose_graph.Graph:
 
 def _marginals(found: pose_graph.Optimum, wanted: Sequence[int] | None, places: dict[int, int]) -> Array:
     if wanted is None:
-        return found.marginals()
+        return found.into_marginals()
     covs = np.zeros((len(places), 6, 6))
     for number in wanted:
         covs[places[number]] = found.marginal(places[number])

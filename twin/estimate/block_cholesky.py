@@ -10,12 +10,12 @@ panel of the first node below, or below that.
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from twin import geometry
 from twin.estimate.elimination import BLOCK as _D
 from twin.estimate.elimination import Structure
 from twin.geometry import Array
@@ -51,22 +51,11 @@ class Factor(NamedTuple):
             panel = s.above(panel)
         return found
 
-    def marginals(self) -> Array:
-        """(n, 6, 6) all blocks on the inverse's diagonal."""
+    def into_marginals(self) -> Array:
+        """(n, 6, 6) all blocks on the inverse's diagonal. They take the place of the factor, which is used up."""
         s = self.structure
-        count = len(s.first) - 1
-        below = Counter(s.above(panel) for panel in range(count))
-        joints: dict[int | None, Array] = {}
         found = np.empty((len(s.place), _D, _D))
-        for panel in reversed(range(count)):
-            above = s.above(panel)
-            joint = joints[panel] = self._joint(panel, above, joints.get(above))
-            own = np.arange(s.first[panel + 1] - s.first[panel])
-            found[s.first[panel] + own] = joint.reshape(len(joint) // _D, _D, -1, _D)[own, :, own]
-            below[above] -= 1
-            for done in (panel, above):  # what nobody below will ask is forgotten
-                if not below[done]:
-                    joints.pop(done, None)
+        _invert(s, self.panels, found)
         return found[s.place]
 
     def _panel(self, panel: int) -> tuple[Array, Array]:
@@ -75,20 +64,6 @@ class Factor(NamedTuple):
         own = _D * int(s.first[panel + 1] - s.first[panel])
         matrix = self.panels[s.at[panel] : s.at[panel + 1]].reshape(-1, own)
         return matrix[:own], matrix[own:]
-
-    def _joint(self, panel: int, above: int | None, of_above: Array | None) -> Array:
-        """Covariance of a panel's nodes and of those below it, by that of the panel above, which has these."""
-        inverse, rest = self._panel(panel)
-        own = len(inverse)
-        joint = np.empty((own + len(rest), own + len(rest)))
-        joint[:own, :own] = inverse.T @ inverse
-        if above is not None and of_above is not None:
-            _pick(of_above, self.structure.columns(above, self.structure.below_of(panel)), joint[own:, own:])
-            weight = rest @ inverse
-            joint[own:, :own] = -joint[own:, own:] @ weight
-            joint[:own, own:] = joint[own:, :own].T
-            joint[:own, :own] -= weight.T @ joint[own:, :own]
-        return joint
 
 
 def factorise(structure: Structure, diagonal: Array, off: Array) -> Factor:
@@ -113,7 +88,7 @@ def _place(s, diagonal, off, panels):
         p = s.panel_of[s.place[k]]
         width, x = s.first[p + 1] - s.first[p], s.place[k] - s.first[p]
         panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width)
-        panel[_D * x : _D * x + _D, _D * x : _D * x + _D] += diagonal[k]
+        geometry.put(panel[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
     for k in range(len(off)):
         row, column = s.pairs[k]
         p = s.panel_of[column]
@@ -136,11 +111,11 @@ def _eliminate(s, whole, panels):
         inverse = np.zeros((n, n))
         if not _invert_root(panel[:n], whole[_D * s.first[p] : _D * s.first[p + 1]], inverse):
             return False
-        panel[:n] = inverse
+        geometry.put(panel[:n], inverse)
         if len(panel) > n:
-            panel[n:] = np.dot(panel[n:], inverse.T)
+            geometry.put(panel[n:], np.dot(panel[n:], inverse.T))
             square = np.dot(panel[n:], panel[n:].T)
-            _subtract(square, s.rows[s.below[p] : s.below[p + 1]], s, panels)
+            _exchange(square, s.rows[s.below[p] : s.below[p + 1]], s, panels, False)
     return True
 
 
@@ -174,19 +149,8 @@ def _invert_root(matrix, whole, inverse):
 
 
 @njit(cache=True, nogil=True)
-def _pick(matrix, blocks, out):
-    """Fills `out` with rows and columns of these blocks of a matrix."""
-    for a in range(len(blocks)):
-        for i in range(_D):
-            row, into = matrix[_D * blocks[a] + i], out[_D * a + i]
-            for b in range(len(blocks)):
-                for j in range(_D):
-                    into[_D * b + j] = row[_D * blocks[b] + j]
-
-
-@njit(cache=True, nogil=True)
-def _subtract(square, places, s, panels):
-    """Takes what a panel's square says of the places below it from the panels that have them."""
+def _exchange(square, places, s, panels, fill):
+    """Takes a square's blocks (lower half) of these places from the panels that have them; or fills it with theirs."""
     start = 0
     while start < len(places):
         p = s.panel_of[places[start]]
@@ -204,8 +168,31 @@ def _subtract(square, places, s, panels):
                 x = places[a] - s.first[p]
                 for i in range(_D):
                     for j in range(_D):
-                        panel[_D * y + i, _D * x + j] -= square[_D * b + i, _D * a + j]
+                        if fill:
+                            square[_D * b + i, _D * a + j] = panel[_D * y + i, _D * x + j]
+                            square[_D * a + j, _D * b + i] = panel[_D * y + i, _D * x + j]
+                        else:
+                            panel[_D * y + i, _D * x + j] -= square[_D * b + i, _D * a + j]
         start = end
+
+
+@njit(cache=True, nogil=True)
+def _invert(s, panels, diagonal):
+    """Turns L1^-1 over L2 of each panel into the inverse's blocks there, and fills those on its diagonal (n, 6, 6)."""
+    for p in range(len(s.first) - 2, -1, -1):
+        width = s.first[p + 1] - s.first[p]
+        n = _D * width
+        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, n)
+        own = np.dot(panel[:n].T, panel[:n])
+        if len(panel) > n:
+            later, weight = np.empty((len(panel) - n, len(panel) - n)), np.dot(panel[n:], panel[:n])
+            _exchange(later, s.rows[s.below[p] : s.below[p + 1]], s, panels, True)
+            across = np.dot(later, weight)
+            own += np.dot(weight.T, across)
+            geometry.put(panel[n:], -across)
+        geometry.put(panel[:n], own)
+        for k in range(width):
+            geometry.put(diagonal[s.first[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
 
 
 @njit(cache=True, nogil=True)
@@ -214,7 +201,7 @@ def _substitute(s, panels, x):
     for p in range(len(s.first) - 1):
         own = x[_D * s.first[p] : _D * s.first[p + 1]]
         panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, len(own))
-        own[:] = np.dot(panel[: len(own)], own)
+        geometry.put(own, np.dot(panel[: len(own)], own))
         if len(panel) > len(own):
             known = np.dot(panel[len(own) :], own)
             for k in range(s.below[p], s.below[p + 1]):
@@ -226,6 +213,7 @@ def _substitute(s, panels, x):
         if len(panel) > len(own):
             later = np.empty(len(panel) - len(own))
             for k in range(s.below[p], s.below[p + 1]):
-                later[_D * (k - s.below[p]) : _D * (k - s.below[p]) + _D] = x[_D * s.rows[k] : _D * s.rows[k] + _D]
+                for i in range(_D):
+                    later[_D * (k - s.below[p]) + i] = x[_D * s.rows[k] + i]
             own -= np.dot(panel[len(own) :].T, later)
-        own[:] = np.dot(panel[: len(own)].T, own)
+        geometry.put(own, np.dot(panel[: len(own)].T, own))

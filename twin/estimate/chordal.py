@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from twin.estimate.elimination import Indices
 from twin.estimate.pose_graph import Graph, State, given, motions, optimise, times, turned
 from twin.geometry import Array
-from twin.records import Link
+from twin.records import Link, Links
 
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 
@@ -50,10 +50,11 @@ def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
 
     Links weigh by their covariance's mean, of rotation and of translation.
     """
-    numbers = sorted({number for link in links for number in link[:2]})
+    columns = Links.of(links)
+    numbers = np.unique(np.concatenate([columns.i, columns.j])).tolist()
     places = {number: k for k, number in enumerate(numbers)}
-    motion, cov = (np.array([link[k] for link in links]) for k in (2, 3))
-    i, j = np.array([(places[link.i], places[link.j]) for link in links]).T
+    motion, cov = columns.i_from_j, columns.cov
+    i, j = (np.array([places[number] for number in ends.tolist()]) for ends in (columns.i, columns.j))
     of_turns, of_ways = (3 / np.trace(cov[:, a : a + 3, a : a + 3], axis1=1, axis2=2) for a in (0, 3))
     turns, nothing = turned(motion[:, :3, :3]), np.zeros((len(links), 3, 3))
     u, _, v = np.linalg.svd(turned(_least_squares(i, j, turns, nothing, np.eye(3), of_turns)))

@@ -6,10 +6,10 @@ columns. The order is the least degree that SuperLU finds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -52,21 +52,16 @@ class Structure(NamedTuple):
         below = self.below_of(panel)
         return int(self.panel_of[below[0]]) if len(below) else None
 
-    def columns(self, panel: int, places: Indices) -> Indices:
-        """Where these places lie among a panel's nodes and those below it."""
-        first, end = self.first[panel], self.first[panel + 1]
-        return np.where(places < end, places - first, end - first + np.searchsorted(self.below_of(panel), places))
-
 
 def analyse(n: int, i: Indices, j: Indices) -> Structure:
     """The structure of a matrix of n x n blocks with blocks (i, j) (m,) off the diagonal; a pair may come twice."""
     place = _least_degree(n, i, j)
-    panels = _panels(n, np.minimum(place[i], place[j]).tolist(), np.maximum(place[i], place[j]).tolist())
+    panels = _panels(n, np.minimum(place[i], place[j]), np.maximum(place[i], place[j]))
     again = np.empty(n, np.int64)  # a panel's nodes one after the other
     again[[node for own, _ in panels for node in own]] = np.arange(n)
     place = again[place]
     first = np.cumsum([0] + [len(own) for own, _ in panels])
-    rows = [np.sort(again[list(after)]) for _, after in panels]
+    rows = [np.sort(again[after]) for _, after in panels]
     below = np.cumsum([0] + [len(row) for row in rows])
     width = np.diff(first)
     at = np.cumsum(np.append(0, BLOCK * BLOCK * width * (width + np.diff(below))))
@@ -85,37 +80,55 @@ def _least_degree(n: int, i: Indices, j: Indices) -> Indices:
     return found.perm_c.astype(np.int64)
 
 
-def _panels(n: int, early: Sequence[int], late: Sequence[int]) -> list[tuple[list[int], set[int]]]:
-    """Nodes of each panel and those below it, of pairs of nodes in an order of elimination.
-
-    A panel comes right after all that it is above of: so few joint covariances are needed at a time.
-    """
-    after: list[set[int]] = [set() for _ in range(n)]
-    for a, b in zip(early, late, strict=True):
-        after[a].add(b)
-    parent = [-1] * n
-    for node in range(n):
-        if after[node]:
-            parent[node] = min(after[node])
-            after[parent[node]] |= after[node]
-            after[parent[node]].discard(parent[node])
+def _panels(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
+    """Nodes of each panel and those below it, of pairs of nodes in an order of elimination."""
+    order = np.argsort(early, kind="stable")
+    at, after = _fill(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
+    count = np.diff(at).tolist()
+    parent = [int(after[at[node]]) if count[node] else -1 for node in range(n)]
     panels: list[list[int]] = []
     home = [0] * n
     for node in reversed(range(n)):
         above = panels[home[parent[node]]] if parent[node] >= 0 else []
         follows = above and above[-1] == parent[node] and len(above) < _WIDEST
-        if follows and len(above) + len(after[above[0]]) - len(after[node]) <= _ZEROS:
+        if follows and len(above) + count[above[0]] - count[node] <= _ZEROS:
             home[node] = home[parent[node]]
             above.append(node)
         else:
             home[node] = len(panels)
             panels.append([node])
-    under: list[list[int]] = [[] for _ in panels]
-    roots: list[int] = []
-    for panel, own in enumerate(panels):
-        (under[home[parent[own[0]]]] if parent[own[0]] >= 0 else roots).append(panel)
-    last_to_first, waiting = [], roots
-    while waiting:
-        last_to_first.append(panels[waiting.pop()])
-        waiting += under[home[last_to_first[-1][0]]]
-    return [(own[::-1], after[own[0]]) for own in reversed(last_to_first)]
+    return [(own[::-1], after[at[own[0]] : at[own[0] + 1]]) for own in reversed(panels)]
+
+
+@njit(cache=True, nogil=True)
+def _fill(n, start, later):
+    """Those after each node that its elimination joins: after[at[k] : at[k + 1]], rising.
+
+    Its own neighbours after it, later[start[k] : start[k + 1]], and those of all nodes whose first it is.
+    """
+    at, after, met = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
+    last_under, one_before = np.full(n, -1), np.full(n, -1)  # of the nodes whose first each is
+    for node in range(n):
+        end = at[node]
+        if len(after) < end + n:
+            grown = np.empty(2 * len(after) + n, np.int64)
+            for k in range(end):
+                grown[k] = after[k]
+            after = grown
+        for k in range(start[node], start[node + 1]):
+            if met[later[k]] != node:
+                met[later[k]], after[end] = node, later[k]
+                end += 1
+        under = last_under[node]
+        while under >= 0:
+            for k in range(at[under] + 1, at[under + 1]):
+                if met[after[k]] != node:
+                    met[after[k]], after[end] = node, after[k]
+                    end += 1
+            under = one_before[under]
+        after[at[node] : end].sort()
+        at[node + 1] = end
+        if end > at[node]:
+            first = after[at[node]]
+            one_before[node], last_under[first] = last_under[first], node
+    return at, after[: at[n]]

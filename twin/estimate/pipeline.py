@@ -25,7 +25,7 @@ from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.estimate.vision import Vision
 from twin.geometry import Array
-from twin.records import Alignment, Estimate, Frame, Link, Rows, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.records import Alignment, Estimate, Frame, Link, Links, Rows, SensorNoise, StereoRig, SurveyResult, Trajectory
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
@@ -66,7 +66,7 @@ class Navigator:
         self.keys: list[KeyPoint] = []
         self.nodes: list[KeyPoint] = []
         self.node_poses = np.empty((64, 4, 4))  # theirs, and room for more
-        self.links: list[Link] = []
+        self.links = Links()
         self.measuring: deque[Callable[[], list[Link]]] = deque()
         self.behind = ThreadPoolExecutor(1) if beside else None
         self.times_s, self.f2f_poses, self.online_poses = Rows(), Rows(4, 4), Rows(4, 4)
@@ -120,7 +120,10 @@ class Navigator:
         with self.watch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
         self._rebase(aligned)
-        self.vision.relay([k for k in self.keys if k.track >= track])  # older ones are forgotten
+        self.vision.relay([k for k in self.keys if k.track >= track])  # the mosaic forgets older ones
+        left = bisect_left(self.nodes, first, key=lambda k: k.track)
+        if left > _START_NODES:
+            self.vision.forget(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
         self.after_ga.append(self._key_poses()[:, :3, 3].copy())
 
     def finish(self) -> SurveyResult:
@@ -159,7 +162,7 @@ class Navigator:
         n_frames = len(self.times_s)
         self.keys = [k for k in self.keys if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
-        self.links = [link for link in self.links if link.j < len(self.keys)]
+        self.links = self.links.kept(self.links.j < len(self.keys))
 
     def _visit_key_point(self, frame: Frame, track: int, status: str) -> str:
         """Stereo, F2M, mosaic and network at a key point; fresh points for F2F."""
@@ -261,7 +264,7 @@ class Navigator:
         """
         while len(self.measuring) > all_but:
             try:
-                self.links += self.measuring[0]()
+                self.links.add(self.measuring[0]())
             except OSError:
                 self.measuring.clear()
                 self.alignable = False
@@ -279,10 +282,10 @@ class Navigator:
         return links
 
     def _align(self, nodes: list[KeyPoint], track: int, marginals: list[int] | None) -> Aligned:
-        """Aligns nodes (with those older ones that they are linked to, held) and moves all key points along."""
-        inside = {k.number for k in nodes}
-        links = [link for link in self.links if link.j in inside]
-        held = {link.i for link in links} - inside
+        """Aligns the last nodes (with those older ones that they are linked to, held); all key points move along."""
+        first = nodes[0].number
+        links = self.links.kept(self.links.j >= first)
+        held = set(links.i[links.i < first].tolist())
         everyone = [k for k in self.nodes if k.number in held] + nodes
         anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
         begun = time.perf_counter()
@@ -294,10 +297,11 @@ class Navigator:
         ms = (time.perf_counter() - begun) * 1e3
         self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
         self.dropped += aligned.dropped
-        dropped = {(link.i, link.j) for link in aligned.dropped}
-        self.links = [link for link in self.links if (link.i, link.j) not in dropped]
+        if aligned.dropped:
+            dropped, ends = {link[:2] for link in aligned.dropped}, zip(self.links.i, self.links.j, strict=True)
+            self.links = self.links.kept(np.array([end not in dropped for end in ends]))
         poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
-        self._move_keys({number: pose for number, pose in poses.items() if number in inside})
+        self._move_keys({number: pose for number, pose in poses.items() if number >= first})
         return aligned
 
     def _move_keys(self, poses: dict[int, Array]) -> None:

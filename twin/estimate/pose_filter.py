@@ -62,7 +62,7 @@ class PoseFilter:
         self.world_from_camera, self.cov = geometry.rigid(world_from_camera), cov
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
-        self.world_from_camera, self.cov = _updated(self.world_from_camera, self.cov, residual, jacobian, cov)
+        self.world_from_camera, self.cov = updated(self.world_from_camera, self.cov, residual, jacobian, cov)
 
 
 def sight(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
@@ -87,12 +87,13 @@ def aided(world_from_camera, cov, level, height_m, rpy_rad):
     pose = world_from_camera
     if not np.isnan(height_m):
         by_pose, off, spread = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
-        by_pose[0, 3:], off[0], spread[0, 0] = pose[2, :3], height_m - pose[2, 3], level.pressure_m2
-        pose, cov = _updated(pose, cov, off, by_pose, spread)
+        geometry.put(by_pose[0, 3:], pose[2, :3])
+        off[0], spread[0, 0] = height_m - pose[2, 3], level.pressure_m2
+        pose, cov = updated(pose, cov, off, by_pose, spread)
     if not np.isnan(rpy_rad[0]):
         measured, spread = _attitude(rpy_rad, level.camera_from_body[:3, :3], level.attitude_rad)
         off = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
-        pose, cov = _updated(pose, cov, off, np.eye(3, 6), spread)
+        pose, cov = updated(pose, cov, off, np.eye(3, 6), spread)
     return pose, cov
 
 
@@ -119,7 +120,7 @@ def carried(cov: Array, a_from_b: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _updated(world_from_camera, prior, residual, jacobian, cov):
+def updated(world_from_camera, prior, residual, jacobian, cov):
     """Pose and covariance after an observation (k,) with its derivative (k, 6) and covariance (k, k); Joseph's form."""
     gain = _gain(prior, jacobian, cov)
     keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)

@@ -21,7 +21,7 @@ from twin import geometry
 from twin.estimate import block_cholesky, elimination
 from twin.estimate.elimination import Indices
 from twin.geometry import Array
-from twin.records import Link
+from twin.records import Link, Links, inverses
 
 #: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
@@ -119,9 +119,12 @@ class Optimum(NamedTuple):
     factor: block_cholesky.Factor
     border: tuple[Array, float] | None
 
-    def marginals(self) -> Array:
-        """(n, 6, 6) covariance of all poses [rotation, translation] (rad, m), each in its own axes."""
-        return self._with_shared(self.factor.marginals(), slice(None))
+    def into_marginals(self) -> Array:
+        """(n, 6, 6) covariance of all poses [rotation, translation] (rad, m), each in its own axes.
+
+        They take the place of the factor, which is used up.
+        """
+        return self._with_shared(self.factor.into_marginals(), slice(None))
 
     def marginal(self, k: int) -> Array:
         """(6, 6) of one."""
@@ -270,7 +273,7 @@ def _add_pairs(first, second, by_j, information, weights, residuals, i_from_j, d
                 for k in range(n):
                     total += half[a, k] * derivative[k, b]
                 matrix[a, b] = matrix[b, a] = total
-        to_i[:] = geometry.adjoint(geometry.inverse(i_from_j[m])).T
+        geometry.put(to_i, geometry.adjoint(geometry.inverse(i_from_j[m])).T)
         for a in range(6):
             for b in range(6):
                 across[m, a, b] = 0.0
@@ -279,7 +282,7 @@ def _add_pairs(first, second, by_j, information, weights, residuals, i_from_j, d
                 diagonal[j, a, b] += matrix[a, b]
                 gradient[i, a] -= to_i[a, b] * slope[b]
             gradient[j, a] += slope[a]
-        diagonal[i] += geometry.sandwich(to_i, matrix)
+        geometry.put(diagonal[i], diagonal[i] + geometry.sandwich(to_i, matrix))
 
 
 @njit(cache=True, nogil=True)
@@ -289,18 +292,18 @@ def _add_border(first, second, by_j, informed, i_from_j, border):
         slope = np.zeros(6)
         for k in range(informed.shape[1]):
             slope += informed[m, k] * by_j[m, k]
-        border[second[m]] += slope
         carry = geometry.adjoint(geometry.inverse(i_from_j[m]))
         for a in range(6):
+            border[second[m], a] += slope[a]
             for b in range(6):
                 border[first[m], a] -= carry[b, a] * slope[b]
 
 
 def motions(links: Sequence[Link], places: dict[int, int], huber: float | None = None) -> Pairs:
     """What links say of the poses at these places, by number of their nodes."""
-    measured = _inverses(np.array([link.i_from_j for link in links]).reshape(-1, 4, 4))
-    information = inverses_of(np.array([link.cov for link in links]).reshape(-1, 6, 6))
-    i, j = np.array([(places[link.i], places[link.j]) for link in links], np.int64).reshape(-1, 2).T.copy()
+    columns = Links.of(links)
+    measured, information = _inverses(columns.i_from_j), columns.information
+    i, j = (np.array([places[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
 
     def observe(i_from_j: Array, _: float) -> Array:
         return errors(measured, i_from_j)
@@ -312,17 +315,9 @@ def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
     """Poses (m, 4, 4) that are known with covariances (m, 6, 6) [rotation, translation], in their own axes."""
     measured = _inverses(poses)
     return Single(
-        np.asarray(at, np.int64), inverses_of(covs), lambda found: errors(measured, found),
+        np.asarray(at, np.int64), inverses(covs), lambda found: errors(measured, found),
         lambda _, residuals: log_derivatives(residuals),
     )  # fmt: skip
-
-
-def inverses_of(covs: Array) -> Array:
-    """Information of covariances (m, d, d), symmetric to the last bit."""
-    found = np.asarray(np.linalg.inv(covs), np.float64)
-    found = found + turned(found)
-    found /= 2
-    return found
 
 
 @njit(cache=True, nogil=True)
@@ -330,7 +325,7 @@ def errors(inverse, found):
     """log(inverse found) of poses (m, 4, 4), (m, 6)."""
     residuals = np.empty((len(found), 6))
     for k in range(len(found)):
-        residuals[k] = geometry.log(geometry.compose(inverse[k], found[k]))
+        geometry.put(residuals[k], geometry.log(geometry.compose(inverse[k], found[k])))
     return residuals
 
 
@@ -339,7 +334,7 @@ def log_derivatives(residuals):
     """Derivatives (m, 6, 6) of such errors (m, 6) by motions of what is found."""
     derivatives = np.empty((len(residuals), 6, 6))
     for k in range(len(residuals)):
-        derivatives[k] = geometry.log_derivative(residuals[k])
+        geometry.put(derivatives[k], geometry.log_derivative(residuals[k]))
     return derivatives
 
 
@@ -347,7 +342,7 @@ def log_derivatives(residuals):
 def _moved(poses, steps):
     moved = np.empty_like(poses)
     for k in range(len(poses)):
-        moved[k] = geometry.compose(poses[k], geometry.exp(steps[k]))
+        geometry.put(moved[k], geometry.compose(poses[k], geometry.exp(steps[k])))
     return moved
 
 

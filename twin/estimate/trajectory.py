@@ -42,4 +42,4 @@ def _spread(there, f2f, gap, out):
     """Poses (n, 4, 4) moved by `there`, each with its even share of the gap (6,) behind the last."""
     step = 1 / len(f2f)
     for k in range(len(f2f)):
-        out[k] = there @ f2f[k] @ geometry.exp(gap * (k * step))
+        geometry.put(out[k], geometry.compose(geometry.compose(there, f2f[k]), geometry.exp(gap * (k * step))))

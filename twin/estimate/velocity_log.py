@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
+from twin.estimate.pose_filter import updated
 from twin.geometry import Array
 from twin.records import SensorNoise, StereoRig
 
@@ -85,14 +86,15 @@ class VelocityLog:
 @njit(cache=True, nogil=True)
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
     """Way (3,) of the body's origin in the earlier body for a motion of the camera, and its derivative (3, 6) by it."""
-    origin = geometry.inverse(body_from_camera)[:3, 3].copy()  # of the body, in the camera
-    mount = np.ascontiguousarray(body_from_camera[:3, :3])
-    turn = mount @ np.ascontiguousarray(a_from_b[:3, :3])
-    joint = body_from_camera @ a_from_b
-    moved = np.ascontiguousarray(joint[:3, :3]) @ origin + joint[:3, 3]
-    by_motion = np.empty((3, 6))
-    by_motion[:, :3], by_motion[:, 3:] = turn @ -geometry.skew(origin), turn
-    return moved, by_motion
+    camera_from_body = geometry.inverse(body_from_camera)
+    turn = geometry.compose(body_from_camera, a_from_b)
+    lever, by_motion = geometry.skew(camera_from_body[:3, 3]), np.zeros((3, 6))
+    for i in range(3):
+        for k in range(3):
+            by_motion[i, 3 + k] = turn[i, k]
+            for m in range(3):
+                by_motion[i, k] -= turn[i, m] * lever[m, k]
+    return geometry.compose(turn, camera_from_body)[:3, 3].copy(), by_motion
 
 
 @njit(cache=True, nogil=True)
@@ -105,49 +107,66 @@ def logged(way, beams, a_from_b, cov, velocity):
         velocity: (3,) reading at the frame's end, in the body; NaN: none.
     """
     last = way.velocity.copy()
-    way.velocity[:] = velocity
+    geometry.put(way.velocity, velocity)
     if np.isnan(last[0]) or np.isnan(velocity[0]):
         way.whole[0] = False
         return a_from_b, cov
-    mount = np.ascontiguousarray(beams.body_from_camera[:3, :3])
-    turn = mount @ np.ascontiguousarray(a_from_b[:3, :3]) @ np.ascontiguousarray(mount.T)
-    step = (last + turn @ velocity) / 2 * beams.step_s
+    turned, step = _of_body(a_from_b, beams.body_from_camera), np.empty(3)
+    for i in range(3):
+        now = turned[i, 0] * velocity[0] + turned[i, 1] * velocity[1] + turned[i, 2] * velocity[2]
+        step[i] = (last[i] + now) / 2 * beams.step_s
     fused, fused_cov = fuse(a_from_b, cov, step, _step_cov(way, beams, step), beams.body_from_camera)
-    _sum(way, beams, mount, step, fused, fused_cov)
+    _sum(way, beams, step, fused, fused_cov)
     return fused, fused_cov
+
+
+@njit(cache=True, nogil=True)
+def _of_body(a_from_b, body_from_camera):
+    """The motion (4, 4) of the body for one of the camera."""
+    return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
+
+
+@njit(cache=True, nogil=True)
+def _length(step):
+    return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
 @njit(cache=True, nogil=True)
 def _step_cov(way, beams, step):
     """Covariance of a frame's displacement. The scale error adds up along the path L since the node: the frames'
     shares s^2 ((L + l)^2 - L^2) have the sum s^2 L^2."""
-    length = max(np.sqrt(np.dot(step, step)), 1e-12)
-    grown = (2 * way.path_m[0] + length) / length
-    return np.eye(3) * beams.white_m2 + beams.scale2 * grown * np.outer(step, step)
+    length = max(_length(step), 1e-12)
+    grown, cov = (2 * way.path_m[0] + length) / length, np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            cov[i, k] = beams.scale2 * grown * step[i] * step[k] + (beams.white_m2 if i == k else 0.0)
+    return cov
 
 
 @njit(cache=True, nogil=True)
-def _sum(way, beams, mount, step, a_from_b, cov):
+def _sum(way, beams, step, a_from_b, cov):
     """Adds a frame to the displacement since the node."""
-    way.metres[:] = way.metres + way.turn @ step
-    way.path_m[0] += np.sqrt(np.dot(step, step))
-    way.cov[:] = way.cov + np.eye(3) * beams.white_m2
-    way.turn[:] = way.turn @ mount @ np.ascontiguousarray(a_from_b[:3, :3]) @ np.ascontiguousarray(mount.T)
-    to_node = way.turn @ mount
-    way.turn_cov[:] = way.turn_cov + to_node @ np.ascontiguousarray(cov[:3, :3]) @ np.ascontiguousarray(to_node.T)
+    way.path_m[0] += _length(step)
+    for i in range(3):
+        way.metres[i] += way.turn[i, 0] * step[0] + way.turn[i, 1] * step[1] + way.turn[i, 2] * step[2]
+        way.cov[i, i] += beams.white_m2
+    geometry.put(way.turn, geometry.product(way.turn, _of_body(a_from_b, beams.body_from_camera)[:3, :3]))
+    to_node = geometry.product(way.turn, beams.body_from_camera[:3, :3])
+    grown = geometry.product(geometry.product(to_node, cov[:3, :3]), to_node.T)
+    geometry.put(way.turn_cov, way.turn_cov + grown)
 
 
 @njit(cache=True, nogil=True)
 def _walked_cov(way):
     lever = geometry.skew(way.metres)  # the attitude's error at the end bounds the one on the way
-    return way.cov + lever @ way.turn_cov @ np.ascontiguousarray(lever.T)
+    return way.cov + geometry.product(geometry.product(lever, way.turn_cov), lever.T)
 
 
 @njit(cache=True, nogil=True)
 def _start(way):
     """Starts anew at a node; the last reading is kept."""
-    way.turn[:], way.turn_cov[:] = np.eye(3), 0.0
-    way.metres[:], way.cov[:], way.path_m[:], way.whole[:] = 0.0, 0.0, 0.0, True
+    geometry.put(way.turn, np.eye(3))
+    way.turn_cov[:], way.metres[:], way.cov[:], way.path_m[:], way.whole[:] = 0.0, 0.0, 0.0, 0.0, True
 
 
 @njit(cache=True, nogil=True)
@@ -158,10 +177,5 @@ def fuse(a_from_b, cov, step, step_cov, body_from_camera):
         a_from_b, cov: (4, 4), (6, 6).
         step, step_cov: (3,), (3, 3) in the body before the motion [m].
     """
-    predicted, by_motion = body_displacement(a_from_b, body_from_camera)
-    spread = by_motion @ cov
-    gain = np.linalg.solve(spread @ np.ascontiguousarray(by_motion.T) + step_cov, spread).T
-    keep = np.eye(6) - gain @ by_motion
-    moved = a_from_b @ geometry.exp(gain @ (step - predicted))
-    fused = keep @ cov @ np.ascontiguousarray(keep.T) + gain @ step_cov @ gain.T
-    return moved, fused
+    expected, by_motion = body_displacement(a_from_b, body_from_camera)
+    return updated(a_from_b, cov, step - expected, by_motion, step_cov)

@@ -66,6 +66,10 @@ class Vision(Protocol):
         """Motion from each of other nodes to this one; None where images do not tell. Safe to call from a thread."""
         ...
 
+    def forget(self, numbers: range) -> None:
+        """No motion from these key points will be asked for any more."""
+        ...
+
     def map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
@@ -176,6 +180,9 @@ class StereoVision:
             with self.watch("network"):
                 motions.append(None if matched is None else self.matcher.motion(node, other, matched))
         return motions
+
+    def forget(self, numbers: range) -> None:
+        """Nothing to do: their images are on disk."""
 
     def map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]

@@ -32,12 +32,11 @@ def write(path: Path, result: SurveyResult) -> None:
     """Writes VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines: quaternions xyzw, upper triangle of the information matrix."""
     poses = result.final.world_from_camera[result.key_frames]
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_texts(poses)))
-    motions = np.array([link.i_from_j for link in result.links]).reshape(-1, 4, 4)
-    information = np.linalg.inv(np.array([link.cov for link in result.links]).reshape(-1, 6, 6))
-    upper = np.asarray(information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER], np.float64)
+    links = result.links
+    upper = links.information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]
     edges = "".join(
-        f"EDGE_SE3:QUAT {link.i} {link.j} {motion} {known}\n"
-        for link, motion, known in zip(result.links, _texts(motions), _lines(upper, "%.9g"), strict=True)
+        f"EDGE_SE3:QUAT {i} {j} {motion} {known}\n"
+        for i, j, motion, known in zip(links.i, links.j, _texts(links.i_from_j), _lines(upper, "%.9g"), strict=True)
     )
     path.write_text(vertices + edges)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from twin import geometry
 from twin.judge.consistency import nees
 from twin.judge.numbers import mean, rms
-from twin.records import Array, Link, SurveyResult, Truth
+from twin.records import Array, Links, SurveyResult, Truth
 
 #: A link "along" reaches back to one of the two nodes before (the paper's), one "across" farther: to the longest base
 #: on the same swath, to neighbouring swaths, to where loops began.
@@ -21,57 +20,54 @@ ALONG_NODES = 2
 
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
     """`links` of metrics.json: errors of the motions along and across, and how many frame-to-frame motions stand in."""
-    measured = [link for link in result.links if link.n_points > 0]
+    measured = result.links.kept(result.links.n_points > 0)
     near = steps_back(measured, node_numbers(result.links)) <= ALONG_NODES
     true = truth.trajectory.world_from_camera[result.key_frames]
     return {
-        "along": _figures([link for link, along in zip(measured, near, strict=True) if along], true),
-        "across": _figures([link for link, along in zip(measured, near, strict=True) if not along], true),
+        "along": _figures(measured.kept(near), true),
+        "across": _figures(measured.kept(~near), true),
         "bridged": len(result.links) - len(measured),
     }
 
 
-def node_numbers(links: Sequence[Link]) -> NDArray[np.int64]:
+def node_numbers(links: Links) -> NDArray[np.int64]:
     """Numbers of the key points that links join, in their order."""
-    return np.unique(np.array([(link.i, link.j) for link in links], dtype=np.int64))
+    return np.unique(np.concatenate([links.i, links.j]))
 
 
-def steps_back(links: Sequence[Link], nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+def steps_back(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     """(n,) nodes from the earlier to the later end of each link."""
-    ends = np.array([(link.i, link.j) for link in links], dtype=np.int64).reshape(-1, 2)
-    return np.diff(np.searchsorted(nodes, ends), axis=1)[:, 0]
+    return np.searchsorted(nodes, links.j) - np.searchsorted(nodes, links.i)
 
 
-def motion_errors(links: Sequence[Link], estimates: Sequence[Array], world_from_key: Array) -> Array:
+def motion_errors(links: Links, estimates: Array, world_from_key: Array) -> Array:
     """(n, 6) twist [rotation, translation] (rad, m) in j from the true to the estimated pose of j in i.
 
     Args:
-        estimates: (4, 4) of each link.
+        estimates: (n, 4, 4) of each link.
         world_from_key: (n_keys, 4, 4) true poses of the key points.
     """
-    ends = np.array([(link.i, link.j) for link in links], dtype=np.int64).reshape(-1, 2)
-    return _motion_errors(ends, np.array(estimates).reshape(-1, 4, 4), np.ascontiguousarray(world_from_key))
+    return _motion_errors(world_from_key[links.i], world_from_key[links.j], np.ascontiguousarray(estimates))
 
 
 @njit(cache=True, nogil=True)
-def _motion_errors(ends, estimates, world_from_key):
-    errors = np.empty((len(ends), 6))
-    for k in range(len(ends)):
-        i, j = ends[k]
-        errors[k] = geometry.log(geometry.inverse(world_from_key[j]) @ world_from_key[i] @ estimates[k])
+def _motion_errors(true_i, true_j, estimates):
+    errors = np.empty((len(true_i), 6))
+    for k in range(len(true_i)):
+        j_from_i = geometry.compose(geometry.inverse(true_j[k]), true_i[k])
+        geometry.put(errors[k], geometry.log(geometry.compose(j_from_i, estimates[k])))
     return errors
 
 
-def _figures(links: Sequence[Link], world_from_key: Array) -> dict[str, float | int | None]:
+def _figures(links: Links, world_from_key: Array) -> dict[str, float | int | None]:
     """Count, RMS errors and mean NEES (6 if right) of links; RMS errors of the closed form of those that have one."""
-    errors = motion_errors(links, [link.i_from_j for link in links], world_from_key)
-    covs = np.array([link.own_cov for link in links]).reshape(-1, 6, 6)
-    closed = [(link, link.closed_form) for link in links if link.closed_form is not None]
-    closed_errors = motion_errors([link for link, _ in closed], [motion for _, motion in closed], world_from_key)
+    errors = motion_errors(links, links.i_from_j, world_from_key)
+    closed, motions = links.by_closed_form
+    closed_errors = motion_errors(links.kept(closed), motions, world_from_key)
     return {
         "count": len(links),
         **_rmse(errors),
-        "nees_mean": mean(nees(errors, covs)),
+        "nees_mean": mean(nees(errors, links.own_cov)),
         **{f"closed_form_{key}": value for key, value in _rmse(closed_errors).items()},
     }
 

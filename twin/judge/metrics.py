@@ -80,7 +80,7 @@ def _flown(result: SurveyResult, truth: Truth) -> SurveyResult:
         key_frames=result.key_frames[:n],
         track_of_key=result.track_of_key[:n],
         node_cov=result.node_cov[:n],
-        links=[link for link in result.links if link.j < n],
+        links=result.links.kept(result.links.j < n),
         looks=[look for look in result.looks if look.row < n_frames],
     )
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.judge.links import node_numbers
+from twin.judge.links import node_numbers, steps_back
 from twin.judge.numbers import number, rms
 from twin.judge.trajectory import path_errors
-from twin.records import Array, Link, SurveyResult, Trajectory, Truth
+from twin.records import Array, Links, SurveyResult, Trajectory, Truth
 
 #: In the order in which they correct one another.
 STAGES = ("f2f", "chain", "online", "final")
@@ -41,9 +41,10 @@ def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, flo
     return {stage: _errors(Trajectory(true.times_s, paths[stage]), true) for stage in STAGES}
 
 
-def compose_chain(links: Sequence[Link], nodes: NDArray[np.int64]) -> Array:
+def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
     """Poses (n, 4, 4) of the nodes in the first one by the motions from each to the next; none if one is missing."""
-    motions = {(link.i, link.j): link.i_from_j for link in links}
+    chain = links.kept(steps_back(links, nodes) == 1)
+    motions = dict(zip(zip(chain.i.tolist(), chain.j.tolist(), strict=True), chain.i_from_j, strict=True))
     poses = [np.eye(4)]
     for step in pairwise(nodes.tolist()):
         if step not in motions:

@@ -110,13 +110,13 @@ def advance(body, command, n_steps):
     set_command(thrusters, command)
     for _ in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
-        acceleration[:] = free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench_of(thrusters))
+        wrench = wrench_of(thrusters)
+        geometry.put(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
         velocity += body.kick[0] * body.timestep_s * acceleration
         body.kick[0] = 1.0
-        turn = np.eye(4)
-        turn[:3, :3] = geometry.so3_exp(body.timestep_s * velocity[3:])
-        turned = geometry.compose(pose, turn)
+        turn = geometry.so3_exp(body.timestep_s * velocity[3:])
+        turned = geometry.compose(pose, geometry.pose(turn, np.zeros(3)))
         for i in range(3):
             turned[i, 3] += body.timestep_s * velocity[i]
-        pose[:] = turned
+        geometry.put(pose, turned)
         pass_step(thrusters)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from scenes.bluerov2 import Vehicle as Vessel
+from twin import geometry
 from twin.simulate.hydrodynamics import angular_first
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ class LaggedThrusters:
 def set_command(thrusters, command):
     """As `LaggedThrusters.command`."""
     cut = np.minimum(np.maximum(command, -1.0), 1.0)
-    thrusters.steady_n[:] = steady_thrust_n(cut, thrusters.coefficients)
+    geometry.put(thrusters.steady_n, steady_thrust_n(cut, thrusters.coefficients))
 
 
 @njit(cache=True, nogil=True)

@@ -51,26 +51,28 @@ class Chart:
 
     Attributes:
         seen: (rows, cols) cells that were marked.
-        steepness: (rows, cols) slope of the floor.
     """
 
     def __init__(self, grid: MapGrid, height_m: Map, rig: StereoRig):
         self.grid, self.height_m, self.seen, self._rig = grid, height_m, np.zeros(height_m.shape, np.bool_), rig
-        self._height = np.ascontiguousarray(height_m, np.float64)
-        down, east = np.gradient(self._height, grid.cell_m)
-        self._slope = np.ascontiguousarray(np.stack([east, -down], axis=-1))
-        self.steepness = np.hypot(*np.moveaxis(self._slope, -1, 0))
-        self._lowest_m = float(np.nanmin(self._height))
+        down, east = np.gradient(np.asarray(height_m, np.float64), grid.cell_m)
+        self._slope = np.stack([east, -down], axis=-1).astype(np.float32)
+        self._lowest_m = float(np.nanmin(height_m))
         self._place = (grid.west_m, grid.north_m, grid.cell_m)
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px - 1), float(rig.height_px - 1), rig.baseline_m,
         )  # fmt: skip
 
+    @property
+    def steepness(self) -> Map:
+        """(rows, cols) slope of the floor."""
+        return np.hypot(*np.moveaxis(self._slope, -1, 0))
+
     def see(self, world_from_camera: Array) -> None:
         """Marks the cells that a key point at this true pose sees with both eyes."""
         window = self._window(world_from_camera)
         camera_from_world = geometry.inverse(world_from_camera)
-        _mark(self.seen, self._height, self._slope, self._place, self._camera, camera_from_world, *window)
+        _mark(self.seen, self.height_m, self._place, self._camera, camera_from_world, *window)
 
     def hand_over(
         self,
@@ -100,7 +102,7 @@ class Chart:
         shift = believed @ camera_from_world[0]
         turn = geometry.adjoint(geometry.pose(believed[:3, :3], np.zeros(3)))
         depth_m = _hand_over(
-            height, variance, common, self._height, self._slope, self._place, self._camera, camera_from_world, last,
+            height, variance, common, self.height_m, self._slope, self._place, self._camera, camera_from_world, last,
             shift, believed[:3, 3].copy(), turn @ cov @ turn.T, rng.standard_normal(shape, np.float32),
             errors, row, col,
         )  # fmt: skip
@@ -151,7 +153,7 @@ def _depth_in(camera_from_world, camera, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def _mark(seen, height, slope, place, camera, camera_from_world, row, end_row, col, end_col):
+def _mark(seen, height, place, camera, camera_from_world, row, end_row, col, end_col):
     west, north, cell = place
     for i in range(row, end_row):
         y = north - (i + 0.5) * cell
@@ -179,7 +181,7 @@ def _hand_over(
             k, share = _between(errors.depths_m, depth)
             if errors.lost[i, j] > _mixed(errors.complete, k, share):
                 continue
-            sx, sy = slope[i, j]
+            sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
             # where this bit of floor is believed to be, and the surface there brought back to the cell's centre
             px = shift[0, 0] * x + shift[0, 1] * y + shift[0, 2] * z + shift[0, 3]
             py = shift[1, 0] * x + shift[1, 1] * y + shift[1, 2] * z + shift[1, 3]

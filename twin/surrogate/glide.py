@@ -31,7 +31,7 @@ def compiled(
     rate_hz = sea.mission.rig.frame_rate_hz
     gauges, n_steps = sea.sensors.gauges(), round(1 / rate_hz / vehicle.body.timestep_s)
 
-    def glide(course: Course, first: int, track: int) -> int:
+    def glide(course: Course, first: int) -> int:
         errors, ahead = vision.following, course.key_point[first:]
         end = first + (int(np.argmax(ahead)) if ahead.any() else len(ahead))
         if errors is None or end == first:
@@ -44,7 +44,7 @@ def compiled(
                 navigator.reckoning, navigator.instruments, pilot.helm, reference, numbers, n_steps, rate_hz,
             )  # fmt: skip
         times_s = np.arange(len(sea), len(sea) + n) / rate_hz
-        sea.record(true[:n], reference[0][:n], course.holding, track)
+        sea.record(true[:n])
         vision.last_pose, vision.last_numbers = true[n - 1], numbers[0][n - 1]
         navigator.go_on(reckoned)
         navigator.record(times_s, f2f[:n], online[:n])
@@ -62,11 +62,13 @@ def _fly(last, last_numbers, body, gauges, errors, reckoned, instruments, helm, 
     n = len(positions)
     true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
     for k in range(n):
-        true[k] = geometry.compose(body.pose, gauges.body_from_camera)
+        geometry.put(true[k], geometry.compose(body.pose, gauges.body_from_camera))
         height, angles, velocity = read_gauges(gauges, body.pose, twist_of(body), of_gauges[k], of_log[k])
         a_from_b = moved(errors, last, true[k], of_vision[k], last_numbers if k == 0 else of_vision[k - 1])
         reckoned, aided = reckon(reckoned, instruments, a_from_b, errors.cov, height, angles, velocity)
-        f2f[k], online[k], last = reckoned.f2f, reckoned.online, true[k]
+        geometry.put(f2f[k], reckoned.f2f)
+        geometry.put(online[k], reckoned.online)
+        last = true[k]
         twist = geometry.log(aided) * rate_hz
         command = steer(helm, reckoned.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)

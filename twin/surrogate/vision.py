@@ -114,7 +114,8 @@ class SurrogateVision:
         self._rays = stereo.normalised(self._pixels, rig)
         self.last_pose: Array | None = None  # true one of the last frame
         self.last_numbers = np.zeros(6)  # that its motion was drawn by
-        self._seen: dict[int, _Seen] = {}
+        self._poses: dict[int, Array] = {}  # true ones of all key points
+        self._seen: dict[int, _Seen] = {}  # those that links may be asked for
         self._now: _Seen | None = None
         self.looks: list[Look] = []
         self._f2f: FrameErrors | None = None
@@ -232,7 +233,7 @@ class SurrogateVision:
         shares = self._owners.shares(self._now.cells)
         if shares is None:
             return None
-        true = np.array([self._seen[number].pose for number in shares.numbers])
+        true = np.array([self._poses[number] for number in shares.numbers])
         offset = _offset(shares.believed, true, shares.parts, now, world_from_camera)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
         error = root @ self.draw(1)[0] * self.model.mosaic_excess
@@ -241,7 +242,7 @@ class SurrogateVision:
 
     def lay(self, number: int, world_from_camera: Array) -> None:
         assert self._now is not None
-        self._seen[number] = self._now
+        self._poses[number], self._seen[number] = self._now.pose, self._now
         self._owners.lay(number, world_from_camera, self._now.cells)
 
     def relay(self, keys: Sequence[KeyPoint]) -> None:
@@ -251,6 +252,10 @@ class SurrogateVision:
 
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
         return self.links(node, others, self.model)
+
+    def forget(self, numbers: range) -> None:
+        for number in numbers:
+            self._seen.pop(number, None)
 
     def links(self, node: KeyPoint, others: Sequence[KeyPoint], model: ErrorModel) -> list[Motion | None]:
         """What `measure` answers by this model."""
@@ -294,13 +299,12 @@ class SurrogateVision:
         model, mapper, shape = self.model, elevation.ElevationMapper(grid), (grid.rows, grid.cols)
         shared, lost = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
         believed = result.final.world_from_camera[result.key_frames]
-        seen = [self._seen[k] for k in range(len(believed))]
+        true = [self._poses[k] for k in range(len(believed))]
         depths_m, bounds_px = self._conditions.depths_m, self._conditions.bounds_px
         depth_px, complete = (np.array([law(b) for b in bounds_px]) for law in (model.depth_px, model.complete))
         errors = CellErrors(shared, lost, model.lateral_px, depths_m, depth_px * model.depth_excess, depth_px, complete)
-        for k, (here, following) in enumerate(zip(seen, [*seen[1:], None], strict=True)):
-            next_pose = None if following is None else following.pose
-            patch = self.chart.hand_over(here.pose, next_pose, believed[k], result.node_cov[k], errors, self._rng)
+        for k, (pose, next_pose) in enumerate(zip(true, [*true[1:], None], strict=True)):
+            patch = self.chart.hand_over(pose, next_pose, believed[k], result.node_cov[k], errors, self._rng)
             if patch is not None:
                 mapper.retire(patch)
             progress(k + 1)
@@ -380,7 +384,8 @@ def _link(
     a, b, farther_cov = a[:n], b[:n], cov * (1 + farther)
     covs, farther_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for k in range(n):
-        covs[k], farther_covs[k] = cov, farther_cov
+        geometry.put(covs[k], cov)
+        geometry.put(farther_covs[k], farther_cov)
     error, _, by_motion, information, _ = observation.linearised(a, b, b, farther_covs, covs, there_from_here, baseline)
     normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
     if n < _LEAST_OF_RASTER:

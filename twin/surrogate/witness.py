@@ -96,6 +96,10 @@ class Witness:
         self.images.relay(keys)
         self.surrogate.relay(keys)
 
+    def forget(self, numbers: range) -> None:
+        self.images.forget(numbers)
+        self.surrogate.forget(numbers)
+
     def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
         """The links of the images; those of the surrogate with all errors; and with one error alone."""
         model, answers = self.surrogate.model, {"images": self.images.measure(node, others)}

@@ -1,0 +1,69 @@
+"""What passes between the rooms, kept as arrays: rows that grow, links by columns."""
+
+import numpy as np
+import pytest
+
+from twin import geometry
+from twin.records import Link, Links, Rows
+
+
+def some_links(n):
+    rng = np.random.default_rng(n)
+    for k in range(n):
+        root = rng.normal(size=(6, 6)) * 0.01
+        motion, exact = geometry.exp(rng.normal(size=6)), geometry.exp(rng.normal(size=6)) if k % 3 else None
+        yield Link(k, k + 2, motion, root @ root.T + np.eye(6) * 1e-4, 0.1 * k, 10 * k, 1 + k % 4, exact)
+
+
+def assert_same(found, expected):
+    assert (found.i, found.j, found.n_points, found.shared_by) == expected[:2] + expected[5:7]
+    assert found.overlap == expected.overlap
+    for name in ("i_from_j", "cov", "own_cov"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9)
+    assert (found.closed_form is None) == (expected.closed_form is None)
+    if expected.closed_form is not None:
+        np.testing.assert_array_equal(found.closed_form, expected.closed_form)
+
+
+def test_rows_stay_when_their_room_grows():
+    numbers = np.arange(6.0).reshape(3, 2)
+    rows = Rows.of(numbers[:1].copy())
+    for row in numbers[1:]:
+        rows.add(row)
+    rows.add(10 + numbers)
+    np.testing.assert_array_equal(rows.array, np.concatenate([numbers, 10 + numbers]))
+
+
+def test_links_come_back_one_by_one_and_by_columns():
+    given = list(some_links(7))
+    links = Links(given[:2])
+    assert links.i.tolist() == [0, 1]
+    links.add(given[2:5])
+    links.add(given[5:])
+    assert len(links) == 7
+    for found, expected in zip(links, given, strict=True):
+        assert_same(found, expected)
+    assert [link.i for link in links[-2:]] == [5, 6]
+    assert links.j.tolist() == [link.j for link in given]
+    np.testing.assert_allclose(links.information @ links.cov, np.tile(np.eye(6), (7, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(links.own_cov, [link.own_cov for link in given], rtol=1e-9)
+
+
+def test_links_of_a_mask_keep_all_that_is_said_of_them_and_leave_the_others():
+    given, mask = list(some_links(9)), np.arange(9) % 2 == 0
+    links = Links(given)
+    kept = links.kept(mask)
+    for found, expected in zip(kept, given[::2], strict=True):
+        assert_same(found, expected)
+    kept.add(given[1:2])
+    assert kept.i.tolist() == [0, 2, 4, 6, 8, 1] and len(links) == 9
+    closed, forms = links.by_closed_form
+    assert closed.tolist() == [k % 3 != 0 for k in range(9)]
+    np.testing.assert_array_equal(forms, [link.closed_form for link in given if link.closed_form is not None])
+
+
+def test_no_links_have_empty_columns():
+    none = Links().kept(np.zeros(0, bool))
+    assert len(none) == 0 and none.cov.shape == none.own_cov.shape == (0, 6, 6) and none.i_from_j.shape == (0, 4, 4)
+    with pytest.raises(IndexError):
+        none[0]
