@@ -13,17 +13,8 @@ from twin import geometry
 from twin.config import Scenario
 from twin.judge import metrics as judge
 from twin.judge.map_error import height_error
-from twin.records import (
-    Alignment,
-    ElevationMap,
-    Link,
-    Links,
-    MapGrid,
-    StereoRig,
-    SurveyResult,
-    Trajectory,
-    Truth,
-)
+from twin.links import Link, Links
+from twin.records import Alignment, ElevationMap, MapGrid, StereoRig, SurveyResult, Trajectory, Truth
 from twin.scenario_file import dump_toml
 from twin.timing import Stopwatch
 

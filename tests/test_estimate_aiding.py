@@ -11,7 +11,8 @@ from twin.estimate.key_points import KeyPoint
 from twin.estimate.motion import Motion
 from twin.estimate.pose_filter import PoseFilter
 from twin.estimate.velocity_log import Displacement, VelocityLog, body_displacement, fuse, logged
-from twin.records import Link, Readings, SensorNoise, Sighting, StereoRig
+from twin.links import Link
+from twin.records import Readings, SensorNoise, Sighting, StereoRig
 
 MOUNT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, MOUNT)

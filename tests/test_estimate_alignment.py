@@ -5,7 +5,8 @@ import numpy as np
 from twin import geometry
 from twin.estimate.alignment import align
 from twin.estimate.key_points import KeyPoint
-from twin.records import Link, Readings, SensorNoise, StereoRig
+from twin.links import Link
+from twin.records import Readings, SensorNoise, StereoRig
 
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
 NOISE = SensorNoise(0.01, 0.003, 0.01)

@@ -12,7 +12,7 @@ from evo.core.trajectory import PosePath3D
 from twin import geometry
 from twin.estimate import block_cholesky, chordal, pose_graph
 from twin.exchange import posegraph
-from twin.records import Link
+from twin.links import Link
 
 DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 

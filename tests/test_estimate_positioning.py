@@ -20,7 +20,8 @@ from twin.estimate.motion import Motion
 from twin.estimate.pipeline import Navigator
 from twin.estimate.pose_filter import PoseFilter, aided
 from twin.estimate.trajectory import interpolate_between_keys
-from twin.records import Frame, Link, Readings, SensorNoise
+from twin.links import Link
+from twin.records import Frame, Readings, SensorNoise
 
 PATCH_PX = 11
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)

@@ -9,7 +9,8 @@ import pytest
 from twin import geometry
 from twin.errors import TwinError
 from twin.exchange import posegraph
-from twin.records import Link, Links, Trajectory
+from twin.links import Link, Links
+from twin.records import Trajectory
 
 UPPER = np.triu_indices(6)
 

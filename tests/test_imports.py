@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-BASICS = {"twin.config", "twin.scenario_file", "twin.records", "twin.geometry", "twin.errors", "twin.timing"}
+BASICS = {
+    "twin.config", "twin.scenario_file", "twin.records", "twin.links", "twin.rows", "twin.geometry", "twin.errors",
+    "twin.timing",
+}  # fmt: skip
 #: What each room may import of ours beside itself. The rest of twin/ (survey, cli, ...) may import everything.
 ROOMS = {
     "terrains": set(),

@@ -9,7 +9,8 @@ from judge_synthetic import link_between, survey
 from twin import geometry
 from twin.judge.links import link_metrics
 from twin.judge.stages import compose_chain, stage_metrics
-from twin.records import Link, Links, Trajectory
+from twin.links import Link, Links
+from twin.records import Trajectory
 
 RESULT, _, TRUTH, _ = survey()
 KEYS = TRUTH.trajectory.world_from_camera[RESULT.key_frames]

@@ -17,7 +17,8 @@ from twin.judge.metrics import check_require, evaluate, unflown
 from twin.judge.overlap import overlap_metrics
 from twin.judge.path import leg_numbers, travel_direction
 from twin.judge.require import more_is_better, number_paths
-from twin.records import ElevationMap, Links, MapGrid, Trajectory, Truth
+from twin.links import Links
+from twin.records import ElevationMap, MapGrid, Trajectory, Truth
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 

@@ -17,7 +17,8 @@ from twin.geometry import Array
 from twin.judge.coverage import true_heights
 from twin.mission import Course, Mission, Step
 from twin.pilot import PilotOfEstimates
-from twin.records import Frame, Image, Rows, Trajectory, Truth
+from twin.records import Frame, Image, Trajectory, Truth
+from twin.rows import Rows
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
 from twin.simulate.sensors import NavigationSensors

@@ -18,7 +18,8 @@ from twin.estimate.key_points import KeyPoint
 from twin.estimate.pose_graph import Pairs, Single, errors, log_derivatives
 from twin.estimate.velocity_log import body_displacement
 from twin.geometry import Array
-from twin.records import SensorNoise, StereoRig, inverses
+from twin.links import inverses
+from twin.records import SensorNoise, StereoRig
 
 
 def singles(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) -> list[Single]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from twin.estimate import aiding, pose_graph
 from twin.estimate.key_points import KeyPoint
 from twin.geometry import Array
-from twin.records import Link, Links, SensorNoise, StereoRig
+from twin.links import Link, Links
+from twin.records import SensorNoise, StereoRig
 
 Mask = NDArray[np.bool_]
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from twin.estimate.elimination import Indices
 from twin.estimate.pose_graph import Graph, State, given, motions, optimise, times, turned
 from twin.geometry import Array
-from twin.records import Link, Links
+from twin.links import Link, Links
 
 _HELD_SIGMA = 1e-6  # of the first pose [rad, m]
 

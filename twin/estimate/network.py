@@ -14,7 +14,8 @@ from twin import geometry
 from twin.estimate import matching, motion, observation, patches, stereo
 from twin.estimate.key_points import ImageSpool, KeyPoint
 from twin.geometry import Array
-from twin.records import Link, StereoRig
+from twin.links import Link
+from twin.records import StereoRig
 
 _SAME_SWATH = 2  # the paper's two previous key points on the same swath
 LEAST_SHARE = 0.3  # of matched points that agree on one motion

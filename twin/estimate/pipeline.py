@@ -25,7 +25,9 @@ from twin.estimate.trajectory import interpolate_between_keys
 from twin.estimate.velocity_log import VelocityLog
 from twin.estimate.vision import Vision
 from twin.geometry import Array
-from twin.records import Alignment, Estimate, Frame, Link, Links, Rows, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.links import Link, Links
+from twin.records import Alignment, Estimate, Frame, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.rows import Rows
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
@@ -298,8 +300,9 @@ class Navigator:
         self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
         self.dropped += aligned.dropped
         if aligned.dropped:
-            dropped, ends = {link[:2] for link in aligned.dropped}, zip(self.links.i, self.links.j, strict=True)
-            self.links = self.links.kept(np.array([end not in dropped for end in ends]))
+            dropped = {link[:2] for link in aligned.dropped}
+            ends = zip(self.links.i.tolist(), self.links.j.tolist(), strict=True)
+            self.links = self.links.kept(np.array([pair not in dropped for pair in ends]))
         poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
         self._move_keys({number: pose for number, pose in poses.items() if number >= first})
         return aligned

@@ -21,7 +21,7 @@ from twin import geometry
 from twin.estimate import block_cholesky, elimination
 from twin.estimate.elimination import Indices
 from twin.geometry import Array
-from twin.records import Link, Links, inverses
+from twin.links import Link, Links, inverses
 
 #: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.

@@ -15,7 +15,8 @@ import numpy as np
 from twin import geometry
 from twin.errors import TwinError
 from twin.geometry import Array
-from twin.records import Link, SurveyResult
+from twin.links import Link
+from twin.records import SurveyResult
 
 _ROTATION_LAST = [3, 4, 5, 0, 1, 2]  # g2o and TORO order translation first
 _UPPER = np.triu_indices(6)

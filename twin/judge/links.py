@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from twin import geometry
 from twin.judge.consistency import nees
 from twin.judge.numbers import mean, rms
-from twin.records import Array, Links, SurveyResult, Truth
+from twin.links import Links
+from twin.records import Array, SurveyResult, Truth
 
 #: A link "along" reaches back to one of the two nodes before (the paper's), one "across" farther: to the longest base
 #: on the same swath, to neighbouring swaths, to where loops began.

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from twin.judge.links import node_numbers, steps_back
 from twin.judge.numbers import number, rms
 from twin.judge.trajectory import path_errors
-from twin.records import Array, Links, SurveyResult, Trajectory, Truth
+from twin.links import Links
+from twin.records import Array, SurveyResult, Trajectory, Truth
 
 #: In the order in which they correct one another.
 STAGES = ("f2f", "chain", "online", "final")

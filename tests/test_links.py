@@ -1,10 +1,11 @@
-"""What passes between the rooms, kept as arrays: rows that grow, links by columns."""
+"""Rows that grow, and links by columns."""
 
 import numpy as np
 import pytest
 
 from twin import geometry
-from twin.records import Link, Links, Rows
+from twin.links import Link, Links
+from twin.rows import Rows
 
 
 def some_links(n):
@@ -57,7 +58,7 @@ def test_links_of_a_mask_keep_all_that_is_said_of_them_and_leave_the_others():
         assert_same(found, expected)
     kept.add(given[1:2])
     assert kept.i.tolist() == [0, 2, 4, 6, 8, 1] and len(links) == 9
-    closed, forms = links.by_closed_form
+    closed, forms = Links(given).by_closed_form
     assert closed.tolist() == [k % 3 != 0 for k in range(9)]
     np.testing.assert_array_equal(forms, [link.closed_form for link in given if link.closed_form is not None])
 
