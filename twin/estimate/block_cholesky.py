@@ -66,14 +66,22 @@ class Factor(NamedTuple):
         return matrix[:own], matrix[own:]
 
 
-def factorise(structure: Structure, diagonal: Array, off: Array) -> Factor:
+def room_for(structure: Structure) -> Array:
+    """Room for a factor's panels."""
+    return np.empty(structure.at[-1])
+
+
+def factorise(structure: Structure, diagonal: Array, off: Array, panels: Array) -> Factor:
     """Factors of the matrix with blocks (n, 6, 6) on the diagonal and (m, 6, 6) off it.
+
+    Args:
+        panels: room for them; an earlier factor in it is lost.
 
     Raises:
         LinAlgError: it is not positive definite, to rounding.
     """
     s = structure
-    panels, whole = np.zeros(s.at[-1]), np.empty((len(s.place), _D))
+    panels[:], whole = 0.0, np.empty((len(s.place), _D))
     whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
     _place(s, diagonal, off, panels)
     if not _eliminate(s, whole.reshape(-1), panels):
@@ -113,9 +121,19 @@ def _eliminate(s, whole, panels):
             return False
         geometry.put(panel[:n], inverse)
         if len(panel) > n:
-            geometry.put(panel[n:], np.dot(panel[n:], inverse.T))
-            square = np.dot(panel[n:], panel[n:].T)
-            _exchange(square, s.rows[s.below[p] : s.below[p + 1]], s, panels, False)
+            rest, places = np.dot(panel[n:], inverse.T), s.rows[s.below[p] : s.below[p + 1]]
+            geometry.put(panel[n:], rest)
+            start = 0
+            while start < len(places):
+                end, above, at = _next_above(s, places, start)
+                square = np.dot(rest[_D * start :], rest[_D * start : _D * end].T)
+                matrix = _panel_of(s, panels, above)
+                for b in range(len(at)):
+                    for a in range(min(b + 1, end - start)):
+                        for i in range(_D):
+                            for k in range(_D):
+                                matrix[_D * at[b] + i, _D * at[a] + k] -= square[_D * b + i, _D * a + k]
+                start = end
     return True
 
 
@@ -149,45 +167,58 @@ def _invert_root(matrix, whole, inverse):
 
 
 @njit(cache=True, nogil=True)
-def _exchange(square, places, s, panels, fill):
-    """Takes a square's blocks (lower half) of these places from the panels that have them; or fills it with theirs."""
-    start = 0
-    while start < len(places):
-        p = s.panel_of[places[start]]
-        width, end = s.first[p + 1] - s.first[p], start
-        while end < len(places) and places[end] < s.first[p + 1]:
-            end += 1
-        panel, row = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width), s.below[p]
-        for b in range(start, len(places)):
-            y = places[b] - s.first[p]
-            if y >= width:
-                while s.rows[row] != places[b]:
-                    row += 1
-                y = width + row - s.below[p]
-            for a in range(start, min(b + 1, end)):
-                x = places[a] - s.first[p]
-                for i in range(_D):
-                    for j in range(_D):
-                        if fill:
-                            square[_D * b + i, _D * a + j] = panel[_D * y + i, _D * x + j]
-                            square[_D * a + j, _D * b + i] = panel[_D * y + i, _D * x + j]
-                        else:
-                            panel[_D * y + i, _D * x + j] -= square[_D * b + i, _D * a + j]
-        start = end
+def _panel_of(s, panels, p):
+    """A panel as a matrix."""
+    return panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * (s.first[p + 1] - s.first[p]))
+
+
+@njit(cache=True, nogil=True)
+def _next_above(s, places, start):
+    """The panel that has the place at `start` and, up to an end, the next ones; and the blocks of its rows for them all.
+
+    Args:
+        places: below a panel, rising.
+
+    Returns:
+        end, panel, rows (len(places) - start,).
+    """
+    p, end = s.panel_of[places[start]], start
+    while end < len(places) and places[end] < s.first[p + 1]:
+        end += 1
+    at, row = np.empty(len(places) - start, np.int64), s.below[p]
+    for k in range(start, len(places)):
+        if k < end:
+            at[k - start] = places[k] - s.first[p]
+        else:
+            while s.rows[row] != places[k]:
+                row += 1
+            at[k - start] = s.first[p + 1] - s.first[p] + row - s.below[p]
+    return end, p, at
 
 
 @njit(cache=True, nogil=True)
 def _invert(s, panels, diagonal):
     """Turns L1^-1 over L2 of each panel into the inverse's blocks there, and fills those on its diagonal (n, 6, 6)."""
     for p in range(len(s.first) - 2, -1, -1):
-        width = s.first[p + 1] - s.first[p]
+        panel, width = _panel_of(s, panels, p), s.first[p + 1] - s.first[p]
         n = _D * width
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, n)
         own = np.dot(panel[:n].T, panel[:n])
         if len(panel) > n:
-            later, weight = np.empty((len(panel) - n, len(panel) - n)), np.dot(panel[n:], panel[:n])
-            _exchange(later, s.rows[s.below[p] : s.below[p + 1]], s, panels, True)
-            across = np.dot(later, weight)
+            weight, places = np.dot(panel[n:], panel[:n]), s.rows[s.below[p] : s.below[p + 1]]
+            across, start = np.zeros_like(weight), 0
+            while start < len(places):
+                end, above, at = _next_above(s, places, start)
+                part, matrix = np.empty((_D * len(at), _D * (end - start))), _panel_of(s, panels, above)
+                for b in range(len(at)):
+                    for a in range(end - start):
+                        for i in range(_D):
+                            for k in range(_D):
+                                part[_D * b + i, _D * a + k] = matrix[_D * at[b] + i, _D * at[a] + k]
+                here, later = slice(_D * start, _D * end), slice(_D * end, None)
+                across[_D * start :] += np.dot(part, weight[here])
+                if end < len(places):
+                    across[here] += np.dot(part[_D * (end - start) :].T, weight[later])
+                start = end
             own += np.dot(weight.T, across)
             geometry.put(panel[n:], -across)
         geometry.put(panel[:n], own)

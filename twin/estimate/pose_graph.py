@@ -27,6 +27,7 @@ from twin.links import Link, Links, inverses
 #: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
 _BEYOND_LINEAR = 5e-4
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-6  # of the diagonal
+_TOGETHER = 4096  # pairs whose derivatives are held at a time
 
 
 class Single(NamedTuple):
@@ -81,12 +82,12 @@ class State(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """A graph at a state: F, residuals (m, d) of singles; of pairs residuals, motions and weights; their chi2 (m,)."""
+    """A graph at a state: F, residuals (m, d) of singles; of pairs residuals and weights (m,); their chi2 (m,)."""
 
     state: State
     cost: float
     singles: list[Array]
-    pairs: list[tuple[Array, Array, Array]]
+    pairs: list[tuple[Array, Array]]
     chi2: list[Array]
 
 
@@ -150,9 +151,9 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
     i, j = np.concatenate([nobody, *(p.i for p in graph.pairs)]), np.concatenate([nobody, *(p.j for p in graph.pairs)])
     structure = elimination.analyse(graph.n, i, j)
     seen, damping, reached = _look(graph, start), 0.0, False
-    system = _equations(graph, seen)
+    system, room = _equations(graph, seen), block_cholesky.room_for(structure)
     while True:
-        step = _step(structure, system, damping)
+        step = _step(structure, system, damping, room)
         moved = State(_moved(seen.state.poses, step.poses), seen.state.shared + step.shared)
         expected = -0.5 * (np.sum(system.gradient * step.poses) + system.shared_gradient * step.shared)
         after, iterations = _look(graph, moved), iterations - 1
@@ -166,7 +167,7 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
         if reached or iterations <= 0:
             break
     if step.damping:  # covariances are those of the equations as they are
-        step = _step(structure, system, 0.0)
+        step = _step(structure, system, 0.0, room)
     return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
 
 
@@ -180,7 +181,7 @@ class _Step(NamedTuple):
     border: tuple[Array, float] | None
 
 
-def _step(structure: elimination.Structure, system: _System, damping: float) -> _Step:
+def _step(structure: elimination.Structure, system: _System, damping: float, room: Array) -> _Step:
     """Solves the bordered equations by the block below the corner."""
     diagonal = system.diagonal
     if damping:
@@ -188,7 +189,7 @@ def _step(structure: elimination.Structure, system: _System, damping: float) -> 
         diagonal = diagonal.copy()
         diagonal[:, axes, axes] *= 1 + damping
     try:
-        factor = block_cholesky.factorise(structure, diagonal, system.off)
+        factor = block_cholesky.factorise(structure, diagonal, system.off, room)
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("not every pose is held") from None
     poses = factor.solve(-system.gradient)
@@ -209,12 +210,11 @@ def _look(graph: Graph, state: State) -> _Seen:
         cost += float(_squares(residuals, single.information).sum()) / 2
         singles.append(residuals)
     for pair in graph.pairs:
-        i_from_j = _between(state.poses[pair.i], state.poses[pair.j])
-        residuals = pair.observe(i_from_j, state.shared)
+        residuals = pair.observe(_between(state.poses, pair.i, pair.j), state.shared)
         chi2.append(_squares(residuals, pair.information))
         losses, weights = _robust(chi2[-1], pair.huber)
         cost += float(losses.sum())
-        pairs.append((residuals, i_from_j, weights))
+        pairs.append((residuals, weights))
     return _Seen(state, cost, singles, pairs, chi2)
 
 
@@ -239,15 +239,19 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
         weighted = turned(by_pose) @ single.information
         diagonal += _summed(graph.n, single.at, weighted @ by_pose)
         gradient += _summed(graph.n, single.at, times(weighted, residuals))
-    for pair, (residuals, i_from_j, weights) in zip(graph.pairs, seen.pairs, strict=True):
-        by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
-        across, done = off[done : done + len(pair.i)], done + len(pair.i)
-        _add_pairs(pair.i, pair.j, by_j, pair.information, weights, residuals, i_from_j, diagonal, across, gradient)
-        if by_shared is not None:
-            informed = weights[:, None] * times(pair.information, by_shared)
-            _add_border(pair.i, pair.j, by_j, informed, i_from_j, border)
-            corner += float(np.sum(informed * by_shared))
-            shared_gradient += float(np.sum(informed * residuals))
+    for pair, every in zip(graph.pairs, seen.pairs, strict=True):
+        for first in range(0, len(pair.i), _TOGETHER):
+            some = slice(first, first + _TOGETHER)
+            i, j, information, (residuals, weights) = *(x[some] for x in pair[:3]), (x[some] for x in every)
+            i_from_j = _between(seen.state.poses, i, j)
+            by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
+            across, done = off[done : done + len(i)], done + len(i)
+            _add_pairs(i, j, by_j, information, weights, residuals, i_from_j, diagonal, across, gradient)
+            if by_shared is not None:
+                informed = weights[:, None] * times(information, by_shared)
+                _add_border(i, j, by_j, informed, i_from_j, border)
+                corner += float(np.sum(informed * by_shared))
+                shared_gradient += float(np.sum(informed * residuals))
     return _System(diagonal, off, gradient, border, corner, shared_gradient)
 
 
@@ -346,9 +350,13 @@ def _moved(poses, steps):
     return moved
 
 
-def _between(a: Array, b: Array) -> Array:
-    """a_from_b (m, 4, 4) of poses in the world."""
-    return _inverses(a) @ b
+@njit(cache=True, nogil=True)
+def _between(poses, first, second):
+    """(m, 4, 4) poses of the second in the first of pairs."""
+    found = np.empty((len(first), 4, 4))
+    for k in range(len(first)):
+        geometry.put(found[k], geometry.compose(geometry.inverse(poses[first[k]]), poses[second[k]]))
+    return found
 
 
 def _inverses(poses: Array) -> Array:
