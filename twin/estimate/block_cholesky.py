@@ -174,13 +174,9 @@ def _panel_of(s, panels, p):
 
 @njit(cache=True, nogil=True)
 def _next_above(s, places, start):
-    """The panel that has the place at `start` and, up to an end, the next ones; and the blocks of its rows for them all.
+    """The end of those places below a panel, rising from `start`, that one panel has; which panel, and its rows of all.
 
-    Args:
-        places: below a panel, rising.
-
-    Returns:
-        end, panel, rows (len(places) - start,).
+    Rows (len(places) - start,) are counted in blocks: of its own places and of those below it.
     """
     p, end = s.panel_of[places[start]], start
     while end < len(places) and places[end] < s.first[p + 1]:

@@ -242,7 +242,8 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
     for pair, every in zip(graph.pairs, seen.pairs, strict=True):
         for first in range(0, len(pair.i), _TOGETHER):
             some = slice(first, first + _TOGETHER)
-            i, j, information, (residuals, weights) = *(x[some] for x in pair[:3]), (x[some] for x in every)
+            i, j, information = pair.i[some], pair.j[some], pair.information[some]
+            residuals, weights = (of_all[some] for of_all in every)
             i_from_j = _between(seen.state.poses, i, j)
             by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
             across, done = off[done : done + len(i)], done + len(i)
