@@ -17,7 +17,7 @@ from twin.geometry import Array
 from twin.judge.coverage import true_heights
 from twin.mission import Course, Mission, Step
 from twin.pilot import PilotOfEstimates
-from twin.records import Frame, Image, Trajectory, Truth
+from twin.records import Frame, Image, StereoRig, Trajectory, Truth
 from twin.rows import Rows
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
@@ -82,7 +82,7 @@ class Sea(ABC):
     @property
     def world_from_camera(self) -> Array:
         """(4, 4) true pose of the left camera."""
-        return geometry.compose(self.vehicle.world_from_body, self.mission.rig.body_from_camera)
+        return left_camera(self.vehicle, self.mission.rig)
 
     def begin(self, course: Course, track: int) -> None:
         """The frames that follow are those of this course, all of them unless the survey breaks off."""
@@ -126,6 +126,11 @@ class Sea(ABC):
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
         )
+
+
+def left_camera(vehicle: Vehicle | FreeBody | Carrier, rig: StereoRig) -> Array:
+    """(4, 4) world_from_camera of the left one, where the vehicle is now."""
+    return geometry.compose(vehicle.world_from_body, rig.body_from_camera)
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from twin.geometry import Array
 from twin.judge.coverage import true_heights
 from twin.mission import Mission, Step
 from twin.pilot import PilotOfEstimates, RovPilot
-from twin.sea import Glide, Sea, Sight, Watch, streams
+from twin.sea import Glide, Sea, Sight, Watch, left_camera, streams
 from twin.simulate.carrier import Carrier
 from twin.simulate.free_body import FreeBody
 from twin.simulate.hull import physics_timestep_s
@@ -44,7 +45,8 @@ class SurrogateSea(Sea):
         super().__init__(
             mission, watch, vehicle, NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
         )
-        self._told = vision_beside(mission, calibration.model, lambda: self.world_from_camera, watch)
+        # not of `self`, which holds the vision: a survey that is over gives its memory back at once
+        self._told = vision_beside(mission, calibration.model, partial(left_camera, vehicle, rig), watch)
         self.vision = self._told
         outside = calibration.outside(*self._told.bounds_px)
         self.warnings = (f"surrogate: {outside}",) if outside else ()
