@@ -50,9 +50,12 @@ NETWORKS = {
 
 
 def factor_of(structure, diagonal, off):
-    room = block_cholesky.room_for(structure)
-    room[:] = np.nan  # nothing of it counts
-    return block_cholesky.factorise(structure, diagonal, off, room)
+    matrix = block_cholesky.Matrix.room(structure)
+    matrix.panels[:] = np.nan  # nothing of it counts
+    matrix.clear()
+    matrix.add(0, off[:3])
+    matrix.add(3, off[3:])
+    return matrix.factorise(diagonal)
 
 
 @pytest.fixture(params=NETWORKS, ids=list(NETWORKS))

@@ -66,56 +66,72 @@ class Factor(NamedTuple):
         return matrix[:own], matrix[own:]
 
 
-def room_for(structure: Structure) -> Array:
-    """Room for a factor's panels."""
-    return np.empty(structure.at[-1])
+class Matrix(NamedTuple):
+    """A symmetric matrix, its blocks in the panels of the factor that it will become."""
 
+    structure: Structure
+    panels: Array
 
-def factorise(structure: Structure, diagonal: Array, off: Array, panels: Array) -> Factor:
-    """Factors of the matrix with blocks (n, 6, 6) on the diagonal and (m, 6, 6) off it.
+    @classmethod
+    def room(cls, structure: Structure) -> Matrix:
+        """One of this pattern; what is in it is not defined."""
+        return cls(structure, np.empty(structure.at[-1]))
 
-    Args:
-        panels: room for them; an earlier factor in it is lost.
+    def clear(self) -> None:
+        """Sets all blocks to zero."""
+        self.panels[:] = 0.0
 
-    Raises:
-        LinAlgError: it is not positive definite, to rounding.
-    """
-    s = structure
-    panels[:], whole = 0.0, np.empty((len(s.place), _D))
-    whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
-    _place(s, diagonal, off, panels)
-    if not _eliminate(s, whole.reshape(-1), panels):
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return Factor(structure, panels)
+    def add(self, first: int, blocks: Array) -> None:
+        """Adds blocks (k, 6, 6) of the pairs from this one on."""
+        _add(self.structure, first, blocks, self.panels)
+
+    def factorise(self, diagonal: Array) -> Factor:
+        """Its factor, with these blocks (n, 6, 6) on the diagonal. It takes the place of the matrix, which is used up.
+
+        Raises:
+            LinAlgError: it is not positive definite, to rounding.
+        """
+        s, whole = self.structure, np.empty((len(diagonal), _D))
+        whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
+        _put_diagonal(s, diagonal, self.panels)
+        if not _eliminate(s, whole.reshape(-1), self.panels):
+            raise np.linalg.LinAlgError("the matrix is not positive definite")
+        return Factor(s, self.panels)
 
 
 @njit(cache=True, nogil=True)
-def _place(s, diagonal, off, panels):
-    """Adds the blocks of the matrix to the panels."""
+def _put_diagonal(s, diagonal, panels):
     for k in range(len(diagonal)):
         p = s.panel_of[s.place[k]]
-        width, x = s.first[p + 1] - s.first[p], s.place[k] - s.first[p]
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width)
-        geometry.put(panel[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
-    for k in range(len(off)):
-        row, column = s.pairs[k]
+        x = s.place[k] - s.first[p]
+        geometry.put(_panel_of(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
+
+
+@njit(cache=True, nogil=True)
+def _add(s, start, blocks, panels):
+    for k in range(len(blocks)):
+        row, column = s.pairs[start + k]
         p = s.panel_of[column]
         width, x = s.first[p + 1] - s.first[p], column - s.first[p]
-        y = row - s.first[p]
+        y, panel = row - s.first[p], _panel_of(s, panels, p)
         if y >= width:
             y = width + np.searchsorted(s.rows[s.below[p] : s.below[p + 1]], row)
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * width)
         for i in range(_D):
             for j in range(_D):
-                panel[_D * y + i, _D * x + j] += off[k, j, i] if s.turned[k] else off[k, i, j]
+                panel[_D * y + i, _D * x + j] += blocks[k, j, i] if s.turned[start + k] else blocks[k, i, j]
+
+
+@njit(cache=True, nogil=True)
+def _panel_of(s, panels, p):
+    """A panel as a matrix."""
+    return panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * (s.first[p + 1] - s.first[p]))
 
 
 @njit(cache=True, nogil=True)
 def _eliminate(s, whole, panels):
     """Turns each panel into L1^-1 over L2; whether every node is held, by the diagonal (6 n,) as it was."""
     for p in range(len(s.first) - 1):
-        n = _D * (s.first[p + 1] - s.first[p])
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, n)
+        n, panel = _D * (s.first[p + 1] - s.first[p]), _panel_of(s, panels, p)
         inverse = np.zeros((n, n))
         if not _invert_root(panel[:n], whole[_D * s.first[p] : _D * s.first[p + 1]], inverse):
             return False
@@ -164,12 +180,6 @@ def _invert_root(matrix, whole, inverse):
             inverse[i, m] *= per_pivot
         inverse[i, i] = per_pivot
     return True
-
-
-@njit(cache=True, nogil=True)
-def _panel_of(s, panels, p):
-    """A panel as a matrix."""
-    return panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * (s.first[p + 1] - s.first[p]))
 
 
 @njit(cache=True, nogil=True)
@@ -227,7 +237,7 @@ def _substitute(s, panels, x):
     """Solves in place, x (6 n,) by place: forwards by L, backwards by its transpose."""
     for p in range(len(s.first) - 1):
         own = x[_D * s.first[p] : _D * s.first[p + 1]]
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, len(own))
+        panel = _panel_of(s, panels, p)
         geometry.put(own, np.dot(panel[: len(own)], own))
         if len(panel) > len(own):
             known = np.dot(panel[len(own) :], own)
@@ -236,7 +246,7 @@ def _substitute(s, panels, x):
                     x[_D * s.rows[k] + i] -= known[_D * (k - s.below[p]) + i]
     for p in range(len(s.first) - 2, -1, -1):
         own = x[_D * s.first[p] : _D * s.first[p + 1]]
-        panel = panels[s.at[p] : s.at[p + 1]].reshape(-1, len(own))
+        panel = _panel_of(s, panels, p)
         if len(panel) > len(own):
             later = np.empty(len(panel) - len(own))
             for k in range(s.below[p], s.below[p + 1]):

@@ -92,11 +92,10 @@ class _Seen(NamedTuple):
 
 
 class _System(NamedTuple):
-    """Normal equations: blocks (n, 6, 6) and, by pair, (m, 6, 6), gradient (n, 6); border (n, 6), corner and gradient
-    of what is shared."""
+    """Normal equations beside the blocks between poses: blocks (n, 6, 6) on the diagonal, gradient (n, 6); border
+    (n, 6), corner and gradient of what is shared."""
 
     diagonal: Array
-    off: Array
     gradient: Array
     border: Array
     corner: float
@@ -149,25 +148,23 @@ def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
     """
     nobody = np.empty(0, np.int64)
     i, j = np.concatenate([nobody, *(p.i for p in graph.pairs)]), np.concatenate([nobody, *(p.j for p in graph.pairs)])
-    structure = elimination.analyse(graph.n, i, j)
+    matrix = block_cholesky.Matrix.room(elimination.analyse(graph.n, i, j))
     seen, damping, reached = _look(graph, start), 0.0, False
-    system, room = _equations(graph, seen), block_cholesky.room_for(structure)
     while True:
-        step = _step(structure, system, damping, room)
+        system = _equations(graph, seen, matrix)
+        step = _step(matrix, system, damping)
         moved = State(_moved(seen.state.poses, step.poses), seen.state.shared + step.shared)
         expected = -0.5 * (np.sum(system.gradient * step.poses) + system.shared_gradient * step.shared)
         after, iterations = _look(graph, moved), iterations - 1
         if after.cost <= seen.cost + _BEYOND_LINEAR:
             reached = damping == 0 and abs(seen.cost - after.cost - expected) < _BEYOND_LINEAR
             seen, damping = after, damping / 10 if damping > _LEAST_DAMPING else 0.0
-            if not reached and iterations > 0:
-                system = _equations(graph, seen)
         else:
             damping = max(10 * damping, _FIRST_DAMPING)
         if reached or iterations <= 0:
             break
     if step.damping:  # covariances are those of the equations as they are
-        step = _step(structure, system, 0.0, room)
+        step = _step(matrix, _equations(graph, seen, matrix), 0.0)
     return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
 
 
@@ -181,15 +178,15 @@ class _Step(NamedTuple):
     border: tuple[Array, float] | None
 
 
-def _step(structure: elimination.Structure, system: _System, damping: float, room: Array) -> _Step:
-    """Solves the bordered equations by the block below the corner."""
+def _step(matrix: block_cholesky.Matrix, system: _System, damping: float) -> _Step:
+    """Solves the bordered equations by the block below the corner; uses the matrix up."""
     diagonal = system.diagonal
     if damping:
         axes = np.arange(6)
         diagonal = diagonal.copy()
         diagonal[:, axes, axes] *= 1 + damping
     try:
-        factor = block_cholesky.factorise(structure, diagonal, system.off, room)
+        factor = matrix.factorise(diagonal)
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("not every pose is held") from None
     poses = factor.solve(-system.gradient)
@@ -228,12 +225,13 @@ def _robust(chi2: Array, huber: float | None) -> tuple[Array, Array]:
     return np.where(within, chi2 / 2, huber * (length - huber / 2)), weights
 
 
-def _equations(graph: Graph, seen: _Seen) -> _System:
-    """Normal equations of all residuals."""
+def _equations(graph: Graph, seen: _Seen, matrix: block_cholesky.Matrix) -> _System:
+    """Normal equations of all residuals; the blocks between poses go into the matrix."""
     diagonal, gradient, border = np.zeros((graph.n, 6, 6)), np.zeros((graph.n, 6)), np.zeros((graph.n, 6))
     corner = 0.0 if graph.shared_sigma is None else graph.shared_sigma**-2
     shared_gradient = corner * seen.state.shared
-    off, done = np.empty((sum(len(pair.i) for pair in graph.pairs), 6, 6)), 0
+    done = 0
+    matrix.clear()
     for single, residuals in zip(graph.singles, seen.singles, strict=True):
         by_pose = single.derive(seen.state.poses[single.at], residuals)
         weighted = turned(by_pose) @ single.information
@@ -246,14 +244,16 @@ def _equations(graph: Graph, seen: _Seen) -> _System:
             residuals, weights = (of_all[some] for of_all in every)
             i_from_j = _between(seen.state.poses, i, j)
             by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
-            across, done = off[done : done + len(i)], done + len(i)
+            across = np.empty((len(i), 6, 6))
             _add_pairs(i, j, by_j, information, weights, residuals, i_from_j, diagonal, across, gradient)
+            matrix.add(done, across)
+            done += len(i)
             if by_shared is not None:
                 informed = weights[:, None] * times(information, by_shared)
                 _add_border(i, j, by_j, informed, i_from_j, border)
                 corner += float(np.sum(informed * by_shared))
                 shared_gradient += float(np.sum(informed * residuals))
-    return _System(diagonal, off, gradient, border, corner, shared_gradient)
+    return _System(diagonal, gradient, border, corner, shared_gradient)
 
 
 @njit(cache=True, nogil=True)
