@@ -66,10 +66,13 @@ def align(
         if not wrong.any():
             break
         dropped += fit.links.kept(wrong)
-        fit = fit.without(wrong)
-        found = fit.optimise(found.state, _FEW_ITERATIONS)
+        fit, state = fit.without(wrong), found.state
+        del found  # its factor goes before the next one comes
+        found = fit.optimise(state, _FEW_ITERATIONS)
     if not found.reached:
-        found = fit.optimise(found.state, _MOST_ITERATIONS)
+        state = found.state
+        del found
+        found = fit.optimise(state, _MOST_ITERATIONS)
     return Aligned(found.state.poses, _marginals(found, marginals_of, places), dropped)
 
 

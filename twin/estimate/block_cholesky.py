@@ -4,8 +4,8 @@ Supernodal and right-looking (Davis 2006, chapter 4): a panel of nodes that is d
 after it, so that beside the panels nothing is kept.
 
 Marginals by Takahashi et al. (1973): from the last panel back, of W = L2 L1^-1 with L1 the panel's triangle, L2 the
-rows below it, cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. What is below is in the
-panel of the first node below, or below that.
+rows below it, cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. The panels after it hold
+all of cov(below) by then, in the place of their part of the factor.
 """
 
 from __future__ import annotations
@@ -220,10 +220,10 @@ def _invert(s, panels, diagonal):
                         for i in range(_D):
                             for k in range(_D):
                                 part[_D * b + i, _D * a + k] = matrix[_D * at[b] + i, _D * at[a] + k]
-                here, later = slice(_D * start, _D * end), slice(_D * end, None)
-                across[_D * start :] += np.dot(part, weight[here])
+                onwards, here = across[_D * start :], across[_D * start : _D * end]
+                onwards += np.dot(part, weight[_D * start : _D * end])
                 if end < len(places):
-                    across[here] += np.dot(part[_D * (end - start) :].T, weight[later])
+                    here += np.dot(part[_D * (end - start) :].T, weight[_D * end :])
                 start = end
             own += np.dot(weight.T, across)
             geometry.put(panel[n:], -across)
