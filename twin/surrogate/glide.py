@@ -14,7 +14,8 @@ from twin.mission import Course
 from twin.pilot import RovPilot, steer
 from twin.simulate.free_body import FreeBody, advance, is_lost, twist_of
 from twin.simulate.sensors import read_gauges
-from twin.surrogate.vision import SurrogateVision, moved
+from twin.surrogate.drawn import moved
+from twin.surrogate.vision import SurrogateVision
 
 if TYPE_CHECKING:
     from twin.sea import Glide

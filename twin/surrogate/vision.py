@@ -14,12 +14,11 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin import geometry
 from twin.config import Estimation
-from twin.estimate import elevation, network, observation, stereo
+from twin.estimate import elevation, network, stereo
 from twin.estimate.f2f import MOST_POINTS as F2F_POINTS
 from twin.estimate.f2f import coast
 from twin.estimate.key_points import KeyPoint
@@ -28,6 +27,7 @@ from twin.estimate.motion import Motion
 from twin.estimate.stereo import StereoPoints
 from twin.geometry import Array
 from twin.records import ElevationMap, Frame, Look, MapGrid, StereoRig, SurveyResult
+from twin.surrogate import drawn
 from twin.surrogate.chart import CellErrors, Chart
 from twin.surrogate.conditions import Conditions
 from twin.surrogate.floor import Floor
@@ -36,8 +36,7 @@ from twin.surrogate.owners import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
 _FIELD = 128  # cells of the floor until what it makes matches err by is the same again
-_LEAST_POINTS = 12  # of those they stand for
-_LEAST_OF_RASTER = 6  # of these, for a motion
+_LEAST_POINTS = 12  # of those that the raster stands for
 _BLOCK = 4096  # numbers drawn at a time
 
 
@@ -165,7 +164,7 @@ class SurrogateVision:
         if self._f2f is None:
             return coast(self._last_motion)
         numbers = self.draw(1)[0]
-        self._last_motion = moved(self._f2f, last, now, numbers, self.last_numbers)
+        self._last_motion = drawn.moved(self._f2f, last, now, numbers, self.last_numbers)
         self.last_numbers = numbers
         return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
 
@@ -181,7 +180,7 @@ class SurrogateVision:
             self.chart.see(pose)
             depth_m = self.floor.depth_at(self._pixels, pose, self.rig)
             met = np.flatnonzero(depth_m < np.inf)
-            if len(met) < _LEAST_OF_RASTER:
+            if len(met) < drawn.LEAST_POINTS:
                 self.looks.append(Look(row, 0, None))
                 return None
             mean_m = float(depth_m[met].mean())
@@ -189,14 +188,14 @@ class SurrogateVision:
             n_points = len(met) / len(self._rays) * model.points(bound_px) * self.settings.points
             self.looks.append(Look(row, int(n_points), None))
             met = met[self._shown(met, depth_m)]
-            if n_points < _LEAST_POINTS or len(met) < _LEAST_OF_RASTER:
+            if n_points < _LEAST_POINTS or len(met) < drawn.LEAST_POINTS:
                 return None
             depth_m = depth_m[met]
             truth = np.column_stack([self._rays[met], self.rig.baseline_m / depth_m])
             n = len(truth)
             place = model.place_px(bound_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
-            unit = _unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
+            unit = drawn.unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
             cells = cells_of(pose, truth, self.rig.baseline_m)
             uneven_px = self._conditions.uneven_px(mean_m)
             self._now = _Seen(pose, truth, met, noise, bound_px, uneven_px, n_points, *unit, cells)
@@ -234,7 +233,7 @@ class SurrogateVision:
         if shares is None:
             return None
         true = np.array([self._poses[number] for number in shares.numbers])
-        offset = _offset(shares.believed, true, shares.parts, now, world_from_camera)
+        offset = drawn.mosaic_offset(shares.believed, true, shares.parts, now, world_from_camera)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
         error = root @ self.draw(1)[0] * self.model.mosaic_excess
         found = Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
@@ -275,14 +274,14 @@ class SurrogateVision:
         place = model.place_px(bound_px) * fewer
         excess = model.place_excess * np.hypot(1, model.lamps * self.lamp_share)
         numbers = self._numbers_of(number, other, n + 1)
-        in_view, motion, cov = _link(
+        in_view, motion, cov = drawn.link(
             here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, there.pose, here.pose,
             self._camera, self._unit_cov * place**2, self._unit_root * (place * excess), model.steady,
             model.relief * here.uneven_px / self.rig.focal_px * fewer, model.common_px / self.rig.focal_px, model.apart,
             network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
         n_matched = int(in_view / n * here.n_points * model.matched(bound_px))
-        if in_view < _LEAST_OF_RASTER or n_matched < _LEAST_POINTS or model.matched(bound_px) < network.LEAST_SHARE:
+        if in_view < drawn.LEAST_POINTS or n_matched < _LEAST_POINTS or model.matched(bound_px) < network.LEAST_SHARE:
             return None
         return Motion(motion, cov, n_matched, 1.0)
 
@@ -324,101 +323,3 @@ def _raster(rig: StereoRig) -> Array:
     rows, cols = ((np.arange(n) + 0.5) / n for n in _RASTER)
     v, u = (a.ravel() for a in np.meshgrid(rows * rig.height_px, cols * rig.width_px, indexing="ij"))
     return np.column_stack([u, v]) - 0.5
-
-
-@njit(cache=True, nogil=True)
-def moved(errors, last, now, numbers, last_numbers):
-    """The motion (4, 4) from one true pose to the next as F2F tells it, with an error by standard normal numbers (6,).
-
-    Args:
-        last_numbers: those of the motion before.
-    """
-    error = np.zeros(6)
-    for i in range(6):
-        for k in range(6):
-            error[i] += errors.root[i, k] * (numbers[k] - errors.undone * last_numbers[k])
-    return geometry.compose(geometry.compose(geometry.inverse(last), now), geometry.exp(error))
-
-
-@njit(cache=True, nogil=True)
-def _link(
-    points, here, there, relief, numbers, there_pose, here_pose, camera, cov, root, steady, relief_size, common, apart,
-    common_claim, correlation,
-):  # fmt: skip
-    """How many points two key points both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
-
-    Args:
-        points: (n, 3) of the later key point.
-        here: (n, 3) standard normal: what the later pair errs by at these points.
-        there: (rows, cols, 3) the same of the earlier pair, over its image.
-        relief: (f, f, 2) standard normal: what the floor makes matches err by, the same whoever matches there.
-        numbers: (n + 1, 3) standard normal: what it errs by in this match alone, and a bias that all points share.
-        there_pose, here_pose: (4, 4) true poses.
-        cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
-        steady: share of the earlier pair in what a match errs by; the rest is its own.
-        relief_size: deviation of what relief makes it err by for every depth that the two are apart.
-        common, common_claim: deviation of the bias, and the one claimed.
-        apart: by how much a match is claimed to err more for every depth that the two are apart.
-    """
-    focal, cx, cy, width, height, margin, baseline = camera
-    there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
-    seen, _, _ = observation.transfer(points, there_from_here, baseline)
-    inverse_depth = np.mean(points[:, 2]) / baseline
-    way, cell_m = inverse_depth * there_from_here[:3, 3], width / focal / there.shape[1] / inverse_depth
-    n, passing, farther = 0, np.sqrt(1 - steady * steady), apart**2 * np.sum(way**2)
-    a, b = np.empty_like(points), np.empty_like(points)
-    for k in range(len(points)):
-        u, v = seen[k, 0] * focal + cx, seen[k, 1] * focal + cy
-        if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
-            cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
-            row, col = _floor_cell(here_pose, points[k], baseline, cell_m, len(relief))
-            askew, along = relief_size * relief[row, col, 0], relief_size * relief[row, col, 1]
-            for r in range(3):
-                a[n, r], b[n, r] = seen[k, r] + bias[r], points[k, r]
-                for c in range(r + 1):
-                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
-                    b[n, r] += root[r, c] * here[k, c]
-            a[n, 0] += way[1] * askew
-            a[n, 1] += way[0] * askew + 2 * way[1] * along
-            n += 1
-    a, b, farther_cov = a[:n], b[:n], cov * (1 + farther)
-    covs, farther_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
-    for k in range(n):
-        geometry.put(covs[k], cov)
-        geometry.put(farther_covs[k], farther_cov)
-    error, _, by_motion, information, _ = observation.linearised(a, b, b, farther_covs, covs, there_from_here, baseline)
-    normal, right, by_common = observation.reduced(error, by_motion, information, np.ones(n))
-    if n < _LEAST_OF_RASTER:
-        return n, there_from_here, normal
-    inverse = np.linalg.inv(normal)
-    shared = inverse @ by_common * common_claim
-    return n, there_from_here @ geometry.exp(inverse @ right), inverse * correlation + shared @ shared.T
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _floor_cell(pose, point, baseline, cell_m, n):
-    """Row and column of the floor's cell that a camera measures at (x, y, disparity), of n that repeat."""
-    depth = baseline / point[2]
-    x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
-    y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
-    return int(np.floor(y / cell_m)) % n, int(np.floor(x / cell_m)) % n
-
-
-@njit(cache=True, nogil=True)
-def _unit_motion(points: Array, baseline: float, n_weight: float) -> tuple[Array, Array]:
-    """Covariance (6, 6), and its root, of a motion by eq. (2) where so many points like these (n, 3) err by one."""
-    n = len(points)
-    rows = observation.image_motion(points[:, 0], points[:, 1], baseline / points[:, 2])
-    normal, _ = observation.normal_equations(rows, np.full(n, n_weight / n), np.zeros((n, 2)))
-    cov = np.ascontiguousarray(np.linalg.inv(normal))
-    return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
-
-
-@njit(cache=True, nogil=True)
-def _offset(believed, true, shares, now, world_from_camera):
-    """What a mosaic of key points at poses (n, 4, 4), laid where they were believed to be, says of a predicted pose."""
-    predicted_from_world, offset = geometry.inverse(world_from_camera), np.zeros(6)
-    for k in range(len(shares)):
-        told = believed[k] @ geometry.inverse(true[k]) @ now
-        offset += shares[k] * geometry.log(predicted_from_world @ told)
-    return offset
