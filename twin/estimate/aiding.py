@@ -45,12 +45,12 @@ def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) ->
     angles = np.array([nodes[k].readings.ahrs_rpy_rad for k in told]).reshape(-1, 3)
     camera_from_body = geometry.inverse(rig.body_from_camera)
     cov = pose_filter.attitude(np.zeros(3), camera_from_body, noise)[1]  # the same for every reading
-    camera_from_world = _turned_back(angles, rig.body_from_camera)
+    measured = _turned(angles, rig.body_from_camera)
 
     def observe(poses: Array) -> Array:
         turned = poses.copy()
         turned[:, :3, 3] = 0.0
-        return errors(camera_from_world, turned)[:, :3]
+        return errors(measured, turned)[:, :3]
 
     def derive(_: Array, residuals: Array) -> Array:
         return log_derivatives(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
@@ -59,14 +59,14 @@ def _attitudes(nodes: Sequence[KeyPoint], rig: StereoRig, noise: SensorNoise) ->
 
 
 @njit(cache=True, nogil=True)
-def _turned_back(angles, body_from_camera):
-    """(m, 4, 4) camera_from_world of attitudes (m, 3) of the body, at the world's origin."""
-    inverses, at_origin = np.empty((len(angles), 4, 4)), body_from_camera.copy()
+def _turned(angles, body_from_camera):
+    """(m, 4, 4) world_from_camera of attitudes (m, 3) of the body, at the world's origin."""
+    poses, at_origin = np.empty((len(angles), 4, 4)), body_from_camera.copy()
     at_origin[:3, 3] = 0.0
     for k in range(len(angles)):
         body = geometry.pose(geometry.rotation_from_rpy(angles[k, 0], angles[k, 1], angles[k, 2]), np.zeros(3))
-        geometry.put(inverses[k], geometry.inverse(geometry.compose(body, at_origin)))
-    return inverses
+        geometry.put(poses[k], geometry.compose(body, at_origin))
+    return poses
 
 
 def _fixes(nodes: Sequence[KeyPoint], noise: SensorNoise) -> Single:

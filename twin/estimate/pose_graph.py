@@ -307,7 +307,7 @@ def _add_border(first, second, by_j, informed, i_from_j, border):
 def motions(links: Sequence[Link], places: dict[int, int], huber: float | None = None) -> Pairs:
     """What links say of the poses at these places, by number of their nodes."""
     columns = Links.of(links)
-    measured, information = _inverses(columns.i_from_j), columns.information
+    measured, information = columns.i_from_j, columns.information
     i, j = (np.array([places[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
 
     def observe(i_from_j: Array, _: float) -> Array:
@@ -318,19 +318,18 @@ def motions(links: Sequence[Link], places: dict[int, int], huber: float | None =
 
 def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
     """Poses (m, 4, 4) that are known with covariances (m, 6, 6) [rotation, translation], in their own axes."""
-    measured = _inverses(poses)
     return Single(
-        np.asarray(at, np.int64), inverses(covs), lambda found: errors(measured, found),
+        np.asarray(at, np.int64), inverses(covs), lambda found: errors(poses, found),
         lambda _, residuals: log_derivatives(residuals),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def errors(inverse, found):
-    """log(inverse found) of poses (m, 4, 4), (m, 6)."""
+def errors(measured, found):
+    """log(measured^-1 found) of poses (m, 4, 4), (m, 6)."""
     residuals = np.empty((len(found), 6))
     for k in range(len(found)):
-        geometry.put(residuals[k], geometry.log(geometry.compose(inverse[k], found[k])))
+        geometry.put(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), found[k])))
     return residuals
 
 
@@ -357,14 +356,6 @@ def _between(poses, first, second):
     found = np.empty((len(first), 4, 4))
     for k in range(len(first)):
         geometry.put(found[k], geometry.compose(geometry.inverse(poses[first[k]]), poses[second[k]]))
-    return found
-
-
-def _inverses(poses: Array) -> Array:
-    found = np.zeros_like(poses)
-    found[:, :3, :3] = turned(poses[:, :3, :3])
-    found[:, :3, 3] = -times(found[:, :3, :3], poses[:, :3, 3])
-    found[:, 3, 3] = 1.0
     return found
 
 
