@@ -60,9 +60,8 @@ class Factor(NamedTuple):
 
     def _panel(self, panel: int) -> tuple[Array, Array]:
         """L1^-1 and L2."""
-        s = self.structure
-        own = _D * int(s.first[panel + 1] - s.first[panel])
-        matrix = self.panels[s.at[panel] : s.at[panel + 1]].reshape(-1, own)
+        matrix = _panel_of(self.structure, self.panels, panel)
+        own = matrix.shape[1]
         return matrix[:own], matrix[own:]
 
 
@@ -143,12 +142,7 @@ def _eliminate(s, whole, panels):
             while start < len(places):
                 end, above, at = _next_above(s, places, start)
                 square = np.dot(rest[_D * start :], rest[_D * start : _D * end].T)
-                matrix = _panel_of(s, panels, above)
-                for b in range(len(at)):
-                    for a in range(min(b + 1, end - start)):
-                        for i in range(_D):
-                            for k in range(_D):
-                                matrix[_D * at[b] + i, _D * at[a] + k] -= square[_D * b + i, _D * a + k]
+                _subtract(square, at, _panel_of(s, panels, above))
                 start = end
     return True
 
@@ -203,6 +197,28 @@ def _next_above(s, places, start):
 
 
 @njit(cache=True, nogil=True)
+def _subtract(square, at, panel):
+    """Takes blocks (lower half) from those of a panel in these rows, the first of which are also the columns."""
+    for b in range(len(at)):
+        for a in range(min(b + 1, square.shape[1] // _D)):
+            for i in range(_D):
+                for k in range(_D):
+                    panel[_D * at[b] + i, _D * at[a] + k] -= square[_D * b + i, _D * a + k]
+
+
+@njit(cache=True, nogil=True)
+def _picked(panel, at, width):
+    """Blocks of a panel in these rows, so many of which, the first, are also the columns."""
+    part = np.empty((_D * len(at), _D * width))
+    for b in range(len(at)):
+        for a in range(width):
+            for i in range(_D):
+                for k in range(_D):
+                    part[_D * b + i, _D * a + k] = panel[_D * at[b] + i, _D * at[a] + k]
+    return part
+
+
+@njit(cache=True, nogil=True)
 def _invert(s, panels, diagonal):
     """Turns L1^-1 over L2 of each panel into the inverse's blocks there, and fills those on its diagonal (n, 6, 6)."""
     for p in range(len(s.first) - 2, -1, -1):
@@ -214,12 +230,7 @@ def _invert(s, panels, diagonal):
             across, start = np.zeros_like(weight), 0
             while start < len(places):
                 end, above, at = _next_above(s, places, start)
-                part, matrix = np.empty((_D * len(at), _D * (end - start))), _panel_of(s, panels, above)
-                for b in range(len(at)):
-                    for a in range(end - start):
-                        for i in range(_D):
-                            for k in range(_D):
-                                part[_D * b + i, _D * a + k] = matrix[_D * at[b] + i, _D * at[a] + k]
+                part = _picked(_panel_of(s, panels, above), at, end - start)
                 onwards, here = across[_D * start :], across[_D * start : _D * end]
                 onwards += np.dot(part, weight[_D * start : _D * end])
                 if end < len(places):

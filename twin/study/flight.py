@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import platform
 import shutil
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -56,19 +54,8 @@ def fly(survey: Survey) -> Row:
         return row_of(survey, "failed", str(error))
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-        _give_memory_back()
     told = row_of(survey, _status(metrics), metrics["reason"]) | {"warning": metrics["warning"]} | flat(metrics)
     return told | {"timing.survey_s": time.perf_counter() - began, "timing.host": platform.node()}
-
-
-def _give_memory_back() -> None:
-    """Returns what is free to the system, where the C library is glibc.
-
-    Between what is not free it keeps it, and a worker that flies one survey after the other grows by a tenth.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
 
 
 def _thin(scratch: Path, survey: Survey) -> None:
