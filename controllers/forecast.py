@@ -1,4 +1,4 @@
-"""What a plan will cost and promise before anything is flown: key points, time, overlaps, depth noise, clearance."""
+"""What a plan will cost and promise before anything is flown: keyframes, time, overlaps, depth noise, clearance."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ class Forecast(NamedTuple):
     """The plan in numbers, at the reference plane z = 0.
 
     Args:
-        n_frames_per_key: N.
-        keys_per_swath: M, of a leg or a loop.
+        n_frames_per_keyframe: N.
+        keyframes_per_swath: M, of a leg or a loop.
         n_tracks: L.
-        n_keys, n_frames: in all, without station keeping.
+        n_keyframes, n_frames: in all, without station keeping.
         duration_s, path_m: of the whole flight, without station keeping.
         speed_mps: along the swaths.
         footprint_m: width (across the bow) and height (along it) of the image.
-        key_spacing_m, swath_spacing_m: distance of neighbouring key points; greatest one of neighbouring swaths.
+        keyframe_spacing_m, swath_spacing_m: distance of neighbouring keyframes; greatest one of neighbouring swaths.
         overlap_along, overlap_across: true shares, along the sides of the image on which the pattern counts them.
         disparity_px: expected disparity.
         depth_sigma_m: expected depth noise of one stereo pair.
     """
 
-    n_frames_per_key: int
-    keys_per_swath: int
+    n_frames_per_keyframe: int
+    keyframes_per_swath: int
     n_tracks: int
-    n_keys: int
+    n_keyframes: int
     n_frames: int
     duration_s: float
     path_m: float
     speed_mps: float
     footprint_m: tuple[float, float]
-    key_spacing_m: float
+    keyframe_spacing_m: float
     swath_spacing_m: float
     overlap_along: float
     overlap_across: float
@@ -53,21 +53,21 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     With d = f b / Z the depth noise is sigma_Z = Z^2 / (f b) sigma_d.
     """
     tracks = range(1, plan.n_tracks + 1)
-    key_points = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
-    key_spacing_m = plan.n_frames_per_key * plan.speed_mps / plan.frame_rate_hz
+    keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
+    keyframe_spacing_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.frame_rate_hz
     return Forecast(
-        n_frames_per_key=plan.n_frames_per_key,
-        keys_per_swath=max(1, round(plan.swath_length_m / key_spacing_m)),
+        n_frames_per_keyframe=plan.n_frames_per_keyframe,
+        keyframes_per_swath=max(1, round(plan.swath_length_m / keyframe_spacing_m)),
         n_tracks=plan.n_tracks,
-        n_keys=int(key_points.sum()),
-        n_frames=len(key_points),
+        n_keyframes=int(keyframes.sum()),
+        n_frames=len(keyframes),
         duration_s=sum(plan.track_duration_s(t) for t in tracks),
         path_m=sum(plan.track_length_m(t) for t in tracks),
         speed_mps=plan.speed_mps,
         footprint_m=plan.footprint_m,
-        key_spacing_m=key_spacing_m,
+        keyframe_spacing_m=keyframe_spacing_m,
         swath_spacing_m=plan.swath_spacing_m,
-        overlap_along=max(0.0, 1 - key_spacing_m / plan.side_along_m),
+        overlap_along=max(0.0, 1 - keyframe_spacing_m / plan.side_along_m),
         overlap_across=max(0.0, 1 - plan.swath_spacing_m / plan.side_across_m),
         disparity_px=plan.focal_px * baseline_m / plan.altitude_m,
         depth_sigma_m=plan.altitude_m**2 / (plan.focal_px * baseline_m) * disparity_sigma_px,

@@ -1,7 +1,7 @@
 """The lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
 
 The vehicle keeps its bow to the east and flies every second leg backwards, so the top of the image always points east:
-key points follow each other along the image height, swaths lie side by side along the image width.
+keyframes follow each other along the image height, swaths lie side by side along the image width.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from itertools import pairwise
 
 from controllers.segments import Point, Segment, line
-from controllers.survey_plan import SurveyPlan, SurveyRequest, frames_per_key, refuse_impossible, tracks_to_fly
+from controllers.survey_plan import SurveyPlan, SurveyRequest, frames_per_keyframe, refuse_impossible, tracks_to_fly
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
@@ -35,7 +35,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         altitude_m=request.altitude_m,
         speed_mps=request.speed_mps,
         frame_rate_hz=request.frame_rate_hz,
-        n_frames_per_key=frames_per_key(request, request.speed_mps),
+        n_frames_per_keyframe=frames_per_keyframe(request, request.speed_mps),
         swath_length_m=length_m,
         swath_spacing_m=spacing_m,
         footprint_m=request.footprint_m,

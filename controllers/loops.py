@@ -14,7 +14,7 @@ from controllers.survey_plan import (
     PlanFault,
     SurveyPlan,
     SurveyRequest,
-    frames_per_key,
+    frames_per_keyframe,
     refuse_impossible,
     tracks_to_fly,
 )
@@ -41,7 +41,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         altitude_m=request.altitude_m,
         speed_mps=speed_mps,
         frame_rate_hz=request.frame_rate_hz,
-        n_frames_per_key=frames_per_key(request, speed_mps),
+        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
         swath_length_m=math.pi * reach_m,
         swath_spacing_m=loop_spacing_m(reach_m, filling),
         footprint_m=request.footprint_m,

@@ -29,7 +29,7 @@ class SurveyRequest(NamedTuple):
         area_m: extent along x and y, centred at the origin.
         altitude_m: height of the left camera above the reference plane z = 0.
         speed_mps: cruise speed.
-        overlap_along, overlap_across: wanted shares, of consecutive key points and of neighbouring swaths.
+        overlap_along, overlap_across: wanted shares, of consecutive keyframes and of neighbouring swaths.
         tracks: how many tracks to fly, the first ones of the whole survey; 0 flies all that fill the area.
         image_width_px, image_height_px, focal_px, frame_rate_hz: of the left camera.
         acceleration_mps2: greatest acceleration.
@@ -64,11 +64,11 @@ class SurveyPlan:
         altitude_m: height of the camera above the reference plane z = 0.
         speed_mps: cruise speed along the swaths.
         frame_rate_hz: frames per second.
-        n_frames_per_key: N, frames from key point to key point.
+        n_frames_per_keyframe: N, frames from keyframe to keyframe.
         swath_length_m: length of a swath: a leg, or a loop.
         swath_spacing_m: greatest distance between neighbouring swaths.
         footprint_m: width (across the bow) and height (along it) of the image on the reference plane.
-        side_along_m, side_across_m: side of the footprint along which key points, and swaths, part from each other.
+        side_along_m, side_across_m: side of the footprint along which keyframes, and swaths, part from each other.
         focal_px: focal length of the cameras.
         acceleration_mps2: greatest acceleration.
     """
@@ -78,7 +78,7 @@ class SurveyPlan:
     altitude_m: float
     speed_mps: float
     frame_rate_hz: float
-    n_frames_per_key: int
+    n_frames_per_keyframe: int
     swath_length_m: float
     swath_spacing_m: float
     footprint_m: tuple[float, float]
@@ -110,12 +110,12 @@ class SurveyPlan:
         return sum(segment.profile.duration_s for segment in self.paths[track - 1])
 
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Time (n,) since the start of a track (from 1) [s] of each frame and whether it is a key point (n,).
+        """Time (n,) since the start of a track (from 1) [s] of each frame and whether it is a keyframe (n,).
 
         Every N-th is one, and the last.
         """
         frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
-        return frames / self.frame_rate_hz, (frames % self.n_frames_per_key == 0) | (frames == frames[-1])
+        return frames / self.frame_rate_hz, (frames % self.n_frames_per_keyframe == 0) | (frames == frames[-1])
 
     def reference(self, track: int, time_s: float) -> Reference:
         """Where the left camera shall be at a time since the start of a track (from 1); at rest before and after it."""
@@ -132,19 +132,19 @@ class SurveyPlan:
         return Reference(*map(np.concatenate, zip(*parts, last.at(left_s), strict=True)))
 
 
-def frames_per_key(request: SurveyRequest, speed_mps: float) -> int:
+def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
     """N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)).
 
     As in the paper ImgSize is the image width (Negahdaripour & Madjidi 2003, section III-A).
 
     Raises:
-        PlanFault: the speed leaves no frame between key points.
+        PlanFault: the speed leaves no frame between keyframes.
     """
     advance_m = (1 - request.overlap_along) * request.footprint_m[0]
     n = round(advance_m * request.frame_rate_hz / speed_mps)
     if n < 1:
         fastest = 2 * advance_m * request.frame_rate_hz
-        raise PlanFault("plan.speed_mps", f"{speed_mps:g}: no frame falls between key points", f"below {fastest:.3g}")
+        raise PlanFault("plan.speed_mps", f"{speed_mps:g}: no frame falls between keyframes", f"below {fastest:.3g}")
     return n
 
 

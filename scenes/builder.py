@@ -19,7 +19,7 @@ CAMERAS = ("left", "right")
 
 
 @dataclass(frozen=True)
-class World:
+class SceneModel:
     """A compiled model and where its parts are.
 
     Args:
@@ -53,7 +53,7 @@ def build(
     body_from_camera: Array,
     timestep_s: float,
     lamp_positions_m: Sequence[Sequence[float]] | Array = (),
-) -> World:
+) -> SceneModel:
     """Floor and vehicle as one model, with gravity; buoyancy, drag and thrust are the physics' part.
 
     Args:
@@ -69,7 +69,7 @@ def build(
     for k, position in enumerate(lamp_positions_m):
         body.add_site(name=f"lamp_{k}", pos=np.asarray(position, dtype=np.float64), group=VEHICLE_GROUP)
     model = spec.compile()
-    return World(
+    return SceneModel(
         model=model,
         terrain=terrain,
         tile_geom_ids=np.array([model.geom(tile.name).id for tile in tiles]),

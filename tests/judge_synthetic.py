@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import rasterio
 
-from twin import geometry
-from twin.config import Scenario
+from twin.core import geometry
+from twin.core.links import Link, Links
+from twin.core.records import Alignment, ElevationMap, MapGrid, StereoRig, SurveyResult, Trajectory, Truth
+from twin.core.timing import Stopwatch
 from twin.judge import metrics as judge
 from twin.judge.map_error import height_error
-from twin.links import Link, Links
-from twin.records import Alignment, ElevationMap, MapGrid, StereoRig, SurveyResult, Trajectory, Truth
-from twin.scenario_file import dump_toml
-from twin.timing import Stopwatch
+from twin.scenario.file import dump_toml
+from twin.scenario.model import Scenario
 
 SCENARIO = Scenario.model_validate(
     {"name": "synthetic", "seed": 7, "plan": {"area_m": [4.0, 1.5]}, "require": {"map.le90_m": 0.05}}
@@ -100,9 +100,9 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     return result, ElevationMap(grid, estimate, np.where(np.isfinite(estimate), sigma, np.nan), mosaic), truth, rig
 
 
-def link_between(world_from_key: np.ndarray, i: int, j: int, rng: np.random.Generator) -> Link:
+def link_between(world_from_keyframe: np.ndarray, i: int, j: int, rng: np.random.Generator) -> Link:
     """A link that errs as its covariance says, and its closed form, three times as far off."""
-    true = geometry.inverse(world_from_key[i]) @ world_from_key[j]
+    true = geometry.inverse(world_from_keyframe[i]) @ world_from_keyframe[j]
     error = rng.normal(0, 1, 6) * [2e-4, 2e-4, 2e-4, 5e-4, 5e-4, 5e-4]
     cov = 3 * np.diag([4e-8] * 3 + [25e-8] * 3)
     exact = true @ geometry.exp(3 * error)
@@ -124,7 +124,7 @@ def evaluated(result: SurveyResult, elevation: ElevationMap | None, truth: Truth
 def write_folder(folder: Path, finished: bool = True) -> Path:
     """A whole run folder of the synthetic survey; unfinished: no maps, no metrics, no final trajectory."""
     result, elevation, truth, rig = survey()
-    (folder / "keypoints").mkdir(parents=True)
+    (folder / "keyframes").mkdir(parents=True)
     (folder / "scenario.resolved.toml").write_text(dump_toml(SCENARIO))
     (folder / "env.json").write_text(json.dumps({"python": "3.11", "cpu": "x86-64", "packages": {"numpy": "2"}}))
     truth.trajectory.save(folder / "trajectory_truth.tum")
@@ -133,7 +133,7 @@ def write_folder(folder: Path, finished: bool = True) -> Path:
     Trajectory(truth.trajectory.times_s, reference).save(folder / "trajectory_reference.tum")
     result.f2f.save(folder / "trajectory_f2f.tum")
     result.online.save(folder / "trajectory_online.tum")
-    _write_key_points(folder / "keypoints", result, rig)
+    _write_keyframes(folder / "keyframes", result, rig)
     if finished:
         result.final.save(folder / "trajectory_final.tum")
         _write_network(folder / "posegraph.g2o", result)
@@ -156,7 +156,7 @@ def write_tif(file: Path, grid: MapGrid, bands: np.ndarray) -> None:
 
 
 def _write_network(file: Path, result: SurveyResult) -> None:
-    poses = result.final.world_from_camera[result.key_frames]
+    poses = result.final.world_from_camera[result.keyframe_rows]
     lines = [
         f"VERTEX_SE3:QUAT {k} " + " ".join(map(str, [*p[:3, 3], *geometry.quaternion_xyzw(p[:3, :3])]))
         for k, p in enumerate(poses)
@@ -165,14 +165,18 @@ def _write_network(file: Path, result: SurveyResult) -> None:
     file.write_text("\n".join(lines) + "\n")
 
 
-def _write_key_points(folder: Path, result: SurveyResult, rig: StereoRig) -> None:
+def _write_keyframes(folder: Path, result: SurveyResult, rig: StereoRig) -> None:
     rng = np.random.default_rng(1)
-    index = {"frames": result.key_frames.tolist(), "tracks": result.track_of_key.tolist(), "n_per_key": 8}
-    index["timing_ms"] = {"f2f": [12.0] * len(result.online), "stereo": [35.0] * len(result.key_frames)}
+    index = {
+        "frames": result.keyframe_rows.tolist(),
+        "tracks": result.track_of_keyframe.tolist(),
+        "n_frames_per_keyframe": 8,
+    }
+    index["timing_ms"] = {"f2f": [12.0] * len(result.online), "stereo": [35.0] * len(result.keyframe_rows)}
     (folder / "index.json").write_text(json.dumps(index))
     ground = cv2.GaussianBlur(rng.normal(0, 1, (600, 900)), (0, 0), 1.5)
     ground = np.clip(110 + 45 * ground / ground.std(), 0, 255).astype(np.uint8)
-    for k, frame in enumerate(result.key_frames):
+    for k, frame in enumerate(result.keyframe_rows):
         view = np.roll(ground, (-k, -2 * k), (0, 1))[: rig.height_px, : rig.width_px]
         for eye, tint in (("left", (0.6, 0.9, 0.8)), ("right", (0.6, 0.85, 0.8))):
             image = (view[..., None] * np.array(tint)).astype(np.uint8)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from scenes.gl import mujoco
-from twin.config import Vehicle as Section
+from twin.scenario.model import VehicleConfig
 from twin.simulate.vehicle import Vehicle
 
 STILL = np.zeros(3)
@@ -23,5 +23,5 @@ def bare_world(timestep_s: float = 1 / 120) -> SimpleNamespace:
 
 
 def vehicle(pose=None, current_mps=STILL, timestep_s=1 / 120, buoyancy_n=0.0, **factors) -> Vehicle:
-    section = Section(buoyancy_n=buoyancy_n, **factors)
+    section = VehicleConfig(buoyancy_n=buoyancy_n, **factors)
     return Vehicle(bare_world(timestep_s), section, current_mps, np.eye(4) if pose is None else pose)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numba import njit
 
-from twin import geometry
-from twin.records import StereoRig
+from twin.core import geometry
+from twin.core.records import StereoRig
 
 
 class Seafloor(NamedTuple):

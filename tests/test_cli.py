@@ -13,7 +13,8 @@ import pytest
 
 import twin
 from scenes.gl import INSTALL_LINE
-from twin import cli, console, doctor
+from twin import cli
+from twin.app import console, doctor
 from twin.errors import TwinError
 
 ROOT = Path(__file__).parent.parent
@@ -30,7 +31,7 @@ METRICS = {
     "map": NUMBERS | {"completeness": 0.98, "sigma_ratio": 1.1},
     "overlap": dict.fromkeys(("along_median", "along_planned", "across_median", "across_planned"), 0.9),
     "control": {"cross_track_rmse_m": 0.02},
-    "timing": {"real_time_factor": 1.2, "frames": 10, "keypoints": 2},
+    "timing": {"real_time_factor": 1.2, "frames": 10, "keyframes": 2},
     "require": {},
 }
 
@@ -150,7 +151,7 @@ def test_an_empty_folder_is_used_and_a_file_is_not(tmp_path):
 
 
 def test_the_schema_describes_every_section(twin_command):
-    from twin.config import Scenario
+    from twin.scenario.model import Scenario
 
     schema = json.loads(twin_command("schema").out)
     assert set(schema["properties"]) == set(Scenario.model_fields)
@@ -158,7 +159,7 @@ def test_the_schema_describes_every_section(twin_command):
 
 def test_the_plan_is_a_table_and_a_picture(twin_command, tmp_path):
     done = twin_command("plan", "quickstart", "--set", "terrain.kind=flat", "--out", "plan.png")
-    assert done.status == 0 and "frames per key point N" in done.out
+    assert done.status == 0 and "frames per keyframe N" in done.out
     assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -174,7 +175,7 @@ def test_a_terminal_gets_a_bar_and_a_pipe_gets_none(capsys):
 
 
 def probe(**environment):
-    command = [sys.executable, "-m", "twin.doctor"]
+    command = [sys.executable, "-m", "twin.app.doctor"]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, cwd=ROOT, check=False)
 
 
@@ -207,7 +208,7 @@ def test_ctrl_c_ends_a_survey_that_can_be_read(tmp_path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also where this one ignores it
     )
     deadline = time.monotonic() + 120
-    while len(list(out.glob("keypoints/*"))) < 5 and time.monotonic() < deadline:
+    while len(list(out.glob("keyframes/*"))) < 5 and time.monotonic() < deadline:
         time.sleep(0.2)
     survey.send_signal(signal.SIGINT)
     printed, _ = survey.communicate(timeout=120)

@@ -29,12 +29,12 @@ def plan(**request):
 
 def test_the_paper_mission_has_the_papers_numbers():
     numbers = forecast(plan(**PAPER), baseline_m=0.3048, disparity_sigma_px=0.2)
-    assert numbers.n_frames_per_key == 15
+    assert numbers.n_frames_per_keyframe == 15
     assert numbers.n_tracks == 25
     assert 0.60 < numbers.swath_spacing_m < 0.63  # 2 ft
-    assert numbers.keys_per_swath == 100
-    assert numbers.n_tracks == pytest.approx(numbers.keys_per_swath / 4, abs=1)  # L = M/4
-    assert 25 * 204 == pytest.approx(numbers.n_keys, rel=0.12)  # ours also stops at every corner
+    assert numbers.keyframes_per_swath == 100
+    assert numbers.n_tracks == pytest.approx(numbers.keyframes_per_swath / 4, abs=1)  # L = M/4
+    assert 25 * 204 == pytest.approx(numbers.n_keyframes, rel=0.12)  # ours also stops at every corner
     assert numbers.disparity_px == pytest.approx(686.24 * 0.3048 / 3.353, rel=1e-4)
     assert numbers.depth_sigma_m == pytest.approx(3.353 / numbers.disparity_px * 0.2)
 
@@ -128,7 +128,7 @@ def test_a_pinnacle_out_of_sight_does_not_count_and_a_path_off_the_floor_is_told
         (
             {"speed_mps": 60.0},
             "plan.speed_mps",
-            "plan.speed_mps: 60: no frame falls between key points (allowed: below ",
+            "plan.speed_mps: 60: no frame falls between keyframes (allowed: below ",
         ),
         ({"altitude_m": 0.0}, "plan.altitude_m", "plan.altitude_m: the camera has no footprint (allowed: above 0)"),
         ({"focal_px": np.inf}, "rig.hfov_deg", "rig.hfov_deg: the camera has no footprint (allowed: above 0)"),
@@ -153,5 +153,6 @@ def test_the_fastest_allowed_speed_is_allowed():
     with pytest.raises(PlanFault) as caught:
         plan(**PAPER | {"speed_mps": 60.0})
     assert (
-        plan(**PAPER | {"speed_mps": float(caught.value.allowed.removeprefix("below ")) * 0.99}).n_frames_per_key == 1
+        plan(**PAPER | {"speed_mps": float(caught.value.allowed.removeprefix("below ")) * 0.99}).n_frames_per_keyframe
+        == 1
     )

@@ -68,13 +68,13 @@ def test_neighbouring_loops_are_nowhere_farther_apart_than_the_overlap_asks(diam
 
 @pytest.mark.parametrize("diameter_m", [0.3, 2.5, 10.0])
 @pytest.mark.parametrize("overlap", [0.05, 0.3, 0.8])
-def test_the_images_at_key_points_cover_the_disc(diameter_m, overlap):
+def test_the_images_at_keyframes_cover_the_disc(diameter_m, overlap):
     p = plan(area_m=(diameter_m, diameter_m), overlap_across=overlap)
     keys = [
         p.reference(track, time_s).position[:2]
         for track in range(1, p.n_tracks + 1)
-        for time_s, is_key in zip(*p.frames_of_track(track), strict=True)
-        if is_key
+        for time_s, is_keyframe in zip(*p.frames_of_track(track), strict=True)
+        if is_keyframe
     ]
     angle, share = np.random.default_rng(0).uniform(0, [2 * np.pi, 1], (2000, 2)).T
     disc = diameter_m / 2 * np.sqrt(share)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -112,11 +112,11 @@ def test_fewer_loops_are_the_first_ones_of_the_whole_survey_and_one_request_give
     assert plan() == whole
 
 
-def test_a_loop_flown_slower_keeps_the_overlap_of_its_key_points():
+def test_a_loop_flown_slower_keeps_the_overlap_of_its_keyframes():
     tight = forecast(plan(area_m=(2.0, 2.0)), 0.3, 0.2)
     assert tight.speed_mps < 0.3
-    assert tight.key_spacing_m <= 0.1 * tight.footprint_m[0] * 1.05  # N is a whole number
-    assert tight.n_frames_per_key > forecast(plan(), 0.3, 0.2).n_frames_per_key
+    assert tight.keyframe_spacing_m <= 0.1 * tight.footprint_m[0] * 1.05  # N is a whole number
+    assert tight.n_frames_per_keyframe > forecast(plan(), 0.3, 0.2).n_frames_per_keyframe
 
 
 def test_the_forecast_counts_what_is_flown():
@@ -125,7 +125,7 @@ def test_the_forecast_counts_what_is_flown():
     assert numbers.path_m == pytest.approx(2 * np.pi * 5)
     assert numbers.n_frames == sum(len(p.frames_of_track(t)[0]) for t in (1, 2))
     # M counts at cruise speed; both ramps double theirs (0.59 / 0.14 s each), then the start and the end
-    assert numbers.n_keys / 2 == pytest.approx(numbers.keys_per_swath + 0.595 / 0.141 * 30 / 16 + 2, abs=1.5)
+    assert numbers.n_keyframes / 2 == pytest.approx(numbers.keyframes_per_swath + 0.595 / 0.141 * 30 / 16 + 2, abs=1.5)
     assert numbers.overlap_across == pytest.approx(1 - p.swath_spacing_m / p.footprint_m[1])  # the shorter side
 
 
@@ -153,7 +153,7 @@ def test_a_pinnacle_in_the_corner_of_the_square_is_out_of_sight_and_one_in_a_loo
         ({"tracks": 35}, "plan.tracks: 35: the area holds 34 at this overlap (allowed: 0 to 34)"),
         ({"altitude_m": 0.0}, "plan.altitude_m: the camera has no footprint (allowed: above 0)"),
         ({"overlap_across": 1.0}, "plan.overlap_across: 1 (allowed: between 0 and 1, both excluded)"),
-        ({"frame_rate_hz": 0.1}, "plan.speed_mps: 0.594604: no frame falls between key points (allowed: below 0.0625)"),
+        ({"frame_rate_hz": 0.1}, "plan.speed_mps: 0.594604: no frame falls between keyframes (allowed: below 0.0625)"),
     ],
 )
 def test_loops_that_cannot_be_flown_name_the_key_at_fault(change, message):

@@ -12,7 +12,8 @@ from controllers.segments import Reference
 from controllers.survey_plan import SurveyRequest
 from controllers.tracking import body_reference, commanded_velocity
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
-from twin import config, geometry
+from twin.core import geometry
+from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import nominal_pilot, top_speed_mps
 from twin.simulate.hull import hull_of
 from twin.simulate.hydrodynamics import angular_first
@@ -36,7 +37,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
     rng = np.random.default_rng(seed)
     p = plan(SurveyRequest((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ))
     start = body_reference(p.reference(1, 0.0), LEVER_M).position
-    section = config.Vehicle(**factors)
+    section = VehicleConfig(**factors)
     rov = Vehicle(bare_world(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
     pilot = nominal_pilot(1.2, RATE_HZ)
     rows = []
@@ -141,8 +142,8 @@ def test_body_and_camera_references_differ_by_the_lever_arm_turned_to_the_headin
 def test_at_top_speed_in_any_direction_drag_takes_all_that_one_thruster_gives(bearing_deg):
     bearing = np.deg2rad(bearing_deg)
     direction = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    hull = hull_of(config.Vehicle())
-    velocity = top_speed_mps(config.Vehicle(), direction) * direction
+    hull = hull_of(VehicleConfig())
+    velocity = top_speed_mps(VehicleConfig(), direction) * direction
     drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
     thrusts = np.linalg.pinv(EFFECTS) @ [0, 0, 0, *drag]
     assert np.abs(thrusts).max() == pytest.approx(thrust_of(np.ones(1))[0])
@@ -166,7 +167,7 @@ def test_while_thrusters_saturate_the_integral_does_not_wind_up():
 def test_the_pilot_holds_any_heading_against_a_current(yaw):
     reference = Reference(np.zeros(3), np.zeros(3), yaw, np.zeros(3))
     start = geometry.pose(geometry.rotation_from_rpy(0.1, 0.1, yaw + 0.4), np.array([0.2, 0.0, 0.0]))
-    rov = Vehicle(bare_world(), config.Vehicle(), np.array([0.1, 0.05, 0.0]), start)
+    rov = Vehicle(bare_world(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
     pilot = nominal_pilot(1.2, RATE_HZ)
     for _ in range(20 * 30):
         rov.step(pilot.command(rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from twin import geometry
-from twin.estimate import aiding
+from twin.core import geometry
+from twin.core.links import Link
+from twin.core.records import Displacement, Readings, SensorNoise, Sighting, StereoRig
 from twin.estimate.alignment import align
-from twin.estimate.key_points import KeyPoint
-from twin.estimate.motion import Motion
-from twin.estimate.pose_filter import PoseFilter
-from twin.estimate.velocity_log import Displacement, VelocityLog, body_displacement, fuse, logged
-from twin.links import Link
-from twin.records import Readings, SensorNoise, Sighting, StereoRig
+from twin.estimate.navigation import aiding
+from twin.estimate.navigation.dvl import VelocityLog, body_displacement, fuse, logged
+from twin.estimate.navigation.pose_filter import PoseFilter
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.two_view_motion import Motion
 
 MOUNT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, MOUNT)
@@ -25,10 +25,10 @@ def numeric(function, at, step=1e-6):
     return np.column_stack([(function(at + d) - function(at - d)) / (2 * step) for d in np.eye(len(at)) * step])
 
 
-def key_points(poses, readings=None, walked=None):
+def keyframes(poses, readings=None, walked=None):
     n = len(poses)
     rows = zip(poses, readings or [Readings()] * n, walked or [None] * n, strict=True)
-    return [KeyPoint(k, k, 1, pose.copy(), None, r, w) for k, (pose, r, w) in enumerate(rows)]
+    return [Keyframe(k, k, 1, pose.copy(), None, r, w) for k, (pose, r, w) in enumerate(rows)]
 
 
 def pixels_of(pose):
@@ -215,7 +215,7 @@ def test_displacements_and_links_agree_with_the_dense_adjustment_and_share_one_s
     links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(d), cov, 1.0, 100) for k, d in enumerate(linked)]
     walked = [None] + [Displacement(k, np.array([d, 0, 0]), np.eye(3) * log_m**2) for k, d in enumerate(logged)]
     start = [level(x) for x in np.concatenate([[0], np.cumsum(linked)])]
-    aligned = align(key_points(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, noise)
+    aligned = align(keyframes(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, noise)
 
     # unknown: steps (n,) and scale; (1 + s) d = logged is linearised at the links' mean, second order 1e-5 of a step
     rows = np.vstack([np.eye(n, n + 1), np.eye(n, n + 1), np.eye(1, n + 1, n)])
@@ -244,7 +244,7 @@ def test_true_displacements_return_the_true_poses_of_a_turning_vehicle():
     ]
     start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 1e-3) for p in poses[1:]]
     exact_scale = SensorNoise(0.01, 0.003, 0.01, dvl_scale=1e-9)
-    aligned = align(key_points(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, exact_scale)
+    aligned = align(keyframes(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, exact_scale)
     # corrections of 1 mrad and 1 mm leave out 0.3 m * (1e-3)^2 / 2 a link
     np.testing.assert_allclose(aligned.poses, poses, atol=5e-6)
 
@@ -253,7 +253,7 @@ def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
     poses = [level(0), level(0.3) @ geometry.exp(np.array([0.02, -0.05, 0.1, 0, 0, 0]))]
     walked = [None, Displacement(0, np.array([0.301, 0.002, -0.001]), np.eye(3) * 1e-6)]
     away = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
-    told = aiding.displacements(key_points(poses, walked=walked), RIG)
+    told = aiding.displacements(keyframes(poses, walked=walked), RIG)
     start, moved = (
         told.observe((geometry.inverse(a) @ b)[None], 0.0) for a, b in (poses, [away @ pose for pose in poses])
     )
@@ -265,7 +265,7 @@ def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
 def test_what_displacements_change_by_agrees_with_finite_differences(scale):
     motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
     walked = [None, Displacement(0, np.array([0.3, 0.0, 0.0]), np.eye(3) * 1e-6)]
-    told = aiding.displacements(key_points([POSE, POSE @ motion], walked=walked), RIG)
+    told = aiding.displacements(keyframes([POSE, POSE @ motion], walked=walked), RIG)
     by_j, by_scale = told.derive(motion[None], scale, told.observe(motion[None], scale))
     by_motion = numeric(lambda m: told.observe((motion @ geometry.exp(m))[None], scale)[0], np.zeros(6))
     np.testing.assert_allclose(by_j[0], by_motion, atol=1e-8)
@@ -279,7 +279,7 @@ def test_what_readings_change_by_agrees_with_finite_differences(kind):
     readings = Readings(2.3, np.array([0.05, -0.02, 0.45]), usbl_m=np.array([0.2, 0.0, 2.0]),
                         beacons=sightings_of(pixels_of(POSE))[:1])  # fmt: skip
     order = ["heights", "attitudes", "fixes", "beacons"]
-    told = aiding.singles(key_points([POSE], [readings]), RIG, NOISE)[order.index(kind)]
+    told = aiding.singles(keyframes([POSE], [readings]), RIG, NOISE)[order.index(kind)]
     found = told.derive(POSE[None], told.observe(POSE[None]))
     expected = numeric(lambda m: told.observe((POSE @ geometry.exp(m))[None])[0], np.zeros(6))
     np.testing.assert_allclose(found[0], expected, rtol=1e-6, atol=1e-7)
@@ -288,7 +288,7 @@ def test_what_readings_change_by_agrees_with_finite_differences(kind):
 def test_a_displacement_from_a_node_outside_the_window_is_left_out():
     walked = [None, Displacement(7, np.full(3, 9.0), np.eye(3) * 1e-6)]
     link = Link(0, 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-6, 1.0, 100)
-    aligned = align(key_points([level(0), level(0.3)], walked=walked), [link], {0: np.eye(6) * RIGID}, RIG, NOISE)
+    aligned = align(keyframes([level(0), level(0.3)], walked=walked), [link], {0: np.eye(6) * RIGID}, RIG, NOISE)
     np.testing.assert_allclose(aligned.poses[1], level(0.3), atol=1e-9)
 
 
@@ -299,7 +299,7 @@ def test_acoustic_fixes_of_a_rigid_chain_have_the_weighted_mean():
     links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-8, 1.0, 100) for k in range(2)]
     prior = np.diag([1e-8] * 3 + [0.2**2] * 3)
     readings = [Readings(usbl_m=fix) for fix in fixes]
-    aligned = align(key_points(poses, readings), links, {0: prior}, RIG, NOISE)
+    aligned = align(keyframes(poses, readings), links, {0: prior}, RIG, NOISE)
     variance = 1 / (1 / 0.2**2 + 3 / 0.3**2)
     shift = variance * (fixes - np.array(poses)[:, :3, 3]).sum(axis=0) / 0.3**2
     np.testing.assert_allclose(aligned.poses[:, :3, 3] - np.array(poses)[:, :3, 3], np.tile(shift, (3, 1)), atol=1e-6)
@@ -309,7 +309,7 @@ def test_acoustic_fixes_of_a_rigid_chain_have_the_weighted_mean():
 def test_four_beacons_resect_the_camera_with_the_covariance_of_their_pixels():
     wide = {0: np.eye(6) * 1e2}
     readings = Readings(beacons=sightings_of(pixels_of(POSE)))
-    key = key_points([POSE @ geometry.exp(np.array([0.03, -0.02, 0.05, 0.1, -0.1, 0.15]))], [readings])
+    key = keyframes([POSE @ geometry.exp(np.array([0.03, -0.02, 0.05, 0.1, -0.1, 0.15]))], [readings])
     aligned = align(key, [], wide, RIG, NOISE)
     jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m)).ravel(), np.zeros(6))
     expected = np.linalg.inv(jacobian.T @ jacobian) * NOISE.beacon_px**2
@@ -325,7 +325,7 @@ def test_online_and_alignment_hold_the_same_of_the_same_beacons():
     believed = PoseFilter(POSE, RIG, NOISE)
     believed.cov = cov
     believed.fix(readings)
-    aligned = align(key_points([POSE], [readings]), [], {0: cov}, RIG, NOISE)
+    aligned = align(keyframes([POSE], [readings]), [], {0: cov}, RIG, NOISE)
     # corrections of 1 mm and 1 mrad: their product is left out by both in ways of their own
     np.testing.assert_allclose(believed.world_from_camera, aligned.poses[0], atol=2e-5)
     np.testing.assert_allclose(believed.cov, aligned.covs[0], atol=0.02 * np.abs(believed.cov).max())

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.links import Link
+from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.estimate.alignment import align
-from twin.estimate.key_points import KeyPoint
-from twin.links import Link
-from twin.records import Readings, SensorNoise, StereoRig
+from twin.estimate.vision.keyframes import Keyframe
 
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
 NOISE = SensorNoise(0.01, 0.003, 0.01)
@@ -26,9 +26,9 @@ def small_network(rng, n=6, share_of_sigma=0.3):
     return poses, links
 
 
-def key_points(poses, readings=None):
+def keyframes(poses, readings=None):
     readings = readings or [Readings()] * len(poses)
-    return [KeyPoint(k, k, 1, pose.copy(), None, r) for k, (pose, r) in enumerate(zip(poses, readings, strict=True))]
+    return [Keyframe(k, k, 1, pose.copy(), None, r) for k, (pose, r) in enumerate(zip(poses, readings, strict=True))]
 
 
 def numeric(function, at, step=1e-6):
@@ -77,7 +77,7 @@ def test_alignment_agrees_with_eq_7_solved_with_lagrange_multipliers():
     poses, links = small_network(rng)
     start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 0.02) for p in poses[1:]]
     direct, cov = mixed_adjustment(start, links)
-    aligned = align(key_points(start), links, ANCHOR, RIG, NOISE)
+    aligned = align(keyframes(start), links, ANCHOR, RIG, NOISE)
     # the bordered system adds residuals as vectors: of 1e-3 rad they err by 5e-4 of themselves, 3e-6 at 5 m
     np.testing.assert_allclose(aligned.poses, direct, atol=5e-6)
     for k in range(1, len(poses)):
@@ -88,7 +88,7 @@ def test_alignment_agrees_with_eq_7_solved_with_lagrange_multipliers():
 def test_exact_links_return_the_true_poses():
     poses, links = small_network(np.random.default_rng(1), share_of_sigma=0.0)
     start = [poses[0]] + [p @ geometry.exp(np.full(6, 0.05)) for p in poses[1:]]
-    aligned = align(key_points(start), links, ANCHOR, RIG, NOISE)
+    aligned = align(keyframes(start), links, ANCHOR, RIG, NOISE)
     np.testing.assert_allclose(aligned.poses, poses, atol=1e-6)
     assert not aligned.dropped
 
@@ -96,10 +96,10 @@ def test_exact_links_return_the_true_poses():
 def test_a_wrong_link_is_dropped_and_told():
     poses, links = small_network(np.random.default_rng(2))
     wrong = links[6]._replace(i_from_j=links[6].i_from_j @ geometry.exp(np.array([0, 0, 0.2, 0.5, 0, 0])))
-    aligned = align(key_points(poses), links[:6] + [wrong] + links[7:], ANCHOR, RIG, NOISE)
+    aligned = align(keyframes(poses), links[:6] + [wrong] + links[7:], ANCHOR, RIG, NOISE)
     assert [(link.i, link.j) for link in aligned.dropped] == [(wrong.i, wrong.j)]
     np.testing.assert_allclose(
-        aligned.poses, align(key_points(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5
+        aligned.poses, align(keyframes(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5
     )
 
 
@@ -114,9 +114,9 @@ def test_pressure_and_attitude_bound_what_links_alone_cannot():
     bias = geometry.exp(np.array([0.002, 0, 0, 0, 0, 0]))
     cov = np.diag([0.002**2] * 3 + [0.001**2] * 3)
     links = [Link(k, k + 1, step @ bias, cov, 1.0, 100) for k in range(n - 1)]
-    free = align(key_points(true), links, ANCHOR, RIG, NOISE).poses[-1]
+    free = align(keyframes(true), links, ANCHOR, RIG, NOISE).poses[-1]
     level = Readings(2.0, np.zeros(3))
-    held = align(key_points(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
+    held = align(keyframes(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
     assert abs(free[2, 3] - 2.0) > 0.3
     assert abs(held[2, 3] - 2.0) < 0.01
 
@@ -125,7 +125,7 @@ def test_a_link_of_the_path_itself_always_stands():
     """A wrong one contradicts its neighbours, but without it the path may fall apart."""
     poses, links = small_network(np.random.default_rng(3))
     links[2] = links[2]._replace(i_from_j=links[2].i_from_j @ geometry.exp(np.array([0, 0, 0, 0.3, 0, 0])))
-    aligned = align(key_points(poses), links, ANCHOR, RIG, NOISE)
+    aligned = align(keyframes(poses), links, ANCHOR, RIG, NOISE)
     assert all(link.j - link.i > 1 for link in aligned.dropped)
 
 
@@ -137,7 +137,7 @@ def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_nois
         return geometry.rotation_from_rpy(*rpy) @ RIG.body_from_camera[:3, :3]
 
     pose, wide = geometry.pose(camera(body), np.array([1.0, 2.0, 3.0])), {0: np.eye(6) * 1e2}
-    cov = align(key_points([pose], [Readings(3.0, body)]), [], wide, RIG, NOISE).covs[0]
+    cov = align(keyframes([pose], [Readings(3.0, body)]), [], wide, RIG, NOISE).covs[0]
     np.testing.assert_allclose(pose[2, :3] @ cov[3:, 3:] @ pose[2, :3], NOISE.pressure_m**2, rtol=1e-3)
     turned = [geometry.so3_exp(step) for step in np.eye(3) * 1e-6]  # about the body's axes, as the data sheet has it
     in_camera = [geometry.so3_log(camera(body).T @ geometry.rotation_from_rpy(*body) @ r @ RIG.body_from_camera[:3, :3])
@@ -161,7 +161,7 @@ def test_of_many_gross_links_every_one_is_dropped_and_next_to_none_of_the_good_o
             gross.add((i, j))
         links.append(Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error), cov, 1.0, 100))
     start = [pose @ geometry.exp(2e-3 * rng.standard_normal(6)) for pose in poses]
-    aligned = align(key_points([poses[0], *start[1:]]), links, ANCHOR, RIG, NOISE)
+    aligned = align(keyframes([poses[0], *start[1:]]), links, ANCHOR, RIG, NOISE)
     dropped = {(link.i, link.j) for link in aligned.dropped}
     assert gross <= dropped
     assert len(dropped - gross) <= 0.01 * len(links)

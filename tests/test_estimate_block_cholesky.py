@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.estimate import block_cholesky, elimination
+from twin.estimate.adjustment import block_cholesky, elimination
 
 
 def normal_equations(rng, n, i, j):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from seafloor_scene import digitise, down_camera, look, plane, small_rig
 
-from twin import geometry
-from twin.estimate import depth_filter
-from twin.estimate.depth_filter import GATE, DepthMap, carry, fuse, motion_depth
+from twin.core import geometry
+from twin.estimate.mapping import depth_filter
+from twin.estimate.mapping.depth_filter import GATE, DepthMap, carry, fuse, motion_depth
 
 RIG = small_rig(160, 120)
 EXACT = np.zeros((6, 6))

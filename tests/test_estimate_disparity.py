@@ -1,4 +1,4 @@
-"""Dense disparity: unbiased, honest about its noise, blind to lamps, silent where only one eye sees."""
+"""Dense disparity: unbiased, honest about its noise, blind to lamps, silent where only one camera sees."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from seafloor_scene import Seafloor, digitise, down_camera, look, plane, small_rig, smooth_texture, stereo_pair
 
-from twin.estimate import disparity, epipolar
+from twin.estimate.vision import disparity, epipolar
 
 RIG = small_rig()
 INSIDE = np.s_[10:-10, 60:-10]
@@ -68,7 +68,7 @@ def test_sigma_holds_for_noise_that_neighbouring_pixels_share():
     assert 0.7 < np.nanpercentile(np.abs(z), 68.3) < 1.3
 
 
-def test_the_margin_that_only_the_left_eye_sees_is_rejected():
+def test_the_margin_that_only_the_left_camera_sees_is_rejected():
     rng = np.random.default_rng(2)
     left, right, depth = stereo_pair(plane(), RIG, down_camera(0, 0, 1.5), rng)
     found = disparity.dense_disparity(left, right, 64)
@@ -98,7 +98,7 @@ def test_what_only_one_eye_sees_beside_a_block_has_no_wrong_disparity():
     found = disparity.dense_disparity(left, right, 64)
     assert hidden.sum() > 500
     error = np.abs(found.disparity_px - truth)[:, 40:]
-    assert (error[hidden] > 1).mean() < 0.06  # a search from one eye alone: 0.09
+    assert (error[hidden] > 1).mean() < 0.06  # a search from one camera alone: 0.09
     assert (error[np.isfinite(error)] > 1).mean() < 0.004
 
 

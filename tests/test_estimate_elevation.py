@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from seafloor_scene import Seafloor, down_camera, look, plane, small_rig, smooth_texture, stereo_pair
 
-from twin import geometry
-from twin.estimate import depth_filter, elevation, surface
-from twin.estimate.depth_filter import DepthMap
-from twin.estimate.map_builder import KeyPointImages, Light, build_map
-from twin.records import MapGrid
+from twin.core import geometry
+from twin.core.records import MapGrid
+from twin.estimate.mapping import depth_filter, elevation, surface
+from twin.estimate.mapping.depth_filter import DepthMap
+from twin.estimate.mapping.map_builder import KeyframeImages, Light, build_map
 
 RIG = small_rig(160, 120)
 GRID = MapGrid(-2.0, 1.6, 0.02, 160, 200)
@@ -74,7 +74,7 @@ def test_variance_of_depth_and_pose_become_variance_of_height():
 
 
 def test_every_piece_of_information_enters_the_map_once():
-    """Key points over a flat floor: a cell seen in n of them ends with n times the information of one."""
+    """Keyframes over a flat floor: a cell seen in n of them ends with n times the information of one."""
     mapper, seen = elevation.ElevationMapper(GRID), np.zeros(X.shape)
     state = before = last = None
     for k in range(8):
@@ -90,7 +90,7 @@ def test_every_piece_of_information_enters_the_map_once():
     mapper.retire(last)
     information = np.where(np.isfinite(mapper._variance[0]), 1e-4 / mapper._variance[0], 0)
     assert np.isinf(mapper._variance[1]).all()
-    # a cell on the rim of a key point gains or loses what interpolation shares: 7 rims of 200 of the 32,000 cells
+    # a cell on the rim of a keyframe gains or loses what interpolation shares: 7 rims of 200 of the 32,000 cells
     assert (np.abs(information - seen) < 0.02 * seen + 1e-6).mean() > 0.95
     assert information.sum() == pytest.approx(seen.sum(), rel=0.01)
 
@@ -174,7 +174,7 @@ def bumpy():
     pairs = []
     for pose in poses:
         left, right, _ = stereo_pair(floor, RIG, pose, rng)
-        pairs.append(KeyPointImages(*(np.repeat(gray[..., None], 3, 2) for gray in (left, right))))
+        pairs.append(KeyframeImages(*(np.repeat(gray[..., None], 3, 2) for gray in (left, right))))
     return floor, poses, build_map(iter(pairs), poses, np.zeros((6, 6, 6)), RIG, GRID), pairs
 
 
@@ -204,12 +204,12 @@ def test_the_same_images_make_the_same_map(bumpy):
 
 def test_a_pair_without_texture_breaks_nothing(bumpy):
     _, poses, _, pairs = bumpy
-    blank = KeyPointImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
+    blank = KeyframeImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
     found = build_map([pairs[0], blank, pairs[2]], poses[:3], np.zeros((3, 6, 6)), RIG, GRID)
     assert np.isfinite(found.height_m).sum() > 2000
 
 
-def test_no_key_point_makes_an_empty_map():
+def test_no_keyframe_makes_an_empty_map():
     found = build_map([], np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), RIG, GRID)
     assert np.isnan(found.height_m).all() and np.isnan(found.sigma_m).all() and not found.mosaic.any()
     assert plane().height_at(np.zeros(1), np.zeros(1)) == 0

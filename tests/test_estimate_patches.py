@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from twin.estimate import patches, stereo
-from twin.records import StereoRig
+from twin.core.records import StereoRig
+from twin.estimate.vision import patches, stereo
 
 PATCH_PX = 11
 SHAPE = (120, 160)

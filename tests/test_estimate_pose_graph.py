@@ -9,10 +9,10 @@ import pytest
 from evo.core.metrics import APE, PoseRelation
 from evo.core.trajectory import PosePath3D
 
-from twin import geometry
-from twin.estimate import block_cholesky, chordal, pose_graph
+from twin.core import geometry
+from twin.core.links import Link
+from twin.estimate.adjustment import block_cholesky, chordal, pose_graph
 from twin.exchange import posegraph
-from twin.links import Link
 
 DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 import seafloor_scene as scene
 
-from twin import geometry
-from twin.config import Estimation
-from twin.estimate import matching, network, stereo, vision
-from twin.estimate.f2f import FrameToFrame
-from twin.estimate.key_points import ImageSpool, KeyPoint
-from twin.estimate.mosaic import Mosaic, Registration
-from twin.estimate.motion import Motion
+from twin.core import geometry
+from twin.core.links import Link
+from twin.core.records import Frame, Readings, SensorNoise
+from twin.estimate import network, stereo_vision
+from twin.estimate.navigation.pose_filter import PoseFilter, aided
 from twin.estimate.pipeline import Navigator
-from twin.estimate.pose_filter import PoseFilter, aided
-from twin.estimate.trajectory import interpolate_between_keys
-from twin.links import Link
-from twin.records import Frame, Readings, SensorNoise
+from twin.estimate.trajectory import interpolate_between_keyframes
+from twin.estimate.vision import matching, stereo
+from twin.estimate.vision.f2f import FrameToFrame
+from twin.estimate.vision.image_spool import ImageSpool
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.mosaic import Mosaic, Registration
+from twin.estimate.vision.two_view_motion import Motion
+from twin.scenario.model import EstimateConfig
 
 PATCH_PX = 11
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)
@@ -41,7 +43,7 @@ def colour(gray):
 
 
 class Diver:
-    """Takes stereo pairs over the hills and makes key points of them."""
+    """Takes stereo pairs over the hills and makes keyframes of them."""
 
     def __init__(self, folder, seed=0):
         self.floor, self.rng, self.spool = hills(), np.random.default_rng(seed), ImageSpool(folder)
@@ -52,13 +54,13 @@ class Diver:
         image, depth = scene.look(self.floor, RIG, pose, samples=1)
         return colour(scene.digitise(image, self.rng, 2.0)), depth
 
-    def key_point(self, pose, believed=None):
+    def keyframe(self, pose, believed=None):
         (left, depth), (right, _) = self.frame(pose), self.frame(pose @ RIG.left_from_right)
         pair = matching.gray(left), matching.gray(right)
         dense_px = (RIG.focal_px * RIG.baseline_m / depth).astype(np.float32)
         points = stereo.points_of_pair(*pair, dense_px, RIG, 300, PATCH_PX)
         self.spool.put(self.count, left, right, pair)
-        key = KeyPoint(self.count, self.count, 1, pose if believed is None else believed, points, Readings())
+        key = Keyframe(self.count, self.count, 1, pose if believed is None else believed, points, Readings())
         self.count += 1
         return key, matching.normalise(pair[0]), depth
 
@@ -69,7 +71,7 @@ def diver(tmp_path):
 
 
 def over_flat_floor(number, x_m, y_m, depth_m=2.4):
-    """A key point over an even floor: its points fill the image; no picture is taken."""
+    """A keyframe over an even floor: its points fill the image; no picture is taken."""
     columns, rows = np.meshgrid(np.arange(5, RIG.width_px, 10.0), np.arange(5, RIG.height_px, 10.0))
     rays = np.column_stack([stereo.normalised(np.column_stack([columns.ravel(), rows.ravel()]), RIG), np.ones(768)])
     xyz = rays * depth_m
@@ -82,7 +84,7 @@ def over_flat_floor(number, x_m, y_m, depth_m=2.4):
         np.tile(np.eye(3) * 1e-8, (768, 1, 1)),
         xyz,
     )
-    return KeyPoint(number, number, 1, scene.down_camera(x_m, y_m, depth_m), points, Readings())
+    return Keyframe(number, number, 1, scene.down_camera(x_m, y_m, depth_m), points, Readings())
 
 
 def along(first, xs, y_m):
@@ -125,7 +127,7 @@ def test_points_whose_patches_overlap_count_as_fewer():
 
 
 def test_stereo_points_are_unbiased_and_their_noise_is_told(diver):
-    key, _, depth = diver.key_point(scene.down_camera(-1, 0, ALTITUDE_M))
+    key, _, depth = diver.keyframe(scene.down_camera(-1, 0, ALTITUDE_M))
     columns, rows = np.round(key.points.pixels).astype(int).T
     error_px = key.points.measured[:, 2] * RIG.focal_px - RIG.focal_px * RIG.baseline_m / depth[rows, columns]
     assert len(error_px) > 150
@@ -150,7 +152,7 @@ def test_on_a_slope_stereo_errs_as_its_covariance_says():
 
 def test_frame_to_frame_drifts_by_millimetres_over_fifteen_frames(diver):
     pose = scene.down_camera(-1, 0, ALTITUDE_M)
-    key, image, _ = diver.key_point(pose)
+    key, image, _ = diver.keyframe(pose)
     f2f = FrameToFrame(RIG, PATCH_PX)
     f2f.step(image)
     f2f.restart(image, key.points)
@@ -164,7 +166,7 @@ def test_frame_to_frame_drifts_by_millimetres_over_fifteen_frames(diver):
 
 
 def test_frame_to_frame_says_so_when_it_sees_nothing(diver):
-    key, image, _ = diver.key_point(scene.down_camera(0, 0, ALTITUDE_M))
+    key, image, _ = diver.keyframe(scene.down_camera(0, 0, ALTITUDE_M))
     f2f = FrameToFrame(RIG, PATCH_PX)
     f2f.step(image)
     f2f.restart(image, key.points)
@@ -175,7 +177,7 @@ def test_frame_to_frame_says_so_when_it_sees_nothing(diver):
 
 def test_frame_to_frame_finds_back_after_a_blind_frame(diver):
     pose, step = scene.down_camera(-1, 0, ALTITUDE_M), geometry.exp(np.array([0.001, 0.0, 0.0, 0.0, -0.02, 0.0]))
-    key, image, _ = diver.key_point(pose)
+    key, image, _ = diver.keyframe(pose)
     f2f, estimated, seen = FrameToFrame(RIG, PATCH_PX), pose, []
     f2f.step(image)
     f2f.restart(image, key.points)
@@ -188,10 +190,10 @@ def test_frame_to_frame_finds_back_after_a_blind_frame(diver):
     assert np.linalg.norm(error_of(pose @ np.linalg.matrix_power(step, 6), estimated)[3:]) < 0.01
 
 
-def test_frame_to_frame_goes_on_where_most_of_the_key_point_has_left_the_image(diver):
+def test_frame_to_frame_goes_on_where_most_of_the_keyframe_has_left_the_image(diver):
     """Half an image away, and turned by a quarter of a radian."""
     pose, step = scene.down_camera(-1, 0, ALTITUDE_M), geometry.exp(np.array([0.0, 0.0, 0.006, 0.0, -0.03, 0.0]))
-    key, image, _ = diver.key_point(pose)
+    key, image, _ = diver.keyframe(pose)
     f2f, estimated, true = FrameToFrame(RIG, PATCH_PX), pose, pose
     f2f.step(image)
     f2f.restart(image, key.points)
@@ -261,10 +263,10 @@ def test_noise_of_depth_does_not_pull_the_registration_with_the_mosaic(diver, tm
 )
 def test_pair_motion_is_right_to_millimetres_though_matching_starts_a_centimetre_off(diver, step):
     pose = scene.down_camera(-1, 0, ALTITUDE_M)
-    earlier, _, _ = diver.key_point(pose)
+    earlier, _, _ = diver.keyframe(pose)
     true = geometry.exp(np.array(step, float))
     start = diver.rng.normal(size=6) * [0.003, 0.003, 0.003, 0.01, 0.01, 0.01]
-    node, _, _ = diver.key_point(pose @ true, believed=pose @ true @ geometry.exp(start))
+    node, _, _ = diver.keyframe(pose @ true, believed=pose @ true @ geometry.exp(start))
     matcher = network.PairMatch(RIG, diver.spool, PATCH_PX)
     matched = matcher.flows(node, [earlier])[0]
     assert matched is not None
@@ -282,7 +284,7 @@ def test_pair_motion_is_right_to_millimetres_though_matching_starts_a_centimetre
 
 def test_overlap_is_of_the_true_footprint_and_falls_with_relief(diver):
     pose = scene.down_camera(-1, 0, ALTITUDE_M)
-    node, _, _ = diver.key_point(pose)
+    node, _, _ = diver.keyframe(pose)
     same, beside, far = (over_flat_floor(k, -1, y, ALTITUDE_M) for k, y in enumerate((0, 0.6, 3.0)))
     shares = network.overlaps(node, poses_of([same, beside, far]), RIG, PATCH_PX)
     flat = 1 - 0.6 / (ALTITUDE_M * RIG.width_px / RIG.focal_px)
@@ -370,7 +372,7 @@ def test_where_nothing_is_known_from_before_it_is_an_ordinary_position():
     np.testing.assert_allclose(np.linalg.inv(believed.cov), np.linalg.inv(prior) + np.linalg.inv(noise), rtol=1e-6)
 
 
-def test_interpolation_meets_the_key_points_and_keeps_frame_to_frame_motion_between():
+def test_interpolation_meets_the_keyframes_and_keeps_frame_to_frame_motion_between():
     rng = np.random.default_rng(0)
     f2f = [np.eye(4)]
     for _ in range(30):
@@ -378,9 +380,9 @@ def test_interpolation_meets_the_key_points_and_keeps_frame_to_frame_motion_betw
     f2f = np.array(f2f)
     rows = np.array([0, 10, 25])
     keys = np.array([f2f[r] @ geometry.exp(rng.normal(size=6) * 0.02) for r in rows])
-    path = interpolate_between_keys(f2f, rows, keys)
+    path = interpolate_between_keyframes(f2f, rows, keys)
     np.testing.assert_allclose(path[rows], keys, atol=1e-9)
-    np.testing.assert_allclose(interpolate_between_keys(f2f, rows, f2f[rows]), f2f, atol=1e-9)
+    np.testing.assert_allclose(interpolate_between_keyframes(f2f, rows, f2f[rows]), f2f, atol=1e-9)
     np.testing.assert_allclose(geometry.inverse(path[25]) @ path[30], geometry.inverse(f2f[25]) @ f2f[30], atol=1e-9)
 
 
@@ -388,36 +390,36 @@ LINK_COV = np.diag([0.002**2] * 3 + [0.01**2] * 3)
 
 
 class Script:
-    """A camera that answers the navigator with the motions between given poses, true or noisy, each a key point."""
+    """A camera that answers the navigator with the motions between given poses, true or noisy, each a keyframe."""
 
     def __init__(self, poses, blind=(), correction=None, rng=None):
         self.poses, self.blind, self.correction, self.rng = poses, blind, correction, rng
-        self.row, self.looks, self.forgotten = -1, [], set()
+        self.row, self.stereo_observations, self.forgotten = -1, [], set()
 
-    def step(self, frame):
+    def track_frame(self, frame):
         self.row = frame.index
         last = self.poses[max(self.row - 1, 0)]
         return Motion(geometry.inverse(last) @ self.poses[self.row], np.eye(6) * 1e-4, 100, 1.0), "ok"
 
-    def look(self, frame, row):
+    def observe_stereo(self, frame, row):
         return over_flat_floor(row, 0.0, 0.0).points
 
-    def restart(self):
+    def restart_tracking(self):
         pass
 
-    def register(self, world_from_camera):
+    def register_with_mosaic(self, world_from_camera):
         return None if self.correction is None else Registration(self.correction, 0)
 
-    def lay(self, number, world_from_camera):
+    def add_to_mosaic(self, number, world_from_camera):
         pass
 
-    def relay(self, keys):
+    def rebuild_mosaic(self, keys):
         pass
 
-    def forget(self, numbers):
+    def discard(self, numbers):
         self.forgotten |= set(numbers)
 
-    def measure(self, node, others):
+    def measure_motions(self, node, others):
         assert self.forgotten.isdisjoint(k.number for k in others)
         true = [geometry.inverse(self.poses[k.number]) @ self.poses[node.number] for k in others]
         if self.rng is not None:
@@ -428,7 +430,7 @@ class Script:
 def navigated(camera, tracks, readings=None, **settings):
     """A navigator that has flown the camera's poses in these tracks (n,), each aligned at its end."""
     noise, image = SensorNoise(0.01, 0.003, 0.01), np.zeros((1, 1, 3), np.uint8)
-    navigator = Navigator(camera, RIG, noise, Estimation(**settings), camera.poses[0], lambda _: nullcontext())
+    navigator = Navigator(camera, RIG, noise, EstimateConfig(**settings), camera.poses[0], lambda _: nullcontext())
     for k, track in enumerate(tracks):
         navigator.update(Frame(k, k / 30, image, image, readings or Readings()), track)
         if k + 1 == len(tracks) or tracks[k + 1] != track:
@@ -448,15 +450,15 @@ def test_a_loop_that_comes_back_after_many_tracks_is_tied_to_the_reference_posit
     assert 5 not in {link.i for link in links if link.j == 8}  # in view, but older than the window
 
 
-def test_key_points_that_no_link_will_reach_back_to_are_given_up():
+def test_keyframes_that_no_link_will_reach_back_to_are_given_up():
     """Those out of the window, but the first four; `Script` sees to it that no link with them is asked for."""
     camera, tracks = Script(line(np.zeros(24))), np.repeat(np.arange(1, 9), 3).tolist()
     navigated(camera, tracks, window_tracks=2)
-    assert camera.forgotten == set(range(4, 15))  # tracks 2 to 5 of 8, but key point 3
+    assert camera.forgotten == set(range(4, 15))  # tracks 2 to 5 of 8, but keyframe 3
 
 
 def test_where_stereo_pairs_do_not_tell_the_motion_frame_to_frame_stands_in():
-    """Key point 3 cannot be matched: one link bridges it, and what the velocity log says is in the F2F motion."""
+    """Keyframe 3 cannot be matched: one link bridges it, and what the velocity log says is in the F2F motion."""
     poses = line(0.3 * np.arange(6))
     forward = Readings(dvl_mps=np.array([9.0, 0.0, 0.0]))
     navigator = navigated(Script(poses, blind=[3]), [1] * 6, forward)
@@ -468,7 +470,7 @@ def test_where_stereo_pairs_do_not_tell_the_motion_frame_to_frame_stands_in():
     assert [node.walked is None for node in navigator.nodes] == [True, False, False, True, False, False]
 
 
-def test_key_points_behind_keep_no_points_in_memory():
+def test_keyframes_behind_keep_no_points_in_memory():
     assert all(key.points is None for key in navigated(Script(line(np.zeros(4))), [1] * 4).keys)
 
 
@@ -496,11 +498,11 @@ def test_however_well_the_mosaic_agrees_its_sampling_bounds_the_motion_since_it_
 
 
 def test_a_mismatch_far_away_does_not_widen_the_window_of_the_mosaic(diver):
-    node, _, _ = diver.key_point(scene.down_camera(-1, 0, ALTITUDE_M))
+    node, _, _ = diver.keyframe(scene.down_camera(-1, 0, ALTITUDE_M))
     wild = node.points.xyz.copy()
     wild[0] *= 100
-    window_m = vision.half_window_m(node.points._replace(xyz=wild), RIG)
-    assert window_m == pytest.approx(vision.half_window_m(node.points, RIG), rel=0.05)
+    window_m = stereo_vision.half_window_m(node.points._replace(xyz=wild), RIG)
+    assert window_m == pytest.approx(stereo_vision.half_window_m(node.points, RIG), rel=0.05)
     assert window_m > ALTITUDE_M * RIG.width_px / RIG.focal_px / 2
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.estimate.tiles import SIDE, TiledRaster
+from twin.estimate.vision.tiles import SIDE, TiledRaster
 
 
 def test_windows_read_what_was_written_across_tiles_also_from_disk(tmp_path):

@@ -5,9 +5,9 @@ import pytest
 import rasterio
 import trimesh
 
+from twin.core.records import ElevationMap, MapGrid
 from twin.exchange import geotiff, mesh
-from twin.judge.run_folder import read_raster
-from twin.records import ElevationMap, MapGrid
+from twin.report.run_folder import read_raster
 
 GRID = MapGrid(-3.1, 4.7, 0.02, 30, 40)
 

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.links import Link, Links
+from twin.core.records import Trajectory
 from twin.errors import TwinError
 from twin.exchange import posegraph
-from twin.links import Link, Links
-from twin.records import Trajectory
 
 UPPER = np.triu_indices(6)
 
@@ -24,7 +24,7 @@ def test_a_written_network_comes_back(tmp_path):
     poses = np.array([geometry.exp(rng.normal(size=6)) for _ in range(3)])
     root = rng.normal(size=(6, 6)) * 0.01
     link = Link(0, 2, geometry.exp(rng.normal(size=6)), root @ root.T, 0.5, 9)
-    result = SimpleNamespace(final=Trajectory(np.arange(3.0), poses), key_frames=np.arange(3), links=Links([link]))
+    result = SimpleNamespace(final=Trajectory(np.arange(3.0), poses), keyframe_rows=np.arange(3), links=Links([link]))
     posegraph.write(tmp_path / "it.g2o", result)
     found = posegraph.read(tmp_path / "it.g2o")
     np.testing.assert_allclose([found.poses[k] for k in range(3)], poses, atol=1e-10)

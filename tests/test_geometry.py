@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from scenes.gl import mujoco
-from twin import geometry as g
+from twin.core import geometry as g
 
 settings.register_profile("compiling", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("compiling")

@@ -1,19 +1,19 @@
-"""Caustics: no light is lost, the lines follow the waves, fade with depth and are the same in both eyes."""
+"""Caustics: no light is lost, the lines follow the waves, fade with depth and are the same in both cameras."""
 
 import types
 
 import numpy as np
 import pytest
 
-from twin import geometry
-from twin.config import Scenario, Sun, Water
+from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.caustics import CELLS, GRAVITY_MPS2, SLOPE_RMS, TILE_M, WATER_INDEX, Caustics
 from twin.imaging.lamps import daylight_at
 from twin.imaging.light import Light, Moment
 from twin.imaging.water import medium
+from twin.scenario.model import Scenario, SunConfig, WaterConfig
 
-CLEAR = medium(Water(jerlov="clear"))
+CLEAR = medium(WaterConfig(jerlov="clear"))
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
 
 
@@ -25,7 +25,7 @@ def scenario(**sun):
 
 @pytest.mark.parametrize(("depth_m", "jerlov"), [(1.0, "clear"), (4.0, "IB"), (20.0, "II")])
 def test_waves_gather_light_and_lose_none(depth_m, jerlov):
-    caustics = Caustics(depth_m, 1.0, medium(Water(jerlov=jerlov)), 3)
+    caustics = Caustics(depth_m, 1.0, medium(WaterConfig(jerlov=jerlov)), 3)
     for time_s in (0.0, 1.7):
         light = caustics.pattern(time_s)
         assert light.mean(dtype=np.float64) == pytest.approx(1.0, abs=1e-5)
@@ -64,11 +64,11 @@ def test_waves_run_as_they_do_on_deep_water():
 
 
 def test_the_pattern_fades_with_depth_turbidity_and_the_share_of_the_sky():
-    contrast = [Caustics(d, 1.0, medium(Water(jerlov="IB")), 1).pattern(0.0).std() for d in (5.0, 15.0, 40.0)]
+    contrast = [Caustics(d, 1.0, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0).std() for d in (5.0, 15.0, 40.0)]
     assert contrast[0] > 2 * contrast[1] > 4 * contrast[2] > 0
-    murky = Caustics(5.0, 1.0, medium(Water(jerlov="II")), 1).pattern(0.0).std()
+    murky = Caustics(5.0, 1.0, medium(WaterConfig(jerlov="II")), 1).pattern(0.0).std()
     assert murky < 0.5 * contrast[0]
-    half = Caustics(5.0, 0.5, medium(Water(jerlov="IB")), 1).pattern(0.0)
+    half = Caustics(5.0, 0.5, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0)
     np.testing.assert_allclose(half.std(), contrast[0] / 2, rtol=1e-4)
 
 
@@ -124,4 +124,4 @@ def test_without_caustics_daylight_is_even():
 )
 def test_a_sun_without_room_for_it_is_told(sun, fault):
     with pytest.raises(TwinError, match=fault):
-        daylight_at(Sun(illuminance_lx=10.0, **sun), CLEAR, 2.2)
+        daylight_at(SunConfig(illuminance_lx=10.0, **sun), CLEAR, 2.2)

@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from twin import geometry
-from twin.mission import prepare
-from twin.rendered_sea import RenderedSea
-from twin.scenario_file import load_scenario
-from twin.timing import Stopwatch
+from twin.core import geometry
+from twin.core.timing import Stopwatch
+from twin.scenario.file import load_scenario
+from twin.world.mission import prepare
+from twin.world.rendered_world import RenderedWorld
 
 LARGE = ("rig.image_width_px=640", "rig.image_height_px=480")
 EFFECTS = (
@@ -49,7 +49,7 @@ class Clock:
 def measure(overrides: tuple[str, ...]) -> dict[str, np.ndarray]:
     """(frames, 2) times of each stage, over the demo's reef."""
     mission, clock = prepare(load_scenario("quickstart", list(overrides))), Clock()
-    with RenderedSea(mission, Stopwatch()) as sea:
+    with RenderedWorld(mission, Stopwatch()) as sea:
         sea.camera._watch = clock
         for x in np.linspace(-1, 1, WARM_UP + N_PAIRS):
             place = np.array([x, 0.2, mission.scenario.plan.altitude_m])

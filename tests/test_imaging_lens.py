@@ -9,16 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
-from twin.config import Scenario
+from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.imaging.camera import StereoCamera
 from twin.imaging.lens import Distortion, distort, fold, undistort
 from twin.imaging.light import Light
 from twin.imaging.resample import gather, interpolate
-from twin.imaging.view import make_view
-from twin.mission import prepare
-from twin.scenario_file import load_scenario
-from twin.timing import Stopwatch
+from twin.imaging.true_cameras import make_view
+from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
+from twin.world.mission import prepare
 
 WIDE = {"k1": -0.28, "k2": 0.09, "k3": -0.012, "p1": 0.0012, "p2": -0.0008}
 STRONG = [WIDE, {"k1": 0.2}, {"k1": -0.2}, {"p1": 0.01, "p2": -0.01}]
@@ -106,7 +106,7 @@ def test_a_frame_through_a_known_lens_looks_like_a_pinhole_s(lens):
 
 def test_a_lens_that_is_not_known_as_it_is_shifts_the_frame_by_the_known_amount():
     """k1 off by e: what lies at tangent r is seen f e r^3 (1 + k1 ...) farther out."""
-    view = make_view(scenario(lens={"k1": -0.1}, calibration={"k1_error": 0.01}))
+    view = make_view(scenario(lens={"k1": -0.1}, calibration_error={"k1_error": 0.01}))
     rig = scenario().believed_rig()
     points = np.array([[0.5, 0.0, 1.0], [0.3, 0.4, 1.0], [0.0, 0.0, 1.0]])
     off = view.project(points) - rig.project(points)
@@ -118,7 +118,7 @@ def test_a_lens_that_is_not_known_as_it_is_shifts_the_frame_by_the_known_amount(
 
 
 def test_without_distortion_nothing_is_done():
-    view = make_view(scenario(calibration={"baseline_error": 0.1}))
+    view = make_view(scenario(calibration_error={"baseline_error": 0.1}))
     light, image = np.ones((240, 320, 3), np.float32), np.ones((240, 320, 3), np.uint8)
     assert view.raw(light, light[..., 0], 1) is light and view.frame(image) is image and view.crop(image) is image
     rig, believed = make_view(scenario()).rig, scenario().believed_rig()

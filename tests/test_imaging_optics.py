@@ -6,19 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from twin.config import Lamp, Scenario, Sun, Water
 from twin.errors import TwinError
 from twin.imaging.lamps import LED_BEAM, Daylight, beam_share, colour, daylight_at, lights_of_eye
 from twin.imaging.optics import Optics, Overhead, scattered_per_m
 from twin.imaging.water import FORWARDNESS, JERLOV_PER_M, downwelling_per_m, medium, phase_function, read_spectrum
+from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 
 RIG = Scenario.model_validate({"rig": {"image_width_px": 96, "image_height_px": 64}}).believed_rig()
-CLEAR, DARK, NIGHT = Water(jerlov="clear"), Sun(illuminance_lx=0), Daylight(np.zeros(3), np.zeros(3))
-#: A lamp at the very place of the left eye, looking along its axis.
-AT_EYE = Lamp(position_m=tuple(RIG.body_from_camera[:3, 3]), intensity_cd=1000.0)
+CLEAR, DARK, NIGHT = WaterConfig(jerlov="clear"), SunConfig(illuminance_lx=0), Daylight(np.zeros(3), np.zeros(3))
+#: A lamp at the very place of the left camera, looking along its axis.
+AT_EYE = LampConfig(position_m=tuple(RIG.body_from_camera[:3, 3]), intensity_cd=1000.0)
 TWO_LAMPS = (
-    Lamp(position_m=(0.25, 0.35, -0.05), pan_deg=-8.0, intensity_cd=1500.0),
-    Lamp(position_m=(0.25, -0.35, -0.05), tilt_deg=10.0, intensity_cd=900.0),
+    LampConfig(position_m=(0.25, 0.35, -0.05), pan_deg=-8.0, intensity_cd=1500.0),
+    LampConfig(position_m=(0.25, -0.35, -0.05), tilt_deg=10.0, intensity_cd=900.0),
 )
 CENTRE = (RIG.height_px // 2, RIG.width_px // 2)
 
@@ -37,7 +37,7 @@ def rays():
 def test_daylight_in_clear_water_shows_albedo_over_pi():
     rng = np.random.default_rng(0)
     albedo = rng.integers(0, 256, (RIG.height_px, RIG.width_px, 3), dtype=np.uint8)
-    light = Optics(RIG, CLEAR, (), Sun(illuminance_lx=1000)).radiance(albedo, floor(3.0)[1], 0)
+    light = Optics(RIG, CLEAR, (), SunConfig(illuminance_lx=1000)).radiance(albedo, floor(3.0)[1], 0)
     np.testing.assert_allclose(light, 1000 / np.pi * albedo / 255, rtol=1e-5)
 
 
@@ -53,11 +53,11 @@ def test_a_lamp_in_clear_water_obeys_the_inverse_square_law_and_lamberts_cosine(
 
 
 def test_doubling_the_way_squares_the_transmission():
-    water = medium(Water(jerlov="II"))
+    water = medium(WaterConfig(jerlov="II"))
     ratio = []
     for depth_m in (1.5, 3.0):
-        veil = Optics(RIG, Water(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m, 0), 0)[CENTRE]
-        wet = Optics(RIG, Water(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m), 0)[CENTRE] - veil
+        veil = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m, 0), 0)[CENTRE]
+        wet = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m), 0)[CENTRE] - veil
         ratio.append(wet / Optics(RIG, CLEAR, (AT_EYE,), DARK).radiance(*floor(depth_m), 0)[CENTRE])
     np.testing.assert_allclose(ratio[1], ratio[0] ** 2, rtol=1e-3)
     # to the floor and back; half a pixel off the axis
@@ -65,7 +65,7 @@ def test_doubling_the_way_squares_the_transmission():
 
 
 def test_without_floor_there_is_the_veil_alone_and_it_grows_with_range():
-    optics = Optics(RIG, Water(jerlov="1C"), TWO_LAMPS, DARK)
+    optics = Optics(RIG, WaterConfig(jerlov="1C"), TWO_LAMPS, DARK)
     near, far, open_water = (optics.radiance(*floor(d, 0), 0) for d in (1.0, 3.0, np.inf))
     assert (near < far).all() and (far <= open_water).all()
     np.testing.assert_array_equal(open_water, optics.radiance(*floor(np.inf, 255), 0))
@@ -74,11 +74,11 @@ def test_without_floor_there_is_the_veil_alone_and_it_grows_with_range():
 
 @pytest.mark.parametrize("lamps", [(), (TWO_LAMPS[0].model_copy(update={"intensity_cd": 0.0}),)])
 def test_a_lamp_that_is_off_makes_no_light_and_no_veil(lamps):
-    assert not Optics(RIG, Water(jerlov="9C"), lamps, DARK).radiance(*floor(2.0), 0).any()
+    assert not Optics(RIG, WaterConfig(jerlov="9C"), lamps, DARK).radiance(*floor(2.0), 0).any()
 
 
 WORLDS = pytest.mark.parametrize("jerlov", ["IB", "II", "3C"])
-ABOVE = Sun(illuminance_lx=40.0, depth_m=12.0)
+ABOVE = SunConfig(illuminance_lx=40.0, depth_m=12.0)
 SAMPLES = 3000  # of a ray: where the table of the beam bends, the sum is off by the square of a step
 
 
@@ -91,7 +91,7 @@ def summed_veil(lights, water, depth_m, pixels):
 
 
 def lit_water(jerlov, eye, sun=ABOVE):
-    water = Water(jerlov=jerlov)
+    water = WaterConfig(jerlov=jerlov)
     optics = Optics(RIG, water, TWO_LAMPS, sun, altitude_m=2.0)
     return optics, lights_of_eye(RIG, TWO_LAMPS, daylight_at(sun, medium(water), 2.0), eye), medium(water)
 
@@ -136,8 +136,8 @@ def test_the_veil_agrees_with_quadrature_all_over_the_image(jerlov):
 @pytest.mark.parametrize("jerlov", ["IB", "II", "3C"])
 def test_the_direct_signal_is_the_formula_within_a_thousandth(jerlov):
     """Two lamps over a level floor, each written out with numpy."""
-    water, sun = medium(Water(jerlov=jerlov)), Sun(illuminance_lx=300.0, depth_m=9.0)
-    optics = Optics(RIG, Water(jerlov=jerlov), TWO_LAMPS, sun, altitude_m=2.0)
+    water, sun = medium(WaterConfig(jerlov=jerlov)), SunConfig(illuminance_lx=300.0, depth_m=9.0)
+    optics = Optics(RIG, WaterConfig(jerlov=jerlov), TWO_LAMPS, sun, altitude_m=2.0)
     lights = lights_of_eye(RIG, TWO_LAMPS, NIGHT, 0)
     for depth_m in (0.8, 2.0, 4.0):
         direct, _ = optics.split(*floor(depth_m), 0)
@@ -155,7 +155,7 @@ def test_the_direct_signal_is_the_formula_within_a_thousandth(jerlov):
 
 def test_daylight_falls_by_kd_from_the_surface_to_each_point_of_the_floor():
     """Floors at two heights under a turned camera: the depth below the surface counts, not that along the axis."""
-    water, sun = Water(jerlov="1C", turbidity=0.0), Sun(illuminance_lx=1e4, depth_m=6.0)
+    water, sun = WaterConfig(jerlov="1C", turbidity=0.0), SunConfig(illuminance_lx=1e4, depth_m=6.0)
     optics, per_m = Optics(RIG, water, (), sun, altitude_m=2.0), downwelling_per_m(medium(water))
     np.testing.assert_allclose(per_m, medium(water).absorption_per_m)  # nothing is scattered, the sun is in the zenith
     np.testing.assert_allclose(optics.floor_lx(floor(2.0)[1], 0)[CENTRE], 1e4 * np.exp(-6 * per_m), rtol=1e-3)
@@ -175,14 +175,14 @@ def test_daylight_falls_by_kd_from_the_surface_to_each_point_of_the_floor():
 )  # fmt: skip
 def test_kd_is_about_what_jerlov_measured(jerlov, table):
     """The table's absorption and scattering were decoded from measured Kd by other hands: within a third."""
-    water = medium(Water(jerlov=jerlov))
+    water = medium(WaterConfig(jerlov=jerlov))
     per_m = downwelling_per_m(water)
     np.testing.assert_allclose(per_m, table, rtol=0.34)
     assert (per_m >= water.absorption_per_m).all() and (per_m <= water.attenuation_per_m).all()
 
 
 def test_kept_scatter_turns_the_beams_attenuation_into_that_of_diffuse_light():
-    beam, forward, all_of_it = (medium(Water(jerlov="II", kept_share=k)) for k in (0.0, 0.74, 1.0))
+    beam, forward, all_of_it = (medium(WaterConfig(jerlov="II", kept_share=k)) for k in (0.0, 0.74, 1.0))
     np.testing.assert_allclose(beam.attenuation_per_m, [0.712, 0.4202, 0.5483])  # a + b
     np.testing.assert_allclose(forward.attenuation_per_m, [0.52715, 0.15528, 0.16084], rtol=1e-3)  # a + 0.26 b
     np.testing.assert_array_equal(all_of_it.attenuation_per_m, all_of_it.absorption_per_m)
@@ -201,7 +201,7 @@ def test_a_table_of_the_beam_shapes_the_light_and_is_dark_beyond_its_end():
     assert not light[off_deg > 20.5].any()
     # the veil of a beam that is dark where the eye looks is dark, too
     aside = spot.model_copy(update={"tilt_deg": 90.0})
-    assert not Optics(RIG, Water(jerlov="II"), (aside,), DARK).radiance(*floor(2.0), 0)[40:].any()
+    assert not Optics(RIG, WaterConfig(jerlov="II"), (aside,), DARK).radiance(*floor(2.0), 0)[40:].any()
 
 
 def test_the_colour_of_a_lamp_is_plancks_and_keeps_its_luminous_intensity():
@@ -216,14 +216,14 @@ def test_the_colour_of_a_lamp_is_plancks_and_keeps_its_luminous_intensity():
     np.testing.assert_allclose(warm / warm[1], np.array(ratio) / ratio[1], rtol=1e-6)
     assert warm @ [0.2126, 0.7152, 0.0722] == pytest.approx(1.0, abs=1e-12)
     lamp = AT_EYE.model_copy(update={"colour_temperature_k": 3000.0})
-    white = Optics(RIG, Water(jerlov="II"), (AT_EYE,), DARK).split(*floor(2.0), 0)
-    coloured = Optics(RIG, Water(jerlov="II"), (lamp,), DARK).split(*floor(2.0), 0)
+    white = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).split(*floor(2.0), 0)
+    coloured = Optics(RIG, WaterConfig(jerlov="II"), (lamp,), DARK).split(*floor(2.0), 0)
     for was, now in zip(white, coloured, strict=True):  # direct and veil alike
         np.testing.assert_allclose(now, was * warm, rtol=1e-5)
 
 
 def test_the_veil_of_one_lamp_agrees_with_the_formula_written_out():
-    lights, water = lights_of_eye(RIG, (AT_EYE,), NIGHT, 0), medium(Water(jerlov="II", turbidity=2.0))
+    lights, water = lights_of_eye(RIG, (AT_EYE,), NIGHT, 0), medium(WaterConfig(jerlov="II", turbidity=2.0))
     range_m = 1.7
     got = scattered_per_m(lights, water, np.array([0.0, 0.0, 1.0]), np.array([range_m]))[0]
     b = 2.0 * np.array([0.2498, 0.3580, 0.5236])
@@ -237,16 +237,16 @@ def test_scattered_light_goes_somewhere(g):
     total, _ = quad(lambda mu: 2 * np.pi * phase_function(np.array(mu), g), -1, 1)
     mean_cosine, _ = quad(lambda mu: 2 * np.pi * mu * phase_function(np.array(mu), g), -1, 1)
     assert total == pytest.approx(1.0, abs=1e-9) and mean_cosine == pytest.approx(g, abs=1e-9)
-    assert Water().mean_cosine == FORWARDNESS
+    assert WaterConfig().mean_cosine == FORWARDNESS
 
 
 def test_own_water_takes_the_place_of_the_types_and_turbidity_still_scales_it():
-    given = Water(absorption_per_m=(0.5, 0.1, 0.2), scattering_per_m=(0.1, 0.2, 0.3), turbidity=2.0)
+    given = WaterConfig(absorption_per_m=(0.5, 0.1, 0.2), scattering_per_m=(0.1, 0.2, 0.3), turbidity=2.0)
     np.testing.assert_allclose(medium(given).absorption_per_m, [0.5, 0.1, 0.2])
     np.testing.assert_allclose(medium(given).scattering_per_m, [0.2, 0.4, 0.6])
-    of_type = Water(jerlov="III")
+    of_type = WaterConfig(jerlov="III")
     a, b = JERLOV_PER_M["III"]
-    same = Optics(RIG, Water(absorption_per_m=a, scattering_per_m=b), TWO_LAMPS, DARK).radiance(*floor(2.0), 0)
+    same = Optics(RIG, WaterConfig(absorption_per_m=a, scattering_per_m=b), TWO_LAMPS, DARK).radiance(*floor(2.0), 0)
     np.testing.assert_array_equal(same, Optics(RIG, of_type, TWO_LAMPS, DARK).radiance(*floor(2.0), 0))
 
 
@@ -276,7 +276,7 @@ def test_a_bad_spectrum_is_told(tmp_path, text, fault):
     if text is not None:
         file.write_text(text)
     with pytest.raises(TwinError, match=r"water\.spectrum_file: .*" + fault):
-        medium(Water(spectrum_file=str(file)))
+        medium(WaterConfig(spectrum_file=str(file)))
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_a_bad_spectrum_is_told(tmp_path, text, fault):
 )
 def test_half_a_water_is_told(keys, fault):
     with pytest.raises(TwinError, match=fault):
-        medium(Water(**keys))
+        medium(WaterConfig(**keys))
 
 
 def test_beams_tilt_to_the_bow_and_pan_to_port():

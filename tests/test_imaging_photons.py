@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.config import Scenario
 from twin.imaging import photo_sensor
 from twin.imaging.light import Light, Moment
 from twin.imaging.photo_sensor import PhotoSensor
 from twin.imaging.photons import electrons_per_cd, photons_per_lux, vignetting
 from twin.imaging.sensor import Setting
+from twin.scenario.model import Scenario
 
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
 BLACK, TOP = 64, 4095

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, root
 
-from twin.config import Port, Scenario
 from twin.errors import ScenarioError
 from twin.imaging.port import air_tangents, pinhole, refract, water_rays
 from twin.imaging.resample import meet
-from twin.imaging.view import make_view
-from twin.mission import prepare
-from twin.scenario_file import load_scenario
+from twin.imaging.true_cameras import make_view
+from twin.scenario.file import load_scenario
+from twin.scenario.model import PortConfig, Scenario
+from twin.world.mission import prepare
 
 FLAT = {"kind": "flat", "thickness_m": 0.012, "distance_m": 0.03}
 TILTED = FLAT | {"tilt_deg": 8.0}
@@ -26,7 +26,7 @@ def scenario(**sections) -> Scenario:
     return Scenario.model_validate({"rig": SIZE} | sections)
 
 
-def tangent_of_pane(port: Port, across_m: float, ahead_m: float) -> float:
+def tangent_of_pane(port: PortConfig, across_m: float, ahead_m: float) -> float:
     """Tangent in air of the ray that goes from the pupil to a point, by root finding on Snell's law in the plane."""
 
     def across_at(angle):
@@ -37,7 +37,7 @@ def tangent_of_pane(port: Port, across_m: float, ahead_m: float) -> float:
     return float(np.tan(brentq(lambda angle: across_at(angle) - across_m, 0.0, np.deg2rad(89.9), xtol=1e-14)))
 
 
-def tangents_by_fermat(port: Port, point_m: np.ndarray) -> np.ndarray:
+def tangents_by_fermat(port: PortConfig, point_m: np.ndarray) -> np.ndarray:
     """The same (2,) for any port, by the light's path of least time: its two places on the faces of the glass."""
     tilt = np.deg2rad(port.tilt_deg)
     along_pane = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), np.sin(tilt)]])
@@ -68,7 +68,7 @@ def tangents_by_fermat(port: Port, point_m: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("tangent", TANGENTS)
 def test_a_pane_shows_a_point_where_snell_s_law_has_it(tangent, depth_m):
     """Within 1e-4 px of a frame 320 px wide; the claim of the whole is 0.01 px."""
-    port, turn = Port(**FLAT), np.deg2rad(35)
+    port, turn = PortConfig(**FLAT), np.deg2rad(35)
     across_m = tangent * depth_m
     point = np.array([[across_m * np.cos(turn), across_m * np.sin(turn), depth_m]])
     expected = tangent_of_pane(port, across_m, depth_m) * np.array([np.cos(turn), np.sin(turn)])
@@ -78,7 +78,7 @@ def test_a_pane_shows_a_point_where_snell_s_law_has_it(tangent, depth_m):
 @pytest.mark.parametrize("depth_m", [0.5, 4.0])
 @pytest.mark.parametrize("port", [FLAT, TILTED, DOME, DOME | {"offset_m": (0.01, -0.004, 0.008)}])
 def test_a_port_shows_a_point_where_fermat_s_principle_has_it(port, depth_m):
-    here = Port(**port)
+    here = PortConfig(**port)
     points = np.array([[0.05, 0.0, 1.0], [0.3, -0.2, 1.0], [-0.2, 0.45, 1.0], [-0.5, -0.35, 1.0]]) * depth_m
     expected = [tangents_by_fermat(here, point) for point in points]
     np.testing.assert_allclose(air_tangents(here, points), expected, atol=1e-4 / 277)
@@ -104,7 +104,7 @@ def test_beyond_the_critical_angle_no_light_gets_out():
 
 @pytest.mark.parametrize("sections", [FLAT | {"tilt_deg": 12.0}, DOME | {"offset_m": (0.01, -0.004, 0.008)}])
 def test_where_all_indices_are_that_of_air_a_port_is_nothing(sections):
-    port = Port(**sections, glass_index=1.0, water_index=1.0)
+    port = PortConfig(**sections, glass_index=1.0, water_index=1.0)
     tangents = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 2))
     origin, direction = water_rays(port, tangents)
     np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], tangents, atol=1e-14)
@@ -114,7 +114,7 @@ def test_where_all_indices_are_that_of_air_a_port_is_nothing(sections):
 
 
 def test_a_dome_with_the_pupil_in_its_centre_bends_nothing():
-    port = Port(**DOME | {"offset_m": (0.0, 0.0, 0.0)})
+    port = PortConfig(**DOME | {"offset_m": (0.0, 0.0, 0.0)})
     tangents = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 2))
     origin, direction = water_rays(port, tangents)
     np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], tangents, atol=1e-13)
@@ -125,17 +125,17 @@ def test_a_dome_with_the_pupil_in_its_centre_bends_nothing():
 def test_glass_bends_no_direction_and_thin_glass_nothing():
     """A pane between two equal media shifts a ray; the direction in water knows of no glass."""
     tangents = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 2))
-    _, acrylic = water_rays(Port(**FLAT), tangents)
-    _, flint = water_rays(Port(**FLAT, glass_index=1.9), tangents)
+    _, acrylic = water_rays(PortConfig(**FLAT), tangents)
+    _, flint = water_rays(PortConfig(**FLAT, glass_index=1.9), tangents)
     np.testing.assert_allclose(acrylic, flint, atol=1e-14)
-    thin = [water_rays(Port(**FLAT | {"thickness_m": 1e-9, "glass_index": g}), tangents)[0] for g in (1.3, 1.9)]
+    thin = [water_rays(PortConfig(**FLAT | {"thickness_m": 1e-9, "glass_index": g}), tangents)[0] for g in (1.3, 1.9)]
     np.testing.assert_allclose(thin[0], thin[1], atol=1e-8)
     np.testing.assert_allclose(thin[0], 0.03 * np.column_stack([tangents, np.ones(20)]), atol=1e-8)
 
 
 def test_the_pinhole_of_a_pane_is_that_of_gauss():
     """Focal length n times the lens's, d (n - 1) + t (n / g - 1) behind the pupil."""
-    like = pinhole(Port(**FLAT))
+    like = pinhole(PortConfig(**FLAT))
     assert like.focal_ratio == pytest.approx(1.339, rel=1e-7)
     assert like.centre_m == pytest.approx(-(0.03 * 0.339 + 0.012 * (1.339 / 1.49 - 1)), rel=1e-6)
 

@@ -12,7 +12,7 @@ import pytest
 
 import terrains
 from scenes.builder import build
-from twin import geometry
+from twin.core import geometry
 from twin.imaging.renderer import Renderer
 
 W, H, VFOV = 160, 120, 45.0

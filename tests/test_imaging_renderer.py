@@ -13,10 +13,10 @@ import pytest
 import scenes.floor
 import scenes.gl
 import terrains
-from scenes.builder import World, build
+from scenes.builder import SceneModel, build
 from scenes.gl import mujoco
 from terrains import Terrain
-from twin import geometry
+from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.renderer import Renderer, linear_depth, visible_tiles
 
@@ -31,17 +31,17 @@ POSES = [
 ]
 
 
-def world_of(terrain: Terrain) -> World:
+def world_of(terrain: Terrain) -> SceneModel:
     return build(terrain, W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), 0.01)
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def world() -> SceneModel:
     return world_of(terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, 0.003, 5))
 
 
 @pytest.fixture(scope="module")
-def renderer(world: World) -> Iterator[Renderer]:
+def renderer(world: SceneModel) -> Iterator[Renderer]:
     with Renderer(world, W, H, VFOV) as made:
         yield made
 
@@ -53,7 +53,7 @@ def pixel_rays(width_px: int, height_px: int, vfov_deg: float) -> np.ndarray:
     return np.stack([u / focal_px, v / focal_px, np.ones_like(u)], axis=-1)
 
 
-def ray_depths(world: World, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def ray_depths(world: SceneModel, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     data = mujoco.MjData(world.model)
     data.qpos[2] = 100.0
     mujoco.mj_forward(world.model, data)
@@ -67,7 +67,9 @@ def ray_depths(world: World, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_depth_is_that_of_rays_through_the_pixel_centres(world: World, renderer: Renderer, pose: np.ndarray) -> None:
+def test_depth_is_that_of_rays_through_the_pixel_centres(
+    world: SceneModel, renderer: Renderer, pose: np.ndarray
+) -> None:
     _, depth = renderer.render(pose)
     pixels = np.random.default_rng(1).integers(0, (W, H), (400, 2))
     seen, expected = depth[pixels[:, 1], pixels[:, 0]], ray_depths(world, pose, pixels)
@@ -79,7 +81,7 @@ def test_depth_is_that_of_rays_through_the_pixel_centres(world: World, renderer:
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_every_drawn_point_lies_on_the_terrain(world: World, renderer: Renderer, pose: np.ndarray) -> None:
+def test_every_drawn_point_lies_on_the_terrain(world: SceneModel, renderer: Renderer, pose: np.ndarray) -> None:
     _, depth = renderer.render(pose)
     seen = np.isfinite(depth)
     points = geometry.transform(pose, pixel_rays(W, H, VFOV)[seen] * depth[seen][:, None].astype(np.float64))
@@ -88,7 +90,7 @@ def test_every_drawn_point_lies_on_the_terrain(world: World, renderer: Renderer,
     assert np.isnan(error).mean() < 0.002  # pixels on the very edge of the floor
 
 
-def test_no_border_between_tiles_shows(monkeypatch: pytest.MonkeyPatch, world: World, renderer: Renderer) -> None:
+def test_no_border_between_tiles_shows(monkeypatch: pytest.MonkeyPatch, world: SceneModel, renderer: Renderer) -> None:
     """Drawn whole or cut into 12 pieces the floor looks the same."""
     cut = [renderer.render(pose) for pose in POSES]
     monkeypatch.setattr(scenes.floor, "TILE_CELLS", 1000)
@@ -169,7 +171,7 @@ def test_texture_is_drawn_no_softer_than_a_pixel() -> None:
     assert albedo[..., 0].std() > 0.5 * noise[..., 0].std()
 
 
-def test_hidden_tiles_are_those_that_no_pixel_sees(world: World, renderer: Renderer) -> None:
+def test_hidden_tiles_are_those_that_no_pixel_sees(world: SceneModel, renderer: Renderer) -> None:
     tangents = np.tan(np.deg2rad(VFOV) / 2) * np.array([W / H, 1.0])
     for pose in POSES:
         albedo, depth = renderer.render(pose)
@@ -204,7 +206,7 @@ def test_linear_depth_inverts_the_projection() -> None:
     assert np.isinf(linear_depth(np.zeros(1, np.float32), near, far)[0])
 
 
-def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
+def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch, world: SceneModel) -> None:
     monkeypatch.setattr(scenes.gl, "_why_missing", "ImportError: no libEGL.so.1")
     with pytest.raises(TwinError, match=r"no libEGL.*apt-get install -y libegl1"):
         Renderer(world, W, H, VFOV)

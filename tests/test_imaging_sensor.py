@@ -5,20 +5,20 @@ import types
 import numpy as np
 import pytest
 
-from twin import geometry
-from twin.config import Imaging, Scenario
-from twin.imaging import bands
+from twin.core import geometry
+from twin.core.timing import Stopwatch
+from twin.imaging import row_parallel
 from twin.imaging.camera import AT_REST, StereoCamera
 from twin.imaging.light import Light, Moment
 from twin.imaging.photo_sensor import sensor_of
 from twin.imaging.sensor import Exposure, Setting, _mean, expose
-from twin.timing import Stopwatch
+from twin.scenario.model import ImagingConfig, Scenario
 
 PHYSICAL = {"bits": 12, "bayer": True, "readout_ms": 10.0}
 
 
 def test_variance_of_noise_grows_in_a_line_with_the_signal():
-    imaging = Imaging(noise_sd=0.02, shot_noise=0.05)
+    imaging = ImagingConfig(noise_sd=0.02, shot_noise=0.05)
     for signal in (0.2, 0.4, 0.7):
         light = np.full((300, 400, 3), signal * 50, np.float32)
         image = expose(light, 1 / 50, imaging, np.random.default_rng(3)) / 255
@@ -29,7 +29,7 @@ def test_variance_of_noise_grows_in_a_line_with_the_signal():
 
 
 def test_noise_is_normal_and_white():
-    imaging = Imaging(noise_sd=0.1, shot_noise=0.0)
+    imaging = ImagingConfig(noise_sd=0.1, shot_noise=0.0)
     image = expose(np.full((300, 400, 3), 0.5, np.float32), 1.0, imaging, np.random.default_rng(4)) / 255 - 0.5
     z = image.ravel() / image.std()
     assert np.mean(z**4) == pytest.approx(3.0, abs=0.05)  # 360,000 draws: sigma 0.016
@@ -37,7 +37,7 @@ def test_noise_is_normal_and_white():
 
 
 def test_light_saturates_and_never_wraps():
-    imaging = Imaging(noise_sd=0.3)
+    imaging = ImagingConfig(noise_sd=0.3)
     light = np.linspace(0, 5, 3000, dtype=np.float32).reshape(-1, 10, 3)
     image = expose(light, 1.0, imaging, np.random.default_rng(0))
     assert (image[-30:] == 255).all() and image[0].min() < 80
@@ -45,7 +45,7 @@ def test_light_saturates_and_never_wraps():
 
 def test_the_same_stream_gives_the_same_image():
     light = np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32)
-    a, b, c = (expose(light, 1.0, Imaging(), np.random.default_rng(k)) for k in (1, 1, 2))
+    a, b, c = (expose(light, 1.0, ImagingConfig(), np.random.default_rng(k)) for k in (1, 1, 2))
     assert (a == b).all() and (a != c).any()
 
 
@@ -55,13 +55,13 @@ def test_noise_does_not_depend_on_the_number_of_threads(monkeypatch, sensor):
     light = np.random.default_rng(0).uniform(0, 60, (130, 90, 3)).astype(np.float32)
     seen = []
     for processors in (1, 2):
-        monkeypatch.setattr(bands, "_processors", lambda n=processors: n)
+        monkeypatch.setattr(row_parallel, "_processors", lambda n=processors: n)
         seen.append(sensor_of(scenario).image(light, Setting(0.01, 0.01, 2.0), np.random.default_rng(1)))
     np.testing.assert_array_equal(*seen)
 
 
 def test_two_streams_make_independent_noise():
-    imaging, light = Imaging(noise_sd=0.1, shot_noise=0.0), np.full((300, 400, 3), 0.5, np.float32)
+    imaging, light = ImagingConfig(noise_sd=0.1, shot_noise=0.0), np.full((300, 400, 3), 0.5, np.float32)
     one, two = (expose(light, 1.0, imaging, rng) / 255 - 0.5 for rng in np.random.default_rng(5).spawn(2))
     assert abs(np.mean(one * two)) < 5 * one.std() * two.std() / np.sqrt(one.size)
 
@@ -119,7 +119,7 @@ def shots(stereo, sensor=None, twist=AT_REST):
 
 
 @pytest.mark.parametrize("sensor", [None, PHYSICAL])
-def test_left_images_do_not_depend_on_when_the_right_eye_is_used(sensor):
+def test_left_images_do_not_depend_on_when_the_right_camera_is_used(sensor):
     flags = [False] * 5, [True] * 5, [True, False, False, True, False]
     alone, both, some = (shots(stereo, sensor, MOVING) for stereo in flags)
     for a, b, c in zip(alone, both, some, strict=True):
@@ -162,7 +162,7 @@ def test_both_eyes_are_exposed_alike():
 
 
 @pytest.mark.parametrize("sensor", [None, PHYSICAL])
-def test_the_right_eye_has_noise_and_place_of_its_own(sensor):
+def test_the_right_camera_has_noise_and_place_of_its_own(sensor):
     shot = shots([True] * 5, sensor)[0]
     assert shot.right.shape == shot.left.shape and (shot.right != shot.left).mean() > 0.5
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import terrains
-from scenes.builder import World, build
+from scenes.builder import SceneModel, build
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import mujoco
-from twin import geometry
-from twin.config import Lamp, Scenario
+from twin.core import geometry
 from twin.imaging import shadows
 from twin.imaging.light import Light, Moment
 from twin.imaging.renderer import Renderer
 from twin.imaging.shadows import BLOCK_CELLS, Shadows
+from twin.scenario.model import LampConfig, Scenario
 
 LAMPS = [{"position_m": (0.25, 0.6, -0.05), "pan_deg": -15.0}, {"position_m": (0.25, -0.6, -0.05), "pan_deg": 15.0}]
 SCENARIO = Scenario.model_validate(
@@ -56,11 +56,11 @@ def cliffs() -> terrains.Terrain:
     return dataclasses.replace(reef, height_m=(0.2 * reef.height_m + 0.7 * plateau + rough).astype(np.float32))
 
 
-def world_of(terrain: terrains.Terrain) -> World:
+def world_of(terrain: terrains.Terrain) -> SceneModel:
     return build(terrain, RIG.width_px, RIG.height_px, VFOV, RIG.baseline_m, RIG.body_from_camera, 0.01)
 
 
-def sees(world: World, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+def sees(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether MuJoCo's ray from a lamp reaches points (n, 3)."""
     data = mujoco.MjData(world.model)
     data.qpos[2] = 100.0  # the vehicle out of the way
@@ -75,7 +75,7 @@ def sees(world: World, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def test_a_pixel_is_lit_where_mujocos_ray_from_the_lamp_arrives() -> None:
-    """At 99.5 % of the pixels at least, on a reef so steep that shadows fall; in both eyes."""
+    """At 99.5 % of the pixels at least, on a reef so steep that shadows fall; in both cameras."""
     terrain = cliffs()
     world, rng = world_of(terrain), np.random.default_rng(0)
     casting = Shadows(terrain, RIG, [lamps_in(0), lamps_in(1)])
@@ -169,7 +169,7 @@ def test_the_shadow_of_a_lamp_takes_its_light_and_leaves_the_others() -> None:
 
     def light_of(lamps: list[dict], casts: bool) -> np.ndarray:
         changes = {
-            "lamps": tuple(Lamp(**lamp) for lamp in lamps),
+            "lamps": tuple(LampConfig(**lamp) for lamp in lamps),
             "imaging": SCENARIO.imaging.model_copy(update={"shadows": casts}),
         }
         return Light(SCENARIO.model_copy(update=changes), high, np.random.default_rng(0)).radiance(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin import geometry
+from twin.core import geometry
 from twin.imaging.shutter import roll, smear
 
 H, W, FOCAL = 90, 120, 110.0

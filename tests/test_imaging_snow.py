@@ -1,27 +1,27 @@
-"""Marine snow: the same particles in both eyes and from frame to frame, as bright as their size and light say."""
+"""Marine snow: the same particles in both cameras and from frame to frame, as bright as their size and light say."""
 
 import numpy as np
 import pytest
 
-from twin import geometry
-from twin.config import Lamp, Scenario, Snow, Water
+from twin.core import geometry
 from twin.imaging import snow as module
 from twin.imaging.lamps import Daylight, lights_of_eye
 from twin.imaging.snow import BOX_M, PUPIL_M
 from twin.imaging.water import medium
+from twin.scenario.model import LampConfig, Scenario, SnowConfig, WaterConfig
 
 RIG = Scenario.model_validate({"rig": {"image_width_px": 320, "image_height_px": 240}}).believed_rig()
 SHAPE = (RIG.height_px, RIG.width_px)
-LAMPS = (Lamp(position_m=(0.2, 0.3, 0.0), intensity_cd=1000.0),)
+LAMPS = (LampConfig(position_m=(0.2, 0.3, 0.0), intensity_cd=1000.0),)
 POSE = geometry.pose(
     geometry.rotation_from_rpy(0.05, -0.1, 0.6) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([1, -2, 2.0])
 )
 
 
 def falling(density=40.0, diameter_m=0.002, current=(0.0, 0.0, 0.0), water="II", seed=0):
-    sea = Water(jerlov=water)
+    sea = WaterConfig(jerlov=water)
     lights = [lights_of_eye(RIG, LAMPS, Daylight(np.zeros(3), np.zeros(3)), eye) for eye in (0, 1)]
-    keys = Snow(density_per_m3=density, diameter_m=diameter_m)
+    keys = SnowConfig(density_per_m3=density, diameter_m=diameter_m)
     return module.Snow(keys, np.array(current), RIG, medium(sea), lights, np.random.default_rng(seed))
 
 
@@ -32,7 +32,7 @@ def drawn(snow, eye=0, pose=POSE, time_s=0.0, depth_m=np.inf):
 
 
 def test_left_and_right_see_the_same_particle_at_the_disparity_of_its_range():
-    """In the images, not only in the list: one particle at a time, its centre of light in both eyes."""
+    """In the images, not only in the list: one particle at a time, its centre of light in both cameras."""
     snow, found = falling(density=20.0), 0
     everything = snow._start_m.copy()
     for k in range(len(everything)):
@@ -78,7 +78,7 @@ def test_there_are_as_many_as_asked_around_the_vehicle_wherever_it_is():
 
 
 def single(depth_m, **kwargs):
-    """A snow of one particle on the axis of the left eye."""
+    """A snow of one particle on the axis of the left camera."""
     snow = falling(**kwargs)
     snow._start_m = geometry.transform(POSE, np.array([[0.0, 0.0, depth_m]]))
     return snow
@@ -87,7 +87,7 @@ def single(depth_m, **kwargs):
 @pytest.mark.parametrize("eye", [0, 1])
 def test_light_obeys_the_inverse_square_law_and_both_ways_of_water(eye):
     lights = lights_of_eye(RIG, LAMPS, Daylight(np.zeros(3), np.zeros(3)), eye)
-    water = medium(Water(jerlov="II"))
+    water = medium(WaterConfig(jerlov="II"))
     point = np.array([-eye * RIG.baseline_m, 0.0, 1.2])
     way = point - lights.position_m[0]
     distance = np.linalg.norm(way)
@@ -132,8 +132,8 @@ def test_streams_place_it_and_nothing_else_does():
 
 
 def test_its_stream_is_the_last_so_that_earlier_draws_are_as_they_were():
-    from twin.sea import _STREAMS
+    from twin.world.world import _STREAMS
 
-    assert _STREAMS[:7] == ("left_eye", "right_eye", "navigation", "dvl", "usbl", "beacons", "snow")
+    assert _STREAMS[:7] == ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow")
     seven, six = (np.random.SeedSequence(1).spawn(n) for n in (7, 6))
     assert all((a.generate_state(4) == b.generate_state(4)).all() for a, b in zip(six, seven, strict=False))

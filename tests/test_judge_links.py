@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from judge_synthetic import link_between, survey
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.links import Link, Links
+from twin.core.records import Trajectory
 from twin.judge.links import link_metrics
 from twin.judge.stages import compose_chain, stage_metrics
-from twin.links import Link, Links
-from twin.records import Trajectory
 
 RESULT, _, TRUTH, _ = survey()
-KEYS = TRUTH.trajectory.world_from_camera[RESULT.key_frames]
+KEYS = TRUTH.trajectory.world_from_camera[RESULT.keyframe_rows]
 N = len(KEYS)
 CHAIN = [(k, k + 1) for k in range(N - 1)]
 ROTATED, MOVED = np.array([0.003, 0.0, -0.004]), np.array([0.02, -0.01, 0.02])  # 5 mrad, 3 cm
@@ -90,7 +90,7 @@ def test_the_chain_of_true_motions_is_the_true_path():
     assert stage_metrics(with_links(linked(CHAIN)), TRUTH)["chain"]["ate_max_m"] == pytest.approx(0, abs=1e-9)
 
 
-def test_one_wrong_step_of_the_chain_carries_over_to_all_key_points_after_it():
+def test_one_wrong_step_of_the_chain_carries_over_to_all_keyframes_after_it():
     k = 30
     links = linked([pair for pair in CHAIN if pair[0] != k]) + linked([CHAIN[k]], (0, 0, 0, 0.02, 0, 0))
     figures = stage_metrics(with_links(links), TRUTH)["chain"]
@@ -98,11 +98,11 @@ def test_one_wrong_step_of_the_chain_carries_over_to_all_key_points_after_it():
     assert figures["ate_rmse_m"] == pytest.approx(0.02 * np.sqrt((N - 1 - k) / N))
 
 
-def test_every_stage_is_judged_at_the_same_key_points():
+def test_every_stage_is_judged_at_the_same_keyframes():
     n = 40
     links = linked(CHAIN[: n - 1])
     figures = stage_metrics(with_links(links), TRUTH)
-    frames = RESULT.key_frames[:n]
+    frames = RESULT.keyframe_rows[:n]
     for name in ("f2f", "online", "final"):
         path = getattr(RESULT, name).world_from_camera[frames]
         anchored = KEYS[0] @ geometry.inverse(path[0]) @ path

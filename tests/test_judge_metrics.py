@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from judge_synthetic import SCENARIO, evaluated, survey
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.links import Links
+from twin.core.records import ElevationMap, MapGrid, Trajectory, Truth
 from twin.errors import TwinError
 from twin.judge.consistency import consistency_metrics, nees
 from twin.judge.control import control_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import check_require, evaluate, unflown
 from twin.judge.overlap import overlap_metrics
-from twin.judge.path import leg_numbers, travel_direction
 from twin.judge.require import more_is_better, number_paths
-from twin.links import Links
-from twin.records import ElevationMap, MapGrid, Trajectory, Truth
+from twin.judge.swaths import leg_numbers, travel_direction
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 
@@ -76,29 +76,29 @@ def test_nees_of_errors_drawn_from_their_covariance_is_three():
 
 
 def gaussian_final(seed: int, spread: np.ndarray):
-    """The survey with final key points displaced in camera axes by normal errors, and the covariance that says so."""
+    """The survey with final keyframes displaced in camera axes by normal errors, and the covariance that says so."""
     rng = np.random.default_rng(seed)
     poses = TRUTH.trajectory.world_from_camera.copy()
-    for frame in RESULT.key_frames[1:]:
+    for frame in RESULT.keyframe_rows[1:]:
         poses[frame] = poses[frame] @ geometry.pose(np.eye(3), rng.normal(0, spread))
     result = copy.copy(RESULT)
     result.final = Trajectory(TRUTH.trajectory.times_s, poses)
     cov = np.diag(np.concatenate([[1e-6] * 3, spread**2]))
-    result.node_cov = np.tile(cov, (len(RESULT.key_frames), 1, 1))
+    result.node_cov = np.tile(cov, (len(RESULT.keyframe_rows), 1, 1))
     return result
 
 
-def test_key_point_consistency_is_judged_in_camera_axes_without_the_anchored_one():
+def test_keyframe_consistency_is_judged_in_camera_axes_without_the_anchored_one():
     spread = np.array([0.001, 0.03, 0.2])  # so unequal that wrong axes would show
     figures = [consistency_metrics(gaussian_final(k, spread), None, TRUTH) for k in range(8)]
-    n = 8 * (len(RESULT.key_frames) - 1)
+    n = 8 * (len(RESULT.keyframe_rows) - 1)
     assert np.mean([f["nees_position_mean"] for f in figures]) == pytest.approx(3, abs=4 * np.sqrt(6 / n))
     share = np.mean([f["within_2sigma_position"] for f in figures])
     assert share == pytest.approx(0.9545, abs=4 * np.sqrt(0.9545 * 0.0455 / (3 * n)))
     assert figures[0]["within_2sigma_map"] is None
 
 
-def test_key_points_without_a_covariance_are_left_out_of_consistency():
+def test_keyframes_without_a_covariance_are_left_out_of_consistency():
     result = gaussian_final(0, np.array([0.01, 0.01, 0.01]))
     result.node_cov = result.node_cov.copy()
     result.node_cov[2::2] = np.nan
@@ -141,7 +141,7 @@ def test_overlap_over_a_flat_floor_is_the_planned_geometry():
     flat = dataclasses.replace(TRUTH, trajectory=Trajectory(times, poses), height_m=np.full_like(TRUTH.height_m, 0.2))
     figures = overlap_metrics(RESULT, flat, RIG, ELEVATION.grid, {"overlap_along": 0.9, "overlap_across": 0.8})
     depth = 2.0
-    step = np.median(np.linalg.norm(np.diff(reference[RESULT.key_frames], axis=0), axis=1))
+    step = np.median(np.linalg.norm(np.diff(reference[RESULT.keyframe_rows], axis=0), axis=1))
     assert figures["along_median"] == pytest.approx(1 - step / (RIG.height_px * depth / RIG.focal_px), abs=1e-6)
     # the reference reaches the next leg's line to within one step (2.5 cm)
     assert figures["across_median"] == pytest.approx(1 - 0.5 / (RIG.width_px * depth / RIG.focal_px), abs=0.012)
@@ -166,7 +166,7 @@ def diagonal_swaths(apart_m):
         TRUTH, trajectory=Trajectory(np.arange(2 * n) * 1.0, poses), reference=reference,
         track=np.repeat([1, 2], n), height_m=np.full_like(TRUTH.height_m, 0.2),
     )  # fmt: skip
-    return truth, dataclasses.replace(RESULT, key_frames=np.arange(2 * n), track_of_key=truth.track)
+    return truth, dataclasses.replace(RESULT, keyframe_rows=np.arange(2 * n), track_of_keyframe=truth.track)
 
 
 def test_overlap_of_loops_is_counted_square_to_their_travel_in_any_direction():
@@ -222,20 +222,21 @@ def test_an_unknown_requirement_is_refused_by_name(name, says):
 
 def test_a_survey_that_broke_off_still_has_every_key_and_no_nan():
     whole = evaluated(RESULT, ELEVATION, TRUTH, RIG)
-    for n_frames, n_keys in [(0, 0), (1, 0), (1, 1), (2, 1), (9, 2), (8, 2)]:
-        part = evaluate(*broken_off(n_frames, n_keys), RIG, {}, {}, {"status": "aborted"}, SCENARIO.require)
+    for n_frames, n_keyframes in [(0, 0), (1, 0), (1, 1), (2, 1), (9, 2), (8, 2)]:
+        part = evaluate(*broken_off(n_frames, n_keyframes), RIG, {}, {}, {"status": "aborted"}, SCENARIO.require)
         json.dumps(part, allow_nan=False)
         assert set(number_paths(part)) >= {p for p in number_paths(whole) if not p.startswith("timing.stages")}
         assert part["map"]["rmse_m"] is None and part["require"]["map.le90_m"]["passed"] is False
     assert set(number_paths(unflown())) == {p for p in number_paths(whole) if not p.startswith("require.")}
 
 
-def broken_off(n_frames: int, n_keys: int):
+def broken_off(n_frames: int, n_keyframes: int):
     """The survey as far as it got, without a map and before any alignment."""
     cut = {k: Trajectory(t.times_s[:n_frames], t.world_from_camera[:n_frames]) for k, t in vars(RESULT).items()
            if isinstance(t, Trajectory)}  # fmt: skip
     result = dataclasses.replace(
-        RESULT, **cut, key_frames=RESULT.key_frames[:n_keys], track_of_key=RESULT.track_of_key[:n_keys],
+        RESULT, **cut,
+        keyframe_rows=RESULT.keyframe_rows[:n_keyframes], track_of_keyframe=RESULT.track_of_keyframe[:n_keyframes],
         node_cov=np.zeros((0, 6, 6)), links=Links(), alignments=[], before_ga=[], after_ga=[],
     )  # fmt: skip
     flown = TRUTH.trajectory

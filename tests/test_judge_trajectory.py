@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from judge_synthetic import drifted, survey
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.records import Trajectory
 from twin.judge.alignment import track_metrics
 from twin.judge.trajectory import path_errors, trajectory_metrics
-from twin.records import Trajectory
 
 RESULT, _, TRUTH, _ = survey()
 TRUE = TRUTH.trajectory
@@ -87,10 +87,10 @@ def test_a_shorter_estimate_is_judged_over_the_frames_it_has():
 
 
 def test_track_rows_judge_whole_and_windowed_alignments_alike():
-    keys = RESULT.key_frames
+    keys = RESULT.keyframe_rows
     rng = np.random.default_rng(3)
     wrong = drifted(TRUE.world_from_camera, rng, 1e-3)
-    up_to = keys[RESULT.track_of_key <= 2]
+    up_to = keys[RESULT.track_of_keyframe <= 2]
     expected = np.sqrt(np.mean(np.sum((wrong[up_to[-30:], :3, 3] - TRUE.positions[up_to[-30:]]) ** 2, axis=1)))
     result = copy.copy(RESULT)
     result.before_ga = [RESULT.before_ga[0], wrong[up_to[-30:], :3, 3]]

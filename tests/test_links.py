@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from twin import geometry
-from twin.links import Link, Links
-from twin.rows import Rows
+from twin.core import geometry
+from twin.core.growing_array import Rows
+from twin.core.links import Link, Links
 
 
 def some_links(n):

@@ -7,15 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from twin import cli, look_sheet
+from twin import cli
+from twin.app import look_sheet
+from twin.app.look import figures, look, noise_of, parse_place, table
 from twin.errors import TwinError
 from twin.imaging.optics import range_of
 from twin.imaging.photo_sensor import PhotoSensor
 from twin.imaging.photons import electrons_per_cd
 from twin.imaging.water import medium
-from twin.look import figures, look, noise_of, parse_place, table
-from twin.mission import prepare
-from twin.scenario_file import load_scenario
+from twin.scenario.file import load_scenario
+from twin.world.mission import prepare
 
 SMALL = ["rig.image_width_px=128", "rig.image_height_px=96", "terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
 

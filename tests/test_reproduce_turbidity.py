@@ -9,7 +9,7 @@ import pytest
 from twin.reproduce import turbidity, turbidity_sheet
 from twin.reproduce.block import BLOCK_M, CORE_M, HEIGHT_M, block_on_sand
 from twin.reproduce.turbidity import SETTINGS, climb, contrast_left, table, write
-from twin.scenario_file import load_scenario
+from twin.scenario.file import load_scenario
 
 SMALL = ("rig.image_width_px=160", "rig.image_height_px=120")
 RANGES_M = np.array([0.5, 1.0, 2.0, 4.0])

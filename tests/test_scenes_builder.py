@@ -10,7 +10,7 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from scenes.builder import World, build
 from scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
 from scenes.gl import mujoco
-from twin import geometry
+from twin.core import geometry
 
 BODY_FROM_LEFT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.02, 0.1, -0.15]))
 LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]

@@ -5,16 +5,16 @@ import pytest
 from physics_world import IDLE, bare_world, vehicle
 
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
-from twin import geometry
-from twin.config import Vehicle as Section
+from twin.core import geometry
 from twin.errors import SurveyAborted
+from twin.scenario.model import VehicleConfig
 from twin.simulate.free_body import FreeBody
 from twin.simulate.hull import hull_of, physics_timestep_s
 from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
 from twin.simulate.vehicle import Vehicle
 
 STEP_S = 1 / 120
-HULL = hull_of(Section(buoyancy_n=0.0))
+HULL = hull_of(VehicleConfig(buoyancy_n=0.0))
 
 
 def energy(v, hull=HULL):
@@ -46,7 +46,7 @@ def dense_acceleration(hull, rotation, twist, current, wrench):
 @pytest.mark.parametrize("seed", range(5))
 def test_acceleration_is_the_solution_of_the_equation_written_with_full_matrices(seed):
     rng = np.random.default_rng(seed)
-    hull = hull_of(Section(buoyancy_n=3.0, drag_factor=1.7, added_mass_factor=0.6))
+    hull = hull_of(VehicleConfig(buoyancy_n=3.0, drag_factor=1.7, added_mass_factor=0.6))
     rotation = geometry.so3_exp(rng.normal(size=3))
     arguments = rotation, rng.normal(size=6), rng.normal(size=3), rng.normal(size=6)
     np.testing.assert_allclose(acceleration(hull, *arguments), dense_acceleration(hull, *arguments), rtol=1e-10)
@@ -66,7 +66,7 @@ def test_energy_never_grows_in_still_water_without_thrust():
 
 
 def test_without_drag_energy_is_kept():
-    hull = hull_of(Section(buoyancy_n=0.0))._replace(linear_drag=np.zeros(6), quadratic_drag=np.zeros(6))
+    hull = hull_of(VehicleConfig(buoyancy_n=0.0))._replace(linear_drag=np.zeros(6), quadratic_drag=np.zeros(6))
     v = vehicle(geometry.pose(geometry.rotation_from_rpy(0.6, -0.3, 0.0), np.zeros(3)))
     v._hull = hull
     start = energy(v, hull)
@@ -153,7 +153,7 @@ def test_a_steady_current_carries_a_drifting_neutral_vehicle_with_it():
 
 
 def test_added_mass_and_drag_factors_scale_what_they_name():
-    hull = hull_of(Section(drag_factor=2.0, added_mass_factor=3.0))
+    hull = hull_of(VehicleConfig(drag_factor=2.0, added_mass_factor=3.0))
     np.testing.assert_allclose(hull.added, 3 * angular_first(ROV.added_mass))
     np.testing.assert_allclose(hull.linear_drag, 2 * angular_first(ROV.linear_damping))
     np.testing.assert_allclose(hull.quadratic_drag, 2 * angular_first(ROV.quadratic_damping))
@@ -175,7 +175,7 @@ def test_a_whole_number_of_physics_steps_makes_a_frame(rate_hz):
     step = physics_timestep_s(rate_hz)
     assert step <= STEP_S * (1 + 1e-9)
     assert 1 / rate_hz / step == pytest.approx(round(1 / rate_hz / step), abs=1e-9)
-    v = Vehicle(bare_world(step), Section(), np.zeros(3), np.eye(4))
+    v = Vehicle(bare_world(step), VehicleConfig(), np.zeros(3), np.eye(4))
     v.step(IDLE, 1 / rate_hz)
     assert v.time_s == pytest.approx(1 / rate_hz)
 
@@ -190,7 +190,7 @@ def test_the_body_without_a_world_moves_as_mujoco_moves_it():
     rng = np.random.default_rng(5)
     start = geometry.exp(np.array([0.1, -0.05, 0.8, 1.0, 2.0, -3.0]))
     current = np.array([0.1, -0.05, 0.02])
-    ours = FreeBody(Section(drag_factor=1.3), current, start, 1 / 120)
+    ours = FreeBody(VehicleConfig(drag_factor=1.3), current, start, 1 / 120)
     theirs = vehicle(start, current, buoyancy_n=1.0, drag_factor=1.3)
     for _ in range(600):
         command = rng.uniform(-0.4, 0.4, 8)

@@ -8,9 +8,9 @@ import pytest
 from scipy import signal
 
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
-from twin import geometry
-from twin.config import Navigation
-from twin.records import SensorNoise, StereoRig
+from twin.core import geometry
+from twin.core.records import SensorNoise, StereoRig
+from twin.scenario.model import NavigationConfig
 from twin.simulate.sensors import AcousticFix, DopplerLog, NavigationSensors, read_sensors, sight_beacons
 from twin.simulate.thrusters import LaggedThrusters, steady_thrust_n
 
@@ -97,7 +97,7 @@ def test_acoustic_fixes_scatter_about_the_camera_and_come_no_sooner_than_their_i
     usbl, times = AcousticFix(noise, 1.0, np.random.default_rng(1)), np.arange(8000) * 0.4
     fixes = [usbl.read(time_s, position) for time_s in times]
     taken = np.array([fix is not None for fix in fixes])
-    np.testing.assert_allclose(np.diff(times[taken]), 1.2)  # the first key point at or after 1 s
+    np.testing.assert_allclose(np.diff(times[taken]), 1.2)  # the first keyframe at or after 1 s
     errors = np.array([fix for fix in fixes if fix is not None]) - position
     n = len(errors)
     assert np.all(np.abs(errors.mean(axis=0)) < 4 * 0.5 / np.sqrt(n))
@@ -127,10 +127,10 @@ def test_what_stands_before_a_beacon_hides_it():
 
 
 def readings_of(aiding, n=40):
-    """Readings of a vehicle in one place, a key point each fifth frame."""
+    """Readings of a vehicle in one place, a keyframe each fifth frame."""
     streams = zip(("navigation", "dvl", "usbl", "beacons"), np.random.SeedSequence(5).spawn(4), strict=True)
     rng = {name: np.random.default_rng(seed) for name, seed in streams}
-    sensors = NavigationSensors(Navigation(aiding=tuple(aiding)), BEACONS, RIG, rng)
+    sensors = NavigationSensors(NavigationConfig(aiding=tuple(aiding)), BEACONS, RIG, rng)
     twist = np.array([0, 0, 0, 0.3, 0.0, 0.0])
     return [sensors.read(k / 30, LEVEL, twist, (lambda: CLEAR) if k % 5 == 0 else None) for k in range(n)]
 
@@ -153,7 +153,7 @@ def test_a_sensor_says_the_same_whatever_else_is_listed_and_nothing_where_it_is_
         assert all(getattr(one, field) is None for other_name, field in SENSORS.items() if other_name != name)
 
 
-def test_fixes_and_sightings_come_with_key_points():
+def test_fixes_and_sightings_come_with_keyframes():
     readings = readings_of(SENSORS)
     assert [k for k, r in enumerate(readings) if r.usbl_m is not None] == [0, 30]
     assert [k for k, r in enumerate(readings) if r.beacons is not None] == list(range(0, 40, 5))

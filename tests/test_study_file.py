@@ -4,7 +4,7 @@ import pytest
 from study_surveys import STUDY, study_of
 
 from twin.errors import ScenarioError
-from twin.scenario_file import load_scenario
+from twin.scenario.file import load_scenario
 from twin.study.study_file import load_study
 from twin.study.surveys import check_samples, surveys
 

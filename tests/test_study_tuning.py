@@ -6,7 +6,7 @@ import study_surveys
 from study_surveys import Here, study_of
 
 from twin.errors import ScenarioError, TwinError
-from twin.scenario_file import load_scenario
+from twin.scenario.file import load_scenario
 from twin.study import tuning_report
 from twin.study.flight import row_of
 from twin.study.progress import Progress

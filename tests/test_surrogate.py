@@ -1,4 +1,4 @@
-"""The surrogate: rays, what key points show, drawn measurements, and a calibration that finds where they came from."""
+"""The surrogate: rays, what keyframes show, drawn measurements, and a calibration that finds where they came from."""
 
 import subprocess
 import sys
@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 
 from terrains import Terrain
-from twin import geometry, survey
+from twin import survey
+from twin.core import geometry
+from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
-from twin.mission import prepare
-from twin.scenario_file import load_scenario
-from twin.surrogate import calibration, fit, witness
-from twin.surrogate.calibrate import fit_to
-from twin.surrogate.chart import CellErrors
-from twin.surrogate.conditions import bounds_px, lamp_share, unevenness_px
-from twin.surrogate.floor import Floor
-from twin.surrogate.model import ErrorModel, Law
-from twin.surrogate.sea import SurrogateSea, vision_beside
-from twin.timing import Stopwatch
+from twin.scenario.file import load_scenario
+from twin.surrogate import error_model_file
+from twin.surrogate.error_model import ErrorModel, Law
+from twin.surrogate.floor_rays import Floor
+from twin.surrogate.map_model import CellErrors
+from twin.surrogate.matchability import bounds_px, lamp_share, unevenness_px
+from twin.surrogate.surrogate_world import SurrogateWorld, vision_beside
+from twin.surrogate_fit import fit, witness
+from twin.surrogate_fit.rendered_surveys import fit_to
+from twin.world.mission import prepare
 
 SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]", "control.hold_s=1.0"]
 
@@ -132,15 +134,15 @@ def test_links_err_as_their_covariance_says(reef, steady):
 
 
 def looked(vision, poses, at):
-    """What was seen at key points with these poses, `at` being where the vehicle is."""
+    """What was seen at keyframes with these poses, `at` being where the vehicle is."""
     for k, pose in enumerate(poses):
         at[0] = k
-        assert vision.look(None, k) is not None
-        vision.lay(k, pose)
+        assert vision.observe_stereo(None, k) is not None
+        vision.add_to_mosaic(k, pose)
 
 
 def link_of(vision, i, j):
-    """The link from the later of two key points to the earlier."""
+    """The link from the later of two keyframes to the earlier."""
     return vision._link(vision._seen[j], vision._seen[i], j, i, vision.model)
 
 
@@ -152,7 +154,7 @@ def error_of_link(vision, i, j):
 def test_points_lie_where_both_eyes_see_them(reef):
     pose = tilted(0, 0, 2.0)
     vision = vision_beside(reef, ErrorModel(), lambda: pose, Stopwatch())
-    points = vision.look(None, 0)
+    points = vision.observe_stereo(None, 0)
     right_px = points.pixels[:, 0] - reef.rig.focal_px * vision._now.points[:, 2]
     assert right_px.min() >= reef.scenario.estimate.patch_px // 2
     left = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision._now.met)]
@@ -212,7 +214,7 @@ def test_what_the_floor_makes_links_err_by_adds_up_along_the_path_and_cancels_ar
 
 @pytest.mark.parametrize(("place_excess", "steady", "relief"), [(1.2, 0.0, 0.0), (0.9, 0.8, 0.0), (1.0, 0.6, 5.0)])
 def test_what_is_steady_and_what_relief_does_are_told_apart_by_the_path(reef, place_excess, steady, relief):
-    """60 ways over eleven key points: the correlation has a standard error of 0.03. This reef is smooth."""
+    """60 ways over eleven keyframes: the correlation has a standard error of 0.03. This reef is smooth."""
     poses, at = [tilted(0.04 * k, 0.02 * k, 2.0) for k in range(11)], [0]
     model = ErrorModel(place_excess=place_excess, steady=steady, relief=relief, common_px=0.0)
     parts = {
@@ -243,7 +245,7 @@ def errors(told):
     return CellErrors(nothing, nothing, 0.0, np.array([1.0, 3.0]), np.zeros(2), np.full(2, 0.01), np.ones(2))
 
 
-def test_without_errors_a_key_point_hands_over_the_true_floor(told, errors):
+def test_without_errors_a_keyframe_hands_over_the_true_floor(told, errors):
     pose = tilted(0.1, 0.2, 2.0)
     patch = told.chart.hand_over(pose, None, pose, np.zeros((6, 6)), errors, np.random.default_rng(0))
     known = np.isfinite(patch.height_m)
@@ -287,33 +289,33 @@ def test_water_in_which_nothing_can_be_matched_ends_the_survey_and_is_named(tmp_
 
 
 def test_what_the_surrogate_knows_nothing_of_is_refused():
-    for sets in (["snow.density_per_m3=100"], ["calibration.focal_error=0.01"], ['port.kind="flat"']):
+    for sets in (["snow.density_per_m3=100"], ["calibration_error.focal_error=0.01"], ['port.kind="flat"']):
         with pytest.raises(ScenarioError, match="imaging.fidelity.*rendered"):
             mission(*sets)
 
 
 def test_water_outside_the_calibration_is_warned_of():
-    kept = calibration.load()
+    kept = error_model_file.load()
     murky = mission('water.jerlov="9C"', "plan.altitude_m=3", "plan.tracks=1")
-    warnings = SurrogateSea(murky, Stopwatch(), kept).warnings
+    warnings = SurrogateWorld(murky, Stopwatch(), kept).warnings
     assert len(warnings) == 1 and "calibrated from" in warnings[0]
-    assert SurrogateSea(mission(), Stopwatch(), kept).warnings == ()
+    assert SurrogateWorld(mission(), Stopwatch(), kept).warnings == ()
 
 
 def test_a_calibration_comes_back_from_disk_and_a_file_that_is_none_is_told(tmp_path):
     model = ErrorModel(place_px=Law(0.031, 0.7), f2f_undone=0.123)
-    kept = calibration.Calibration(model, 7, {"place_px": 0.1})
-    calibration.save(kept, tmp_path / "model.toml")
-    assert calibration.load(tmp_path / "model.toml") == kept
+    kept = error_model_file.FittedErrorModel(model, 7, {"place_px": 0.1})
+    error_model_file.save(kept, tmp_path / "model.toml")
+    assert error_model_file.load(tmp_path / "model.toml") == kept
     (tmp_path / "other.toml").write_text("surveys = 3\n")
-    with pytest.raises(TwinError, match="imaging.calibration.*twin calibrate"):
-        calibration.load(tmp_path / "other.toml")
+    with pytest.raises(TwinError, match="imaging.error_model.*twin fit-surrogate"):
+        error_model_file.load(tmp_path / "other.toml")
 
 
 def test_calibrating_on_surveys_that_obey_a_model_finds_that_model():
     """The images are played by a surrogate with other errors than the one that it is compared with.
 
-    What is steady, and relief, take longer paths than these of 15 key points.
+    What is steady, and relief, take longer paths than these of 15 keyframes.
     """
     true = ErrorModel(
         place_px=Law(0.03, 1.5), place_excess=1.4, f2f_px=Law(0.04, 2.0), f2f_excess=1.0, f2f_undone=0.4, steady=0.4,
@@ -344,24 +346,24 @@ class Played:
     def __getattr__(self, name):
         return getattr(self._vision, name)
 
-    def look(self, frame, row):
-        points = self._vision.look(frame, row)
+    def observe_stereo(self, frame, row):
+        points = self._vision.observe_stereo(frame, row)
         return points._replace(cov=points.cov / self._vision.stand_for)
 
 
 def witnessed(flown, true, seed):
     """What a witness notes on a survey whose vision obeys a model."""
-    sea = SurrogateSea(flown, Stopwatch(), calibration.Calibration(true, 2, {}))
+    world = SurrogateWorld(flown, Stopwatch(), error_model_file.FittedErrorModel(true, 2, {}))
 
     def truth():
-        return sea.world_from_camera
+        return world.world_from_camera
 
-    redrawn(sea.vision, 100 + seed)
-    beside = witness.Witness(Played(sea.vision), vision_beside(flown, COMPARED, truth, Stopwatch()), truth)
+    redrawn(world.vision, 100 + seed)
+    beside = witness.Witness(Played(world.vision), vision_beside(flown, COMPARED, truth, Stopwatch()), truth)
     navigator = survey.make_navigator(flown, beside, Stopwatch())
-    survey.fly(flown, sea, navigator, lambda *_: None)
+    survey.fly(flown, world, navigator, lambda *_: None)
     result = navigator.finish()
-    beside.map(result, flown.grid, np.zeros((len(result.key_frames), 6, 6)), lambda _: None)
+    beside.map(result, flown.grid, np.zeros((len(result.keyframe_rows), 6, 6)), lambda _: None)
     return beside.notes
 
 
@@ -371,13 +373,13 @@ def test_frames_at_once_are_what_they_are_one_by_one(aiding, monkeypatch, tmp_pa
     flown = mission(f"navigation.aiding={aiding}", "plan.tracks=1")
 
     def fly():
-        with survey.open_sea(flown, Stopwatch()) as sea:
-            navigator = survey.make_navigator(flown, survey.vision_in(sea, tmp_path), Stopwatch())
-            survey.fly(flown, sea, navigator, lambda *_: None)
-            return sea.truth().trajectory, navigator.finish()
+        with survey.open_world(flown, Stopwatch()) as world:
+            navigator = survey.make_navigator(flown, survey.vision_in(world, tmp_path), Stopwatch())
+            survey.fly(flown, world, navigator, lambda *_: None)
+            return world.truth().trajectory, navigator.finish()
 
     true, at_once = fly()
-    monkeypatch.setattr(SurrogateSea, "glide", lambda *_: None)
+    monkeypatch.setattr(SurrogateWorld, "glide", lambda *_: None)
     true_single, single = fly()
     np.testing.assert_array_equal(true.world_from_camera, true_single.world_from_camera)
     for name in ("f2f", "online", "final"):
@@ -388,37 +390,37 @@ def test_frames_at_once_are_what_they_are_one_by_one(aiding, monkeypatch, tmp_pa
 
 def test_the_truth_knows_of_every_frame_its_track_its_plan_and_whether_it_keeps_station():
     flown = mission("plan.tracks=2", "plan.area_m=[1.2, 1.2]")
-    with survey.open_sea(flown, Stopwatch()) as sea:
-        navigator = survey.make_navigator(flown, sea.vision, Stopwatch())
-        survey.fly(flown, sea, navigator, lambda *_: None)
-        truth, first, hold = sea.truth(), flown.fly(1), len(flown.hold(1))
+    with survey.open_world(flown, Stopwatch()) as world:
+        navigator = survey.make_navigator(flown, world.vision, Stopwatch())
+        survey.fly(flown, world, navigator, lambda *_: None)
+        truth, first, hold = world.truth(), flown.fly(1), len(flown.hold(1))
     n = len(first)
-    assert len(truth.reference) == len(truth.holding) == len(truth.track) == len(sea) == flown.n_frames
+    assert len(truth.reference) == len(truth.holding) == len(truth.track) == len(world) == flown.n_frames
     np.testing.assert_array_equal(truth.reference[:n], first.reference.position)
     np.testing.assert_array_equal(truth.holding[: n + 2 * hold + 1], [False] * n + [True] * 2 * hold + [False])
     np.testing.assert_array_equal(np.flatnonzero(np.diff(truth.track)), [n + 2 * hold - 1])
     np.testing.assert_allclose(truth.reference[n : n + 2 * hold], first.reference.position[-1:].repeat(2 * hold, 0))
 
 
-def test_what_is_kept_of_key_points_does_not_grow_with_the_survey():
+def test_what_is_kept_of_keyframes_does_not_grow_with_the_survey():
     flown = mission("plan.tracks=6", "plan.area_m=[1.2, 1.2]", "plan.overlap_across=0.95", "estimate.window_tracks=1")
-    with survey.open_sea(flown, Stopwatch()) as sea:
-        navigator = survey.make_navigator(flown, sea.vision, Stopwatch())
-        survey.fly(flown, sea, navigator, lambda *_: None)
+    with survey.open_world(flown, Stopwatch()) as world:
+        navigator = survey.make_navigator(flown, world.vision, Stopwatch())
+        survey.fly(flown, world, navigator, lambda *_: None)
         last_two = [key.number for key in navigator.keys if key.track >= 5]
-        assert sorted(sea.vision._seen) == [0, 1, 2, 3, *last_two]
+        assert sorted(world.vision._seen) == [0, 1, 2, 3, *last_two]
 
 
 def test_where_the_physics_diverges_frames_at_once_end_and_say_so():
     flown = mission()
-    with survey.open_sea(flown, Stopwatch()) as sea:
-        navigator, pilot = survey.make_navigator(flown, sea.vision, Stopwatch()), survey.make_pilot(flown)
-        course, glide = flown.fly(1), sea.glide(navigator, pilot)
-        navigator.update(sea.observe(course[0]), 1)
-        sea.vehicle.body.velocity[0] = np.nan
+    with survey.open_world(flown, Stopwatch()) as world:
+        navigator, pilot = survey.make_navigator(flown, world.vision, Stopwatch()), survey.make_pilot(flown)
+        course, glide = flown.fly(1), world.glide(navigator, pilot)
+        navigator.update(world.observe(course[0]), 1)
+        world.vehicle.body.velocity[0] = np.nan
         with pytest.raises(SurveyAborted, match="the physics diverged at"):
             glide(course, 1)
-        assert len(sea) == len(navigator.times_s) == 2  # the frame that showed it is kept
+        assert len(world) == len(navigator.times_s) == 2  # the frame that showed it is kept
 
 
 def test_a_survey_for_its_figures_loads_nothing_that_draws(tmp_path):

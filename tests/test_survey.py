@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin import records, rendered_sea, scenario_file, survey
+from twin import survey
+from twin.core import records
+from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted
-from twin.mission import prepare
-from twin.timing import Stopwatch
+from twin.scenario import file as scenario_file
+from twin.world import rendered_world
+from twin.world.mission import prepare
 
 SMALL = [
     "terrain.size_m=[5.0, 4.0]",
@@ -28,7 +31,7 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         if not report:
-            patch.setattr("twin.judge.report.write_report", lambda *_: None)
+            patch.setattr("twin.report.survey_page.write_report", lambda *_: None)
         return survey.run(scenario, out, progress)
 
 
@@ -51,7 +54,7 @@ def test_the_run_folder_holds_all_that_the_design_promises(flown):
         "scenario.resolved.toml env.json metrics.json report.html run.rrd log.jsonl posegraph.g2o mesh.glb mosaic.tif"
     )
     rasters = [f"dem{s}.tif" for s in ("", "_sigma", "_truth", "_error")]
-    for name in [*names.split(), *rasters, *(f"trajectory_{t}.tum" for t in TRAJECTORIES), "keypoints"]:
+    for name in [*names.split(), *rasters, *(f"trajectory_{t}.tum" for t in TRAJECTORIES), "keyframes"]:
         assert (flown.folder / name).exists(), name
     assert json.loads((flown.folder / "metrics.json").read_text()) == flown.metrics
 
@@ -68,10 +71,10 @@ def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
 
 
 def first_frame(*overrides):
-    """What a survey's first key point sees and reads."""
+    """What a survey's first keyframe sees and reads."""
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, *overrides]))
-    with rendered_sea.RenderedSea(mission, Stopwatch()) as world:
-        return world.observe(next(step for step in mission.fly(1) if step.key_point))
+    with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
+        return world.observe(next(step for step in mission.fly(1) if step.keyframe))
 
 
 def test_another_seed_gives_another_floor_and_another_noise():
@@ -96,11 +99,11 @@ class Recorder:
 
 
 def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path):
-    """Frames are recorded in one sea and replayed with every truth (floor, poses, map) replaced by another."""
+    """Frames are recorded in one world and replayed with every truth (floor, poses, map) replaced by another."""
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
     mission, watch = prepare(scenario), Stopwatch()
     recorder = Recorder(survey.make_navigator(mission, survey.image_vision(mission, tmp_path / "first", watch), watch))
-    with rendered_sea.RenderedSea(mission, watch) as world:
+    with rendered_world.RenderedWorld(mission, watch) as world:
         survey.fly(mission, world, recorder, lambda *_: None)
     first = recorder.navigator.finish()
 
@@ -138,13 +141,13 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
     images = survey.image_vision(mission, tmp_path, Stopwatch())
     navigator, estimates = survey.make_navigator(mission, images, Stopwatch()), []
-    with rendered_sea.RenderedSea(mission, Stopwatch()) as world:
+    with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
         survey.fly(mission, world, navigator, lambda _, estimate, __: estimates.append(estimate))
         true = world.truth().trajectory
     result = navigator.finish()
     assert [node.walked is not None for node in navigator.nodes] == [False] + [True] * (len(navigator.nodes) - 1)
     assert sum(len(node.readings.beacons) for node in navigator.nodes) > 3
-    sigma_m = [estimates[row].sigma_m for row in result.key_frames]
+    sigma_m = [estimates[row].sigma_m for row in result.keyframe_rows]
     assert max(sigma_m) < np.sqrt(3) * 1.01e-4  # no worse than the fix just taken
     for path in (result.online, result.final):
         assert np.sqrt(((path.positions - true.positions) ** 2).sum(axis=1).mean()) < 4e-3

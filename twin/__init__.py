@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from twin.config import Scenario
-    from twin.results import RunResult
+    from twin.scenario.model import Scenario
+    from twin.session.conclusion import RunResult
 
 __all__ = ["load_scenario", "run"]
 
@@ -24,7 +24,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     Raises:
         ScenarioError: every fault of the file, each as `FILE:LINE: key: what is wrong`.
     """
-    from twin.scenario_file import load_scenario
+    from twin.scenario.file import load_scenario
 
     return load_scenario(path, overrides)
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin import console
+from twin.app import console
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
-    from twin.config import Scenario
-    from twin.results import RunResult
+    from twin.scenario.model import Scenario
+    from twin.session.conclusion import RunResult
 
 app = typer.Typer(
     help="A digital twin of an underwater stereo survey: fly one, and be told how far off it was.",
@@ -44,10 +44,10 @@ AtOption = Annotated[
     str | None, typer.Option("--at", metavar="X,Y,Z", help="Place of the left camera [m]; mid-survey where not given.")
 ]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
-CalibrationArgument = Annotated[
+FitArgument = Annotated[
     list[str] | None, typer.Argument(metavar="FILE", help="Studies of rendered surveys; the project's own if none.")
 ]
-ModelOption = Annotated[Path, typer.Option("--out", help="TOML to write, for `imaging.calibration`.")]
+ModelOption = Annotated[Path, typer.Option("--out", help="TOML to write, for `imaging.error_model`.")]
 RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of what was flown for it.")]
 StudyArgument = Annotated[
     str, typer.Argument(metavar="FILE", help="A study's TOML file, or a name in scenes/studies/.")
@@ -111,9 +111,9 @@ def plan(
     out: PictureOption = None,
 ) -> None:
     """Show the numbers and a picture of a survey; nothing is simulated."""
-    from twin import plan as planning
-    from twin.mission import prepare
-    from twin.scenario_file import load_scenario
+    from twin.app import plan as planning
+    from twin.scenario.file import load_scenario
+    from twin.world.mission import prepare
 
     mission = prepare(load_scenario(scene, overrides))
     console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
@@ -129,10 +129,10 @@ def look(
     as_json: JsonOption = False,
 ) -> None:
     """Look through the cameras at one place: the stereo pair, and all that the left image consists of, as one sheet."""
-    from twin import look as looking
-    from twin import look_sheet
-    from twin.mission import prepare
-    from twin.scenario_file import load_scenario
+    from twin.app import look as looking
+    from twin.app import look_sheet
+    from twin.scenario.file import load_scenario
+    from twin.world.mission import prepare
 
     place = None if at is None else looking.parse_place(at)
     mission = prepare(load_scenario(scene, overrides))
@@ -160,14 +160,14 @@ def turbidity(out: LadderOption = Path("runs/turbidity"), as_json: SummaryOption
         print(f"Sheet: {out / 'turbidity.png'}")
 
 
-@app.command()
-def calibrate(
-    files: CalibrationArgument = None,
-    out: ModelOption = Path("calibration.toml"),
-    runs: RunsOption = Path("runs/calibration"),
+@app.command("fit-surrogate")
+def fit_surrogate(
+    files: FitArgument = None,
+    out: ModelOption = Path("error_model.toml"),
+    runs: RunsOption = Path("runs/fit-surrogate"),
 ) -> None:
     """Fit the surrogate's error model to rendered surveys; what was flown before is not flown again."""
-    from twin.surrogate import command
+    from twin.surrogate_fit import command
 
     raise typer.Exit(command.run(files or [], out, runs))
 
@@ -213,7 +213,7 @@ def tune(
 @app.command()
 def report(folder: RunArgument) -> None:
     """Write the report of a run again from its folder."""
-    from twin.judge.report import write_report
+    from twin.report.survey_page import write_report
 
     print(f"Report: {write_report(folder)}")
 
@@ -221,7 +221,7 @@ def report(folder: RunArgument) -> None:
 @app.command()
 def view(folder: RunArgument) -> None:
     """Open the recording of a run in Rerun."""
-    from twin.view import open_viewer
+    from twin.report.recording import open_viewer
 
     raise typer.Exit(open_viewer(folder))
 
@@ -229,7 +229,7 @@ def view(folder: RunArgument) -> None:
 @app.command()
 def doctor() -> None:
     """Tell what this machine renders with and what it lacks, with the line that installs it."""
-    from twin.doctor import examine
+    from twin.app.doctor import examine
 
     findings = examine(Path.cwd())
     for finding in findings:
@@ -240,7 +240,7 @@ def doctor() -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of the scenario; editors complete from it."""
-    from twin.config import Scenario
+    from twin.scenario.model import Scenario
 
     print(json.dumps(Scenario.model_json_schema(), indent=1))
 
@@ -254,7 +254,7 @@ def exit_status(result: RunResult) -> int:
 
 
 def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
-    from twin.scenario_file import load_scenario
+    from twin.scenario.file import load_scenario
 
     scenario = load_scenario(scene, overrides)
     folder = _new_folder(scenario, out)
@@ -267,7 +267,7 @@ def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> R
 
 def _need_graphics() -> None:
     """Ends the command where nothing can be drawn."""
-    from twin.doctor import graphics
+    from twin.app.doctor import graphics
 
     drawing = graphics()
     if not drawing.ok:

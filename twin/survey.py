@@ -7,17 +7,17 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.config import Scenario
+from twin.core.records import Estimate
+from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
-from twin.estimate.vision import StereoVision, Vision
-from twin.mission import Course, Mission, Step, prepare
-from twin.pilot import make_pilot
-from twin.records import Estimate
-from twin.results import RunResult, conclude
-from twin.run_writer import PICTURES, RunFolder
-from twin.sea import Sea, Watch
-from twin.timing import Stopwatch
+from twin.estimate.stereo_vision import StereoVision, Vision
+from twin.report.run_writer import PICTURES, RunFolder
+from twin.scenario.model import Scenario
+from twin.session.conclusion import RunResult, conclude
+from twin.world.mission import Course, Mission, Step, prepare
+from twin.world.pilot import make_pilot
+from twin.world.world import Watch, World
 
 _PATIENCE_S = 2.0  # without vision for longer, the vehicle is lost
 
@@ -53,30 +53,30 @@ def run(
     def say(stage: str, share: float) -> None:
         progress(Progress(0.0, time.perf_counter() - begun, share, 0.0, stage))
 
-    with open_sea(mission, watch) as sea, RunFolder(out, mission, shows) as folder:
-        for warning in sea.warnings:
+    with open_world(mission, watch) as world, RunFolder(out, mission, shows) as folder:
+        for warning in world.warnings:
             folder.log("warning", text=warning)
-        navigator = make_navigator(mission, vision_in(sea, out), watch)
+        navigator = make_navigator(mission, vision_in(world, out), watch)
         try:
-            fly(mission, sea, navigator, _Watcher(mission, folder, progress, begun, live))
+            fly(mission, world, navigator, _Watcher(mission, folder, progress, begun, live))
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
             reason = str(error) or "interrupted"
-        return conclude(mission, folder, navigator, sea, watch, begun, reason, say)
+        return conclude(mission, folder, navigator, world, watch, begun, reason, say)
 
 
-def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Step, Estimate, Any], None]) -> None:
+def fly(mission: Mission, world: World, navigator: Navigator, watcher: Callable[[Step, Estimate, Any], None]) -> None:
     """The closed loop: what the vehicle sees moves what it believes, what it believes moves the vehicle."""
     pilot = make_pilot(mission)
-    glide = sea.glide(navigator, pilot)
+    glide = world.glide(navigator, pilot)
 
     def follow(course: Course, track: int) -> None:
         k = 0
-        sea.begin(course, track)
+        world.begin(course, track)
         while k < len(course):
-            frame = sea.observe(course[k])
+            frame = world.observe(course[k])
             estimate = navigator.update(frame, track)
             watcher(course[k], estimate, frame)
-            sea.act(pilot(estimate, course[k].reference))
+            world.act(pilot(estimate, course[k].reference))
             k = k + 1 if glide is None else glide(course, k + 1)
 
     for track in mission.tracks:
@@ -86,27 +86,27 @@ def fly(mission: Mission, sea: Sea, navigator: Navigator, watcher: Callable[[Ste
         follow(mission.hold(track), track)
 
 
-def open_sea(mission: Mission, watch: Stopwatch) -> Sea:
+def open_world(mission: Mission, watch: Stopwatch) -> World:
     """The world of a mission, as real as its scenario asks."""
     if mission.scenario.imaging.fidelity == "rendered":
-        from twin.rendered_sea import RenderedSea  # only here: MuJoCo and OpenGL are 25 MB
+        from twin.world.rendered_world import RenderedWorld  # only here: MuJoCo and OpenGL are 25 MB
 
-        return RenderedSea(mission, watch)
-    from twin.surrogate import calibration
-    from twin.surrogate.sea import SurrogateSea
+        return RenderedWorld(mission, watch)
+    from twin.surrogate import error_model_file
+    from twin.surrogate.surrogate_world import SurrogateWorld
 
-    return SurrogateSea(mission, watch, calibration.load(mission.scenario.imaging.calibration))
+    return SurrogateWorld(mission, watch, error_model_file.load(mission.scenario.imaging.error_model))
 
 
-def vision_in(sea: Sea, folder: Path) -> Vision:
-    """What answers for the stereo camera: the images, or the sea in their place where nothing is rendered."""
-    return sea.vision or image_vision(sea.mission, folder, sea.watch)
+def vision_in(world: World, folder: Path) -> Vision:
+    """What answers for the stereo camera: the images, or the world in their place where nothing is rendered."""
+    return world.vision or image_vision(world.mission, folder, world.watch)
 
 
 def image_vision(mission: Mission, folder: Path, watch: Watch) -> StereoVision:
     """Vision by images, with all it may know."""
     pixel_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
-    return StereoVision(mission.rig, mission.scenario.estimate, pixel_m, folder / "keypoints", watch)
+    return StereoVision(mission.rig, mission.scenario.estimate, pixel_m, folder / "keyframes", watch)
 
 
 def make_navigator(mission: Mission, vision: Vision, watch: Stopwatch) -> Navigator:
@@ -125,7 +125,7 @@ class _Watcher:
         self.folder, self.progress, self.begun = folder, progress, begun
         self.live = None
         if live:
-            from twin.view import Live
+            from twin.report.recording import Live
 
             self.live = Live(mission.rig)
         self.blind, self.status = 0, "ok"

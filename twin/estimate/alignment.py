@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.estimate import aiding, pose_graph
-from twin.estimate.key_points import KeyPoint
-from twin.geometry import Array
-from twin.links import Link, Links
-from twin.records import SensorNoise, StereoRig
+from twin.core.geometry import Array
+from twin.core.links import Link, Links
+from twin.core.records import SensorNoise, StereoRig
+from twin.estimate.adjustment import pose_graph
+from twin.estimate.navigation import aiding
+from twin.estimate.vision.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
 
@@ -38,7 +39,7 @@ class Aligned(NamedTuple):
 
 
 def align(
-    nodes: Sequence[KeyPoint],
+    nodes: Sequence[Keyframe],
     links: Sequence[Link],
     anchors: dict[int, Array],
     rig: StereoRig,

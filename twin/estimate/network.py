@@ -1,4 +1,4 @@
-"""The key-point network (P10, P11, P13, P14): which nodes are linked, and the motion measured between them."""
+"""The keyframe network (P10, P11, P13, P14): which nodes are linked, and the motion measured between them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.estimate import matching, motion, observation, patches, stereo
-from twin.estimate.key_points import ImageSpool, KeyPoint
-from twin.geometry import Array
-from twin.links import Link
-from twin.records import StereoRig
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.links import Link
+from twin.core.records import StereoRig
+from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
+from twin.estimate.vision.image_spool import ImageSpool
+from twin.estimate.vision.keyframes import Keyframe
 
-_SAME_SWATH = 2  # the paper's two previous key points on the same swath
+_SAME_SWATH = 2  # the paper's two previous keyframes on the same swath
 LEAST_SHARE = 0.3  # of matched points that agree on one motion
 COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
 _NEAREST_M = 1e-3  # of a point before a camera
 _LEVELS = 2  # a quarter of the image: matches are found though positions err by 8 pixels
 
 
-def overlaps(node: KeyPoint, poses: Array, rig: StereoRig, patch_px: int) -> Array:
+def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Shares (n,) of the node's points that the left images at poses (n, 4, 4) show: overlap of true 3-D footprints.
 
     Predicted from poses and depth (P11), not from a flat floor.
@@ -38,14 +39,14 @@ def overlaps(node: KeyPoint, poses: Array, rig: StereoRig, patch_px: int) -> Arr
 
 
 def choose_links(
-    node: KeyPoint,
-    earlier: Sequence[KeyPoint],
+    node: Keyframe,
+    earlier: Sequence[Keyframe],
     poses: Array,
     rig: StereoRig,
     min_overlap: float,
     max_links: int,
     patch_px: int,
-) -> list[tuple[KeyPoint, float]]:
+) -> list[tuple[Keyframe, float]]:
     """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
 
     The last link of a run of overlapping nodes carries the longest base; links to other swaths tie the legs together,
@@ -80,7 +81,7 @@ def _unbroken(linked: list[int], newest: int) -> list[int]:
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
-def _spread(others: list[int], earlier: Sequence[KeyPoint], count: int) -> list[int]:
+def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
     """The best of other swaths, no two of them neighbours on theirs as long as there is a choice."""
     chosen: list[int] = []
     for k in others:
@@ -130,7 +131,7 @@ class PairMatch:
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
         self._workers = ThreadPoolExecutor(2)
 
-    def flows(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Matched | None]:
+    def flows(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Matched | None]:
         """The node's points found in both images of each other pair, two pairs at a time; None where it has none."""
         points = node.points
         if points is None:
@@ -140,7 +141,7 @@ class PairMatch:
         return list(self._workers.map(lambda other: self._flow(node, points, cut, other), others))
 
     def _flow(
-        self, node: KeyPoint, points: stereo.StereoPoints, cut: Sequence[patches.Patches], other: KeyPoint
+        self, node: Keyframe, points: stereo.StereoPoints, cut: Sequence[patches.Patches], other: Keyframe
     ) -> Matched:
         """The points found in both images of one other pair.
 
@@ -149,7 +150,7 @@ class PairMatch:
         """
         rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        expected, by_point, _ = observation.transfer(points.measured, other_from_node, rig.baseline_m)
+        expected, by_point, _ = observation_equations.transfer(points.measured, other_from_node, rig.baseline_m)
         warp = by_point[:, :, :2] + by_point[:, :, 2:] * points.slope[:, None, :]
         left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
         left_px, shift_px = self._places(expected)
@@ -168,7 +169,7 @@ class PairMatch:
     def _shows(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
         """Which points (n,) both images of the other pair show, patch and all."""
         around = np.column_stack([points.measured[:, :2], points.around_px / self.rig.focal_px])
-        expected, _, _ = observation.transfer(around, other_from_node, self.rig.baseline_m)
+        expected, _, _ = observation_equations.transfer(around, other_from_node, self.rig.baseline_m)
         left_px, shift_px = self._places(expected)
         in_left, in_right = (stereo.well_inside(px, self.rig, self.patch_px) for px in (left_px, left_px - shift_px))
         return in_left & in_right
@@ -178,14 +179,14 @@ class PairMatch:
         left_px = expected[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([expected[:, 2] * self.rig.focal_px, np.zeros(len(expected))])
 
-    def motion(self, node: KeyPoint, other: KeyPoint, matched: Matched) -> motion.Motion | None:
+    def motion(self, node: Keyframe, other: Keyframe, matched: Matched) -> two_view_motion.Motion | None:
         """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted.
 
         It starts from the closed form of eq. (2), or where that has none from the predicted poses.
         """
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        closed_form = motion.exact_depth_motion(matched.other, matched.node, self.rig.baseline_m, predicted)
-        result = motion.pair_motion(
+        closed_form = two_view_motion.exact_depth_motion(matched.other, matched.node, self.rig.baseline_m, predicted)
+        result = two_view_motion.pair_motion(
             matched.other,
             matched.node,
             matched.other_cov,
@@ -200,7 +201,7 @@ class PairMatch:
         return result._replace(closed_form=closed_form)
 
 
-def to_link(node: KeyPoint, other: KeyPoint, share: float, result: motion.Motion) -> Link:
+def to_link(node: Keyframe, other: Keyframe, share: float, result: two_view_motion.Motion) -> Link:
     """The network's record of a measured motion."""
     return Link(
         other.number, node.number, result.a_from_b, result.cov, share, result.n_points, closed_form=result.closed_form

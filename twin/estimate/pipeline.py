@@ -1,4 +1,4 @@
-"""The method in the paper's order: F2F at every frame; stereo, F2M and network at key points; GA at a track's end."""
+"""The method in the paper's order: F2F at every frame; stereo, F2M and network at keyframes; GA at a track's end."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from functools import partial
 
 import numpy as np
 
-from twin import geometry
-from twin.config import Estimation
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.growing_array import Rows
+from twin.core.links import Link, Links
+from twin.core.records import Alignment, Estimate, Frame, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.errors import SurveyAborted
 from twin.estimate import network
 from twin.estimate.alignment import Aligned, align
-from twin.estimate.key_points import KeyPoint
-from twin.estimate.pose_filter import PoseFilter, carried, clipped
-from twin.estimate.reckoning import Instruments, Reckoning, reckon, said
-from twin.estimate.trajectory import interpolate_between_keys
-from twin.estimate.velocity_log import VelocityLog
-from twin.estimate.vision import Vision
-from twin.geometry import Array
-from twin.links import Link, Links
-from twin.records import Alignment, Estimate, Frame, SensorNoise, StereoRig, SurveyResult, Trajectory
-from twin.rows import Rows
+from twin.estimate.navigation.dead_reckoning import Instruments, Reckoning, reckon, said
+from twin.estimate.navigation.dvl import VelocityLog
+from twin.estimate.navigation.pose_filter import PoseFilter, carried, clipped
+from twin.estimate.stereo_vision import Vision
+from twin.estimate.trajectory import interpolate_between_keyframes
+from twin.estimate.vision.keyframes import Keyframe
+from twin.scenario.model import EstimateConfig
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _START_NODES = 4  # the reference position stays in the window: loops come back to it
@@ -53,7 +53,7 @@ class Navigator:
         vision: Vision,
         rig: StereoRig,
         noise: SensorNoise,
-        settings: Estimation,
+        settings: EstimateConfig,
         start: Array,
         watch: Callable[[str], AbstractContextManager[None]],
         beside: bool = True,
@@ -65,8 +65,8 @@ class Navigator:
         self.since_node = (np.eye(4), np.zeros((6, 6)))
         self.cov_at_node = np.zeros((6, 6))
         self.alignable = True
-        self.keys: list[KeyPoint] = []
-        self.nodes: list[KeyPoint] = []
+        self.keys: list[Keyframe] = []
+        self.nodes: list[Keyframe] = []
         self.node_poses = np.empty((64, 4, 4))  # theirs, and room for more
         self.links = Links()
         self.measuring: deque[Callable[[], list[Link]]] = deque()
@@ -78,12 +78,12 @@ class Navigator:
         self.after_ga: list[Array] = []
 
     def update(self, frame: Frame, track: int) -> Estimate:
-        """Takes one frame; a frame with a right image is a key point of the track (from 1)."""
-        seen, status = self.vision.step(frame)
+        """Takes one frame; a frame with a right image is a keyframe of the track (from 1)."""
+        seen, status = self.vision.track_frame(frame)
         reckoned, moved = reckon(self.reckoning, self.instruments, seen.a_from_b, seen.cov, *said(frame.readings))
         self.go_on(reckoned)
         if frame.right is not None:
-            status = self._visit_key_point(frame, track, status)
+            status = self._visit_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
         self.record(frame.time_s, f2f, online)
         velocity = geometry.log(moved) * self.rig.frame_rate_hz
@@ -116,17 +116,17 @@ class Navigator:
         """Global alignment over the window that ends with this track; the vehicle keeps station meanwhile."""
         if not self.settings.use_ga or len(self.nodes) < 2:
             return
-        self.before_ga.append(self._key_poses()[:, :3, 3].copy())
+        self.before_ga.append(self._keyframe_poses()[:, :3, 3].copy())
         self._take_links()
         first = track - self.settings.window_tracks
         with self.watch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
         self._rebase(aligned)
-        self.vision.relay([k for k in self.keys if k.track >= track])  # the mosaic forgets older ones
+        self.vision.rebuild_mosaic([k for k in self.keys if k.track >= track])  # the mosaic forgets older ones
         left = bisect_left(self.nodes, first, key=lambda k: k.track)
         if left > _START_NODES:
-            self.vision.forget(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
-        self.after_ga.append(self._key_poses()[:, :3, 3].copy())
+            self.vision.discard(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
+        self.after_ga.append(self._keyframe_poses()[:, :3, 3].copy())
 
     def finish(self) -> SurveyResult:
         """The truly global alignment over all tracks, and the trajectories.
@@ -143,36 +143,36 @@ class Navigator:
             cov = aligned.covs[owner]
         times, f2f, online = (rows.array for rows in (self.times_s, self.f2f_poses, self.online_poses))
         rows = np.array([k.row for k in self.keys], dtype=np.int64)
-        final = interpolate_between_keys(f2f, rows, self._key_poses()) if self.settings.use_ga else online
+        final = interpolate_between_keyframes(f2f, rows, self._keyframe_poses()) if self.settings.use_ga else online
         return SurveyResult(
             f2f=Trajectory(times, f2f),
             online=Trajectory(times, online),
             final=Trajectory(times, final),
-            key_frames=rows,
-            track_of_key=np.array([k.track for k in self.keys], dtype=np.int64),
+            keyframe_rows=rows,
+            track_of_keyframe=np.array([k.track for k in self.keys], dtype=np.int64),
             node_cov=cov,
             links=self.links,
             alignments=self.alignments,
             before_ga=self.before_ga,
             after_ga=self.after_ga,
-            looks=[look for look in self.vision.looks if look.row < len(times)],
+            stereo_observations=[look for look in self.vision.stereo_observations if look.row < len(times)],
         )
 
     def _forget_unfinished(self) -> None:
-        """Drops a key point whose frame was interrupted before it was recorded."""
+        """Drops a keyframe whose frame was interrupted before it was recorded."""
         self._take_links()
         n_frames = len(self.times_s)
         self.keys = [k for k in self.keys if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
         self.links = self.links.kept(self.links.j < len(self.keys))
 
-    def _visit_key_point(self, frame: Frame, track: int, status: str) -> str:
-        """Stereo, F2M, mosaic and network at a key point; fresh points for F2F."""
-        points = self.vision.look(frame, len(self.times_s))
+    def _visit_keyframe(self, frame: Frame, track: int, status: str) -> str:
+        """Stereo, F2M, mosaic and network at a keyframe; fresh points for F2F."""
+        points = self.vision.observe_stereo(frame, len(self.times_s))
         if points is None:
             self.filter.fix(frame.readings)
             return "too few points in stereo"
-        key = KeyPoint(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
+        key = Keyframe(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
         self.keys.append(key)
         is_node = key.number % self.settings.node_stride == 0
         chain = self._follow_chain(key) if is_node else None
@@ -180,20 +180,20 @@ class Navigator:
         with self.watch("f2m"):
             self._register_with_mosaic(key, chain)
             key.world_from_camera = self.filter.world_from_camera
-            self.vision.lay(key.number, key.world_from_camera)
+            self.vision.add_to_mosaic(key.number, key.world_from_camera)
         if is_node:
             self._connect(key, chain)
-        self.vision.restart()
+        self.vision.restart_tracking()
         key.points = None  # links start from the new node's points: memory need not hold the old ones
         return status
 
-    def _register_with_mosaic(self, key: KeyPoint, chain: Link | None) -> None:
+    def _register_with_mosaic(self, key: Keyframe, chain: Link | None) -> None:
         """Corrects the position by the mosaic (F2M), as far as the motion since that was laid is less sure."""
         pose, step_cov = self.filter.world_from_camera, self.since_node[1] if chain is None else chain.cov
         to_world, from_world = geometry.adjoint(pose), geometry.adjoint(geometry.inverse(pose))
         if self.nodes:
             key.walked_cov = self.nodes[-1].walked_cov + to_world @ step_cov @ to_world.T
-        found = self.vision.register(pose) if self.settings.use_f2m else None
+        found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
         if found is not None:
             walked_cov = from_world @ (key.walked_cov - self.keys[found.laid_by].walked_cov) @ from_world.T
             since = clipped(walked_cov, step_cov, least=1.0) if self.nodes else walked_cov
@@ -202,7 +202,7 @@ class Navigator:
             if learnt is not None:
                 key.walked_cov = key.walked_cov - to_world @ learnt @ to_world.T
 
-    def _follow_chain(self, node: KeyPoint) -> Link | None:
+    def _follow_chain(self, node: Keyframe) -> Link | None:
         """Measures the motion since the last node, and lets it take the place of the F2F motion in the online position.
 
         Two stereo pairs tell the motion better than the frames between them do (the paper's better start values
@@ -223,7 +223,7 @@ class Navigator:
         node.world_from_camera = self.filter.world_from_camera
         return link
 
-    def _connect(self, node: KeyPoint, chain: Link | None) -> None:
+    def _connect(self, node: Keyframe, chain: Link | None) -> None:
         """Links a new node to earlier ones by measured motions; to the last one by F2F where that failed."""
         s = self.settings
         with self.watch("network"):
@@ -246,13 +246,13 @@ class Navigator:
         self.cov_at_node = self.filter.cov
         self.since_node = (np.eye(4), np.zeros((6, 6)))
 
-    def _bridge(self, node: KeyPoint) -> Link:
+    def _bridge(self, node: Keyframe) -> Link:
         """The F2F motion since the last node, where the two stereo pairs do not tell it."""
         relative, cov = self.since_node
         return Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0)
 
     def _links_of(
-        self, node: KeyPoint, others: list[tuple[KeyPoint, float]], chain: Link | None, bridge: Link | None
+        self, node: Keyframe, others: list[tuple[Keyframe, float]], chain: Link | None, bridge: Link | None
     ) -> list[Link]:
         """All links of one new node."""
         measured = self._measure(node, others)
@@ -273,9 +273,9 @@ class Navigator:
                 raise
             self.measuring.popleft()
 
-    def _measure(self, node: KeyPoint, others: list[tuple[KeyPoint, float]]) -> list[Link]:
+    def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
         """The links from earlier nodes (with the share of the node that they see) that could be measured."""
-        motions = self.vision.measure(node, [other for other, _ in others])
+        motions = self.vision.measure_motions(node, [other for other, _ in others])
         links = [
             network.to_link(node, other, share, motion)
             for (other, share), motion in zip(others, motions, strict=True)
@@ -283,8 +283,8 @@ class Navigator:
         ]
         return links
 
-    def _align(self, nodes: list[KeyPoint], track: int, marginals: list[int] | None) -> Aligned:
-        """Aligns the last nodes (with those older ones that they are linked to, held); all key points move along."""
+    def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> Aligned:
+        """Aligns the last nodes (with those older ones that they are linked to, held); all keyframes move along."""
         first = nodes[0].number
         links = self.links.kept(self.links.j >= first)
         held = set(links.i[links.i < first].tolist())
@@ -304,11 +304,11 @@ class Navigator:
             ends = zip(self.links.i.tolist(), self.links.j.tolist(), strict=True)
             self.links = self.links.kept(np.array([pair not in dropped for pair in ends]))
         poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
-        self._move_keys({number: pose for number, pose in poses.items() if number >= first})
+        self._move_keyframes({number: pose for number, pose in poses.items() if number >= first})
         return aligned
 
-    def _move_keys(self, poses: dict[int, Array]) -> None:
-        """Gives nodes their new poses; key points between them move along with the node before, if that moved."""
+    def _move_keyframes(self, poses: dict[int, Array]) -> None:
+        """Gives nodes their new poses; keyframes between them move along with the node before, if that moved."""
         moving = self.keys[min(poses) :]
         old = np.array([key.world_from_camera for key in moving])
         numbers = {node.number for node in self.nodes}
@@ -321,11 +321,11 @@ class Navigator:
             self.node_poses[k] = node.world_from_camera
 
     def _rebase(self, aligned: Aligned) -> None:
-        """Moves the online position along with the last key point."""
+        """Moves the online position along with the last keyframe."""
         last = self.keys[-1]
         last_from_now = geometry.inverse(self.online_poses.array[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, carried(aligned.covs[-1], last_from_now))
         self.cov_at_node = aligned.covs[-1]
 
-    def _key_poses(self) -> Array:
+    def _keyframe_poses(self) -> Array:
         return np.array([k.world_from_camera for k in self.keys]).reshape(-1, 4, 4)

@@ -1,4 +1,4 @@
-"""Poses of all frames from those of the key points."""
+"""Poses of all frames from those of the keyframes."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.geometry import Array
+from twin.core import geometry
+from twin.core.geometry import Array
 
 
-def interpolate_between_keys(f2f: Array, rows: NDArray[np.int64], key_poses: Array) -> Array:
-    """Follows frame-to-frame motion from each key point and spreads what is left at the next evenly over the way.
+def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
+    """Follows frame-to-frame motion from each keyframe and spreads what is left at the next evenly over the way.
 
     Args:
         f2f: (n, 4, 4) poses by frame-to-frame motion alone.
-        rows: (m,) frames that are key points, ascending.
-        key_poses: (m, 4, 4) their aligned poses.
+        rows: (m,) frames that are keyframes, ascending.
+        keyframe_poses: (m, 4, 4) their aligned poses.
 
     Returns:
-        (n, 4, 4); equal to `key_poses` at the key points; before the first and after the last, frame to frame alone.
+        (n, 4, 4), equal to `keyframe_poses` at the keyframes; frame-to-frame motion before the first and after the last.
     """
     if len(rows) == 0:
         return f2f.copy()
     result = np.empty_like(f2f)
-    first = key_poses[0] @ geometry.inverse(f2f[rows[0]])
+    first = keyframe_poses[0] @ geometry.inverse(f2f[rows[0]])
     result[: rows[0]] = first @ f2f[: rows[0]]
     for k, row in enumerate(rows):
         end = rows[k + 1] if k + 1 < len(rows) else len(f2f)
-        there = key_poses[k] @ geometry.inverse(f2f[row])
+        there = keyframe_poses[k] @ geometry.inverse(f2f[row])
         if k + 1 < len(rows):
-            gap = geometry.log(geometry.inverse(there @ f2f[end]) @ key_poses[k + 1])
+            gap = geometry.log(geometry.inverse(there @ f2f[end]) @ keyframe_poses[k + 1])
             _spread(there, f2f[row:end], gap, result[row:end])
         else:
             result[row:] = there @ f2f[row:]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
-from twin.records import ElevationMap, Image, MapGrid
+from twin.core.records import ElevationMap, Image, MapGrid
 
 Map = NDArray[np.float32]
 

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.exchange.gltf import export_glb
 
-from twin.records import ElevationMap
+from twin.core.records import ElevationMap
 
 #: GLB is Y-up: east stays x, up becomes y, north becomes -z.
 GLB_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Pose graphs on disk: the key-point network as a g2o file, and g2o and TORO files of others as links.
+"""Pose graphs on disk: the keyframe network as a g2o file, and g2o and TORO files of others as links.
 
 Information on rotation is taken per radian, as gtsam takes it. A g2o file made by g2o itself has it per vector part of
 a quaternion, which is half an angle: four times the number.
@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.links import Link
+from twin.core.records import SurveyResult
 from twin.errors import TwinError
-from twin.geometry import Array
-from twin.links import Link
-from twin.records import SurveyResult
 
 _ROTATION_LAST = [3, 4, 5, 0, 1, 2]  # g2o and TORO order translation first
 _UPPER = np.triu_indices(6)
@@ -31,7 +31,7 @@ class PoseGraph(NamedTuple):
 
 def write(path: Path, result: SurveyResult) -> None:
     """Writes VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines: quaternions xyzw, upper triangle of the information matrix."""
-    poses = result.final.world_from_camera[result.key_frames]
+    poses = result.final.world_from_camera[result.keyframe_rows]
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_texts(poses)))
     links = result.links
     upper = links.information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.config import Scenario
+from twin.core import geometry
+from twin.core.records import Image
 from twin.imaging.light import Layers, Light, Moment
 from twin.imaging.photo_sensor import PhotoSensor, sensor_of
 from twin.imaging.pixels import Raw
 from twin.imaging.sensor import Setting
-from twin.imaging.view import View, make_view
-from twin.records import Image
+from twin.imaging.true_cameras import View, make_view
+from twin.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from twin.imaging.renderer import Renderer
@@ -64,7 +64,7 @@ class Anatomy(NamedTuple):
 
 
 class StereoCamera:
-    """Two eyes that share one auto-exposure; noise of the left eye does not depend on whether the right one is used."""
+    """Two cameras that share one auto-exposure; the noise of the left one is independent of the right one."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class StereoCamera:
         self._shots = 0
 
     def shoot(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> Shot:
-        """Images of the left eye and, where `stereo`, of the right one at the same instant.
+        """Images of the left camera and, where `stereo`, of the right one at the same instant.
 
         Args:
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].

@@ -22,12 +22,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.imaging.bands import in_bands
+from twin.core.records import StereoRig
 from twin.imaging.optics import Depth, Radiance
 from twin.imaging.powers import LOG2_E, two_to
+from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import FAR_M, PATH_MAX_M
 from twin.imaging.water import FORWARDNESS, Medium, phase_function
-from twin.records import StereoRig
 
 Array = NDArray[np.float64]
 
@@ -79,14 +79,14 @@ class ForwardScatter:
         """Adds to `light` (H, W, 3) what arrives from the floor, scattered forward or not."""
         spread = self._draw(direct, depth)
         parts = light.reshape(len(light), -1), spread.reshape(len(light), -1), direct.reshape(len(light), -1)
-        in_bands(lambda first, end: _add(*parts, first, end), len(light))
+        in_row_bands(lambda first, end: _add(*parts, first, end), len(light))
 
     def _draw(self, direct: Radiance, depth: Depth) -> Radiance:
         """The same as `spread`, in memory of its own until the next call: to get fresh one takes as long as to fill."""
         size, (height, width) = self._bin_px, depth.shape
         bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
         scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
-        in_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
+        in_row_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
         # what lies in a bin has its variance already, and drawing straight lines between bins adds to it
         sigma = np.sqrt(np.maximum(self._variance_px2 / size**2 - (0.25 - 1 / (4 * size**2)), 1e-3))
         pairs = zip(bins, sigma, strict=True)

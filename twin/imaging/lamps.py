@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.config import Lamp, Sun
+from twin.core import geometry
+from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.imaging.water import Medium, downwelling_per_m
-from twin.records import StereoRig
+from twin.scenario.model import LampConfig, SunConfig
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class Daylight(NamedTuple):
 
 
 class Lights(NamedTuple):
-    """Lamps in the axes of one eye, and daylight along its optical axis.
+    """Lamps in the axes of one camera, and daylight along its optical axis.
 
     Args:
         position_m, axis: (n, 3), axis of unit length.
@@ -58,7 +58,7 @@ class Lights(NamedTuple):
     daylight: Daylight
 
 
-def daylight_at(sun: Sun, water: Medium, altitude_m: float) -> Daylight:
+def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
     """Daylight at a height above the reference plane: of `sun`, less what the water took above.
 
     Raises:
@@ -76,8 +76,8 @@ def daylight_at(sun: Sun, water: Medium, altitude_m: float) -> Daylight:
     return Daylight(sun.illuminance_lx * np.exp(-per_m * (sun.depth_m - altitude_m)), per_m)
 
 
-def lights_of_eye(rig: StereoRig, lamps: Sequence[Lamp], daylight: Daylight, eye: int) -> Lights:
-    """The lamps, which move with the rig, in the axes of one eye.
+def lights_of_eye(rig: StereoRig, lamps: Sequence[LampConfig], daylight: Daylight, eye: int) -> Lights:
+    """The lamps, which move with the rig, in the axes of one camera.
 
     Raises:
         TwinError: the table of a beam is none.
@@ -95,13 +95,13 @@ def lights_of_eye(rig: StereoRig, lamps: Sequence[Lamp], daylight: Daylight, eye
     )
 
 
-def _beam_axis(lamp: Lamp) -> Array:
+def _beam_axis(lamp: LampConfig) -> Array:
     """Unit vector of a lamp's beam in the body: from straight down, tilted to the bow, panned to port."""
     tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
     return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
 
 
-def _beam(number: int, lamp: Lamp) -> Array:
+def _beam(number: int, lamp: LampConfig) -> Array:
     """The table of a lamp's beam."""
     table = np.array(lamp.beam or LED_BEAM)
     if table[0, 0] != 0 or not (np.diff(table[:, 0]) > 0).all():

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import config
+from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
@@ -30,12 +30,12 @@ class Distortion(NamedTuple):
     p2: float = 0.0
 
 
-def true_lens(lens: config.Lens) -> Distortion:
+def true_lens(lens: LensConfig) -> Distortion:
     """The lens that the sea is seen through."""
     return Distortion(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2)
 
 
-def believed_lens(lens: config.Lens, calibration: config.Calibration) -> Distortion:
+def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Distortion:
     """The lens by which frames are rectified: the true one less the errors of calibration."""
     return true_lens(lens)._replace(k1=lens.k1 - calibration.k1_error, k2=lens.k2 - calibration.k2_error)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Scenario
+from twin.core.records import Image, StereoRig
 from twin.imaging.caustics import CELLS, TILE_M, Caustics
 from twin.imaging.forward_scatter import ForwardScatter
 from twin.imaging.lamps import daylight_at, lights_of_eye
@@ -15,7 +15,7 @@ from twin.imaging.optics import Depth, Lit, Optics, Overhead, Radiance
 from twin.imaging.shadows import Heights, Shadows
 from twin.imaging.snow import Snow
 from twin.imaging.water import medium
-from twin.records import Image, StereoRig
+from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]
 

@@ -20,12 +20,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Lamp, Sun, Water
-from twin.imaging.bands import in_bands
+from twin.core.records import Image, StereoRig
 from twin.imaging.lamps import Lights, beam_share, daylight_at, lights_of_eye
+from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import PATH_MAX_M, PATH_STEP_M, RANGE_SCALE_M, shade
 from twin.imaging.water import Medium, medium, phase_function
-from twin.records import Image, StereoRig
+from twin.scenario.model import LampConfig, SunConfig, WaterConfig
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -72,11 +72,13 @@ class Optics:
         altitude_m: height that is flown above the reference plane, on which `sun.depth_m` is told.
     """
 
-    def __init__(self, rig: StereoRig, water: Water, lamps: Sequence[Lamp], sun: Sun, altitude_m: float = 0.0):
+    def __init__(
+        self, rig: StereoRig, water: WaterConfig, lamps: Sequence[LampConfig], sun: SunConfig, altitude_m: float = 0.0
+    ):
         self._rig, self._medium = rig, medium(water)
         daylight = daylight_at(sun, self._medium, altitude_m)
         self._lights = [lights_of_eye(rig, lamps, daylight, eye) for eye in (0, 1)]
-        self._tables_of = cache(lambda eye: _tables(rig, self._medium, self._lights[eye]))  # some need one eye only
+        self._tables_of = cache(lambda eye: _tables(rig, self._medium, self._lights[eye]))  # some need one camera only
         falls = bool(daylight.per_m.any())
         self._surface_lx = np.full(3, sun.illuminance_lx) if falls else daylight.eye_lx
         self._loss_per_m = np.array([daylight.per_m, self._medium.attenuation_per_m], np.float32)
@@ -139,7 +141,7 @@ class Optics:
         lamps = np.column_stack([lights.position_m, lights.axis, lights.intensity_cd, lights.colour])
         beams, transmission, veil = self._tables_of(eye)
         scene = np.ascontiguousarray(albedo), depth, focal, lamps.astype(np.float32), beams, transmission, veil, sky
-        in_bands(lambda first, end: shade(*scene, out, lit, veil_out, first, end), len(depth))
+        in_row_bands(lambda first, end: shade(*scene, out, lit, veil_out, first, end), len(depth))
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:

@@ -9,14 +9,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import config
-from twin.config import Scenario
-from twin.imaging.bands import in_bands
+from twin.core.records import Image, StereoRig
 from twin.imaging.photons import electrons_per_cd, vignetting
 from twin.imaging.pixels import Pixels, Raw, read_out
+from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.sensor import Array, Depth, Exposure, PlainSensor, Radiance, Setting
 from twin.imaging.shutter import roll, smear
-from twin.records import Image, StereoRig
+from twin.scenario.model import Scenario, SensorConfig
 
 BLACK_SHARE = 1 / 64  # of the scale lies below the black level, so that the noise of darkness has both its sides
 
@@ -37,12 +36,12 @@ def sensor_of(scenario: Scenario, raw: StereoRig | None = None) -> Sensor:
 
 
 class PhotoSensor:
-    """Sensor of both eyes: exposes longer, then amplifies; what is out of reach stays dark, or saturates.
+    """Sensor of both cameras: exposes longer, then amplifies; what is out of reach stays dark, or saturates.
 
     Auto-exposure meters the light itself, so that it does not hunt where an image saturates.
     """
 
-    def __init__(self, scenario: Scenario, sensor: config.Sensor, raw: StereoRig | None = None):
+    def __init__(self, scenario: Scenario, sensor: SensorConfig, raw: StereoRig | None = None):
         rig = scenario.believed_rig()
         self._sensor, self._focal_px = sensor, rig.focal_px
         self._vignetting = vignetting(rig if raw is None else raw, sensor.vignetting_power)
@@ -91,7 +90,7 @@ class PhotoSensor:
         """An 8-bit RGB image (H, W, 3): black level off, white balanced for clear water, linear, bands interpolated."""
         toned = np.empty(raw.shape, np.uint8)
         bands = raw.reshape(*raw.shape[:2], -1), self._tones, toned.reshape(*raw.shape[:2], -1)
-        in_bands(lambda first, end: _tone(*bands, first, end), len(raw))
+        in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw))
         if raw.ndim == 3:
             return toned
         image = np.empty((*raw.shape, 3), np.uint8)

@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Sensor
-from twin.records import StereoRig
+from twin.core.records import StereoRig
+from twin.scenario.model import SensorConfig
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def photons_per_lux() -> Array:
     return watts_per_m2 * np.array(BAND_NM) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
 
 
-def electrons_per_cd(sensor: Sensor, water_index: float) -> Array:
+def electrons_per_cd(sensor: SensorConfig, water_index: float) -> Array:
     """Electrons that a pixel on the axis collects in a second by 1 cd/m2, for R, G, B (3,) [1/s]."""
     lux = np.pi / (4 * (water_index * sensor.f_number) ** 2)
     return lux * photons_per_lux() * (sensor.pixel_um * 1e-6) ** 2 * np.array(sensor.quantum_efficiency)

@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.imaging.bands import in_bands
 from twin.imaging.noise import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
+from twin.imaging.row_parallel import in_row_bands
 
 Raw = NDArray[np.uint16]
 
@@ -60,7 +60,7 @@ def read_out(
     seed = np.uint64(0) if rng is None else seed_of(rng)
     numbers = np.array([*pixels.electrons_per_cd, *pixels[1:]], np.float32)
     chances = normal_numbers(), seed, rng is not None
-    in_bands(lambda first, end: _read_out(light, vignetting, numbers, *chances, out, first, end), height)
+    in_row_bands(lambda first, end: _read_out(light, vignetting, numbers, *chances, out, first, end), height)
     return out[..., 0] if bayer else out
 
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Port
 from twin.imaging.lens import solve
+from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Pinhole(NamedTuple):
     focal_ratio: float
 
 
-def pinhole(port: Port) -> Pinhole:
+def pinhole(port: PortConfig) -> Pinhole:
     """The pinhole of a port that stands straight: tilt and sideways offset are faults that it does not know of."""
     if port.kind == "none":
         return Pinhole(0.0, 1.0)
@@ -46,7 +46,7 @@ def pinhole(port: Port) -> Pinhole:
     return Pinhole(float(z - x * along_z / along_x), float(SMALL_RAD * along_z / along_x))
 
 
-def water_rays(port: Port, tangents: Array) -> tuple[Array, Array]:
+def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
     """Origin on the outer face and unit direction, both (..., 3), of the ray that is (..., 2) in air.
 
     NaN where the ray does not get through. Without a port rays start at the pupil.
@@ -63,7 +63,7 @@ def water_rays(port: Port, tangents: Array) -> tuple[Array, Array]:
     return outer, refract(ray, normal, port.glass_index / port.water_index)
 
 
-def air_tangents(port: Port, points_m: Array) -> Array:
+def air_tangents(port: PortConfig, points_m: Array) -> Array:
     """The rays (..., 2) in air that reach points (..., 3): the inverse of `water_rays`; NaN where none does.
 
     By Newton from the ray of the pinhole; the angle in air grows faster than that in water, so that for a pane each
@@ -102,7 +102,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
     return ratio * ray + (behind - ratio * cosine) * normal
 
 
-def _hit_pane(port: Port, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
+def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
     """Where rays meet the face of a pane at a depth in its glass, and its normal."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
@@ -111,7 +111,7 @@ def _hit_pane(port: Port, start: Array, ray: Array, depth_m: float) -> tuple[Arr
     return start + way[..., None] * ray, np.broadcast_to(normal, ray.shape)
 
 
-def _hit_dome(port: Port, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
+def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
     """Where rays from within meet the sphere at a depth in the glass of a dome, and its normal."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre

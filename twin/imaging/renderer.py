@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.builder import World
+from scenes.builder import SceneModel
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import GlMissing, MjModel, MjvScene, mujoco, offscreen_context
 from twin.errors import TwinError
@@ -31,24 +31,24 @@ class Renderer:
 
     def __init__(
         self,
-        world: World,
+        scene: SceneModel,
         width_px: int,
         height_px: int,
         vfov_deg: float,
         znear_m: float = NEAR_M,
         zfar_m: float = 100.0,
     ):
-        self._world = world
+        self._scene_model = scene
         self._near, self._far = np.float32(znear_m), np.float32(zfar_m)
         self._rect = mujoco.MjrRect(0, 0, width_px, height_px)
         self._tan = np.tan(np.deg2rad(vfov_deg) / 2) * np.array([width_px / height_px, 1.0])
         self._rgb = np.empty((height_px, width_px, 3), np.uint8)
         self._z = np.empty((height_px, width_px), np.float32)
         self._gl: Any
-        self._gl, self._context = _open(world.model, width_px, height_px)
-        self._scene = _floor_scene(world.model)
+        self._gl, self._context = _open(scene.model, width_px, height_px)
+        self._scene = _floor_scene(scene.model)
         self._set_projection()
-        order = {geom: k for k, geom in enumerate(world.tile_geom_ids)}
+        order = {geom: k for k, geom in enumerate(scene.tile_geom_ids)}
         drawn = [self._scene.geoms[k] for k in range(self._scene.ngeom)]
         self._tiles = sorted(drawn, key=lambda geom: order[geom.objid])
         self._meshes = [tile.dataid for tile in self._tiles]
@@ -62,7 +62,7 @@ class Renderer:
         """
         self._gl.make_current()
         self._place(world_from_camera)
-        self._show(visible_tiles(self._world, world_from_camera, self._tan))
+        self._show(visible_tiles(self._scene_model, world_from_camera, self._tan))
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._z, self._rect, self._context)
@@ -83,7 +83,7 @@ class Renderer:
         self.close()
 
     def _set_projection(self) -> None:
-        for camera in self._scene.camera:  # two eyes, of which MuJoCo takes the mean
+        for camera in self._scene.camera:  # two cameras, of which MuJoCo takes the mean
             camera.frustum_near, camera.frustum_far = self._near, self._far
             camera.frustum_center, camera.frustum_width = 0.0, self._near * self._tan[0]
             camera.frustum_top, camera.frustum_bottom = self._near * self._tan[1], -self._near * self._tan[1]
@@ -131,7 +131,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
     return scene
 
 
-def visible_tiles(world: World, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
+def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
     """Which tiles' boxes reach into the camera's pyramid of view: a box is out if it lies beyond one of the four sides.
 
     Args:
@@ -139,7 +139,7 @@ def visible_tiles(world: World, world_from_camera: Array, half_tangents: Array) 
     """
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
-    low, high = world.tile_low_m - world_from_camera[:3, 3], world.tile_high_m - world_from_camera[:3, 3]
+    low, high = scene.tile_low_m - world_from_camera[:3, 3], scene.tile_high_m - world_from_camera[:3, 3]
     # the corner of a box that lies farthest inwards of a side takes, along each axis, the end the normal points to
     farthest = high @ np.maximum(inward, 0).T + low @ np.minimum(inward, 0).T
     return np.all(farthest >= 0, axis=1)

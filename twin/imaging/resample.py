@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.imaging.bands import in_bands
-from twin.records import Image
+from twin.core.records import Image
+from twin.imaging.row_parallel import in_row_bands
 
 Light = NDArray[np.float32]
 Places = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
@@ -31,16 +31,16 @@ def gather(light: Light, places: Places) -> Light:
 def interpolate(image: Image, places: Places) -> Image:
     """An image (H, W, 3) between its pixels, exact at them."""
     spline = image.reshape(len(image), -1).astype(np.float32)
-    in_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
-    in_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
+    in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
+    in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
     between, out = _gathered(spline, places), np.empty((*places.shape[:2], 3), np.uint8)
-    in_bands(lambda first, end: _round(between, out, first, end), len(places))
+    in_row_bands(lambda first, end: _round(between, out, first, end), len(places))
     return out
 
 
 def _gathered(source: NDArray[np.float32], places: Places) -> Light:
     out = np.empty((*places.shape[:2], 3), np.float32)
-    in_bands(lambda first, end: _gather(source, places, out, first, end), len(places))
+    in_row_bands(lambda first, end: _gather(source, places, out, first, end), len(places))
     return out
 
 
@@ -56,7 +56,7 @@ def meet(depth: NDArray[np.float32], places: Places, shift_px_m: Places) -> Plac
         shift_px_m: f p.
     """
     out, nearness = np.empty_like(places), np.reciprocal(depth)
-    in_bands(lambda first, end: _meet(nearness, places, shift_px_m, out, first, end), len(places))
+    in_row_bands(lambda first, end: _meet(nearness, places, shift_px_m, out, first, end), len(places))
     return out
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.config import Imaging, Scenario
-from twin.imaging.bands import in_bands
+from twin.core.records import Image
 from twin.imaging.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
-from twin.records import Image
+from twin.imaging.row_parallel import in_row_bands
+from twin.scenario.model import ImagingConfig, Scenario
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -74,7 +74,7 @@ class Setting(NamedTuple):
 
 
 class PlainSensor:
-    """Sensor of both eyes: exposes at once, to any gain, with the noise of `[imaging]`."""
+    """Sensor of both cameras: exposes at once, to any gain, with the noise of `[imaging]`."""
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
@@ -96,7 +96,7 @@ class PlainSensor:
         return expose(light, setting.gain, noiseless, np.random.default_rng(0))
 
 
-def expose(radiance: Radiance, gain: float, imaging: Imaging, rng: np.random.Generator) -> Image:
+def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
     """An 8-bit image of the light: variance of the noise is read^2 + shot^2 * signal, all as shares of full scale.
 
     Args:
@@ -110,7 +110,7 @@ def expose(radiance: Radiance, gain: float, imaging: Imaging, rng: np.random.Gen
     light, filled = np.ascontiguousarray(radiance).reshape(rows, -1), image.reshape(rows, -1)
     numbers = np.float32(gain), np.float32(imaging.noise_sd**2), np.float32(imaging.shot_noise**2)
     seed, normal = seed_of(rng), normal_numbers()
-    in_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
+    in_row_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
     return image
 
 

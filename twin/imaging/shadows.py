@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.imaging.bands import in_bands
+from twin.core import geometry
+from twin.core.records import StereoRig
 from twin.imaging.optics import Depth, Lit
-from twin.records import StereoRig
+from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 
@@ -71,8 +71,8 @@ class Shadows:
         floor, west, south, spacing = self._grid[:3], *self._grid[3:]
         pose = np.ascontiguousarray(world_from_eye)
         scene = *floor, west, south, spacing, depth, self._rig.focal_px, pose, lamps, lattice
-        in_bands(lambda first, end: _look_at_lattice(*scene, first, end), rows + 1)
-        in_bands(lambda first, end: _look_between(*scene, out, first, end), rows)
+        in_row_bands(lambda first, end: _look_at_lattice(*scene, first, end), rows + 1)
+        in_row_bands(lambda first, end: _look_between(*scene, out, first, end), rows)
         return out
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.imaging.bands import in_bands
+from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -42,7 +42,7 @@ def smear(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
-    in_bands(lambda first, end: _smear(flat, depth, focal, motion, open_s, out, first, end), len(light))
+    in_row_bands(lambda first, end: _smear(flat, depth, focal, motion, open_s, out, first, end), len(light))
     return out
 
 
@@ -54,7 +54,7 @@ def roll(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     focal, whole_s = np.float32(focal_px), np.float32(readout_s)
-    in_bands(lambda first, end: _roll(light, depth, focal, motion, whole_s, out, first, end), len(light))
+    in_row_bands(lambda first, end: _roll(light, depth, focal, motion, whole_s, out, first, end), len(light))
     return out
 
 

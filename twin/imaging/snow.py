@@ -1,7 +1,7 @@
 """Marine snow: small white particles that drift with the current through the light of the lamps.
 
 They fill a box around the left camera that repeats itself: a particle that leaves it on one side, as the vehicle moves
-on, comes back on the other. So they are the same in both eyes and from frame to frame. A particle of diameter D at
+on, comes back on the other. So they are the same in both cameras and from frame to frame. A particle of diameter D at
 depth z is a Lambertian disc that covers pi/4 (f D / z)^2 of the image, whatever it is blurred to: by one pixel of the
 lens and, as the lens is focused far off, by its pupil A to f A / z.
 """
@@ -14,11 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import config, geometry
+from twin.core import geometry
+from twin.core.records import StereoRig
 from twin.imaging.lamps import Lights, beam_share
 from twin.imaging.optics import LAMP_RADIUS_M, Depth, Radiance
 from twin.imaging.water import Medium
-from twin.records import StereoRig
+from twin.scenario.model import SnowConfig
 
 Array = NDArray[np.float64]
 
@@ -41,13 +42,13 @@ class Snow:
 
     Args:
         current_mps: (3,) that carries them.
-        lights: of the left and of the right eye.
+        lights: of the left and of the right camera.
         rng: stream that places them.
     """
 
     def __init__(
         self,
-        snow: config.Snow,
+        snow: SnowConfig,
         current_mps: Array,
         rig: StereoRig,
         water: Medium,

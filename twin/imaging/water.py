@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Water
 from twin.errors import TwinError
+from twin.scenario.model import WaterConfig
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Medium(NamedTuple):
         return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
 
-def medium(water: Water) -> Medium:
+def medium(water: WaterConfig) -> Medium:
     """The water of a scenario; `turbidity` multiplies its scattering.
 
     Raises:
@@ -70,7 +70,7 @@ def medium(water: Water) -> Medium:
     return Medium(absorption, scattering * water.turbidity, water.mean_cosine, water.kept_share)
 
 
-def _spectrum(water: Water) -> tuple[Array, Array]:
+def _spectrum(water: WaterConfig) -> tuple[Array, Array]:
     """Absorption and scattering (3,) [1/m]."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]

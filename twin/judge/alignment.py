@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.judge.numbers import number, rms
+from twin.core import geometry
+from twin.core.records import Alignment, Array, SurveyResult, Truth
+from twin.judge.summary_statistics import number, rms
 from twin.judge.trajectory import anchor, path_errors
-from twin.records import Alignment, Array, SurveyResult, Truth
 
 #: The far end of a track: as planned, at least this share of its greatest distance from the survey's start.
 FAR_SHARE = 0.9
@@ -20,7 +20,7 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     """`tracks[]` of metrics.json, a row for each alignment at the end of a track.
 
     `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`; an alignment beyond them (the truly global one at the
-    end) has no row. Their n positions are those of the last n key points up to the end of the track (all of
+    end) has no row. Their n positions are those of the last n keyframes up to the end of the track (all of
     them, or those of the moving window), anchored at the first true pose like the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
@@ -31,11 +31,11 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
 def _row(
     alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth, error_m: Array
 ) -> dict[str, Any]:
-    frames = result.key_frames[result.track_of_key <= alignment.track]
+    frames = result.keyframe_rows[result.track_of_keyframe <= alignment.track]
     return {
         "track": int(alignment.track),
-        "before_ga_rmse_m": _key_point_rmse(before, frames, result, truth),
-        "after_ga_rmse_m": _key_point_rmse(after, frames, result, truth),
+        "before_ga_rmse_m": _keyframe_rmse(before, frames, result, truth),
+        "after_ga_rmse_m": _keyframe_rmse(after, frames, result, truth),
         "farthest_error_m": farthest_error_m(alignment.track, error_m, truth),
         "ga_ms": number(alignment.ms),
         "nodes": int(alignment.nodes),
@@ -56,8 +56,8 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     return rms(error_m[frames[distance_m >= FAR_SHARE * distance_m.max()]])
 
 
-def _key_point_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """RMSE of the last key points of `frames` whose positions (n, 3) are given [m]."""
+def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
+    """RMSE of the last keyframes of `frames` whose positions (n, 3) are given [m]."""
     n = min(len(positions), len(frames))
     if n == 0:
         return None

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from twin.core.records import Array, ElevationMap, SurveyResult, Truth
 from twin.judge.map_error import normalised_error
-from twin.judge.numbers import mean
+from twin.judge.summary_statistics import mean
 from twin.judge.trajectory import anchor
-from twin.records import Array, ElevationMap, SurveyResult, Truth
 
 
 def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """`consistency.*` of metrics.json: mean NEES of positions (3 if right), shares within two sigma (0.954 if normal).
 
-    `within_2sigma_position` counts every camera axis of every key point, `within_2sigma_map` every estimated cell.
+    `within_2sigma_position` counts every camera axis of every keyframe, `within_2sigma_map` every estimated cell.
     """
-    error, cov = key_point_errors(result, truth)
+    error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
     return {
@@ -25,13 +25,13 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
     }
 
 
-def key_point_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
-    """Position errors (n, 3) [m] of the final key points and their covariances (n, 3, 3) [m2], both in camera axes.
+def keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
+    """Position errors (n, 3) [m] of the final keyframes and their covariances (n, 3, 3) [m2], both in camera axes.
 
-    The first key point is anchored at the truth and left out, as is one without a positive definite covariance.
+    The first keyframe is anchored at the truth and left out, as is one without a positive definite covariance.
     """
-    n = min(len(result.key_frames), len(result.node_cov))
-    frames = result.key_frames[1:n]
+    n = min(len(result.keyframe_rows), len(result.node_cov))
+    frames = result.keyframe_rows[1:n]
     if len(frames) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3, 3))
     final, true = result.final.world_from_camera, truth.trajectory.world_from_camera

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.judge.numbers import rms
-from twin.judge.path import travel_direction
-from twin.records import Array, Truth
+from twin.core.records import Array, Truth
+from twin.judge.summary_statistics import rms
+from twin.judge.swaths import travel_direction
 
 
 def control_metrics(truth: Truth) -> dict[str, float | None]:

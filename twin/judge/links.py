@@ -1,4 +1,4 @@
-"""The measured motions between key points against the truth, beside the closed form that each started from."""
+"""The measured motions between keyframes against the truth, beside the closed form that each started from."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import geometry
+from twin.core import geometry
+from twin.core.links import Links
+from twin.core.records import Array, SurveyResult, Truth
 from twin.judge.consistency import nees
-from twin.judge.numbers import mean, rms
-from twin.links import Links
-from twin.records import Array, SurveyResult, Truth
+from twin.judge.summary_statistics import mean, rms
 
 #: A link "along" reaches back to one of the two nodes before (the paper's), one "across" farther: to the longest base
 #: on the same swath, to neighbouring swaths, to where loops began.
@@ -23,7 +23,7 @@ def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
     """`links` of metrics.json: errors of the motions along and across, and how many frame-to-frame motions stand in."""
     measured = result.links.kept(result.links.n_points > 0)
     near = steps_back(measured, node_numbers(result.links)) <= ALONG_NODES
-    true = truth.trajectory.world_from_camera[result.key_frames]
+    true = truth.trajectory.world_from_camera[result.keyframe_rows]
     return {
         "along": _figures(measured.kept(near), true),
         "across": _figures(measured.kept(~near), true),
@@ -32,7 +32,7 @@ def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
 
 
 def node_numbers(links: Links) -> NDArray[np.int64]:
-    """Numbers of the key points that links join, in their order."""
+    """Numbers of the keyframes that links join, in their order."""
     return np.unique(np.concatenate([links.i, links.j]))
 
 
@@ -41,14 +41,14 @@ def steps_back(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.searchsorted(nodes, links.j) - np.searchsorted(nodes, links.i)
 
 
-def motion_errors(links: Links, estimates: Array, world_from_key: Array) -> Array:
+def motion_errors(links: Links, estimates: Array, world_from_keyframe: Array) -> Array:
     """(n, 6) twist [rotation, translation] (rad, m) in j from the true to the estimated pose of j in i.
 
     Args:
         estimates: (n, 4, 4) of each link.
-        world_from_key: (n_keys, 4, 4) true poses of the key points.
+        world_from_keyframe: (n_keyframes, 4, 4) true poses of the keyframes.
     """
-    return _motion_errors(world_from_key[links.i], world_from_key[links.j], np.ascontiguousarray(estimates))
+    return _motion_errors(world_from_keyframe[links.i], world_from_keyframe[links.j], np.ascontiguousarray(estimates))
 
 
 @njit(cache=True, nogil=True)
@@ -60,11 +60,11 @@ def _motion_errors(true_i, true_j, estimates):
     return errors
 
 
-def _figures(links: Links, world_from_key: Array) -> dict[str, float | int | None]:
+def _figures(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
     """Count, RMS errors and mean NEES (6 if right) of links; RMS errors of the closed form of those that have one."""
-    errors = motion_errors(links, links.i_from_j, world_from_key)
+    errors = motion_errors(links, links.i_from_j, world_from_keyframe)
     closed, motions = links.by_closed_form
-    closed_errors = motion_errors(links.kept(closed), motions, world_from_key)
+    closed_errors = motion_errors(links.kept(closed), motions, world_from_keyframe)
     return {
         "count": len(links),
         **_rmse(errors),

@@ -1,11 +1,11 @@
-"""How far the elevation map is from the true floor, over the cells that a key point truly saw."""
+"""How far the elevation map is from the true floor, over the cells that a keyframe truly saw."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from twin.judge.numbers import mean, number, percentile, rms
-from twin.records import Array, ElevationMap, Truth
+from twin.core.records import Array, ElevationMap, Truth
+from twin.judge.summary_statistics import mean, number, percentile, rms
 
 KEYS = ("cell_m", "completeness", "bias_m", "rmse_m", "nmad_m", "p85_m", "le90_m", "le95_m", "max_m", "sigma_ratio")
 

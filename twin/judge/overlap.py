@@ -1,6 +1,6 @@
 """The overlap the survey truly had, from true poses and the true floor.
 
-The footprint of a key point is a level rectangle at the height of the floor under it: width W depth / f across the bow
+The footprint of a keyframe is a level rectangle at the height of the floor under it: width W depth / f across the bow
 and H depth / f along it, where depth is the camera's height above the mean floor of that very rectangle. Tilt and
 relief inside the footprint are left out.
 """
@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from twin import geometry
-from twin.judge.numbers import number, percentile
-from twin.judge.path import swath_numbers, travel_direction
-from twin.records import Array, MapGrid, StereoRig, SurveyResult, Truth
+from twin.core import geometry
+from twin.core.records import Array, MapGrid, StereoRig, SurveyResult, Truth
+from twin.judge.summary_statistics import number, percentile
+from twin.judge.swaths import swath_numbers, travel_direction
 
 
 class Footprints(NamedTuple):
-    """Of n key points.
+    """Of n keyframes.
 
     Args:
         centre_m: (n, 2) position [m].
@@ -42,10 +42,10 @@ def overlap_metrics(
 ) -> dict[str, float | None]:
     """`overlap.*` of metrics.json; `planned` holds pattern, overlap_along and overlap_across of the plan.
 
-    Along: shared area of consecutive key points of one swath (a leg, a loop). Across: sidelap, the area shared with the
-    nearest key point of the next swath, were it abeam.
+    Along: shared area of consecutive keyframes of one swath (a leg, a loop). Across: sidelap, the area shared with the
+    nearest keyframe of the next swath, were it abeam.
     """
-    prints = footprints(result.key_frames, truth, rig, grid, planned.get("pattern", "lawnmower"))
+    prints = footprints(result.keyframe_rows, truth, rig, grid, planned.get("pattern", "lawnmower"))
     along, across = along_overlap(prints), across_overlap(prints)
     return {
         "along_planned": number(planned.get("overlap_along")),
@@ -57,15 +57,15 @@ def overlap_metrics(
 
 
 def footprints(
-    key_frames: NDArray[np.int64], truth: Truth, rig: StereoRig, grid: MapGrid | None, pattern: str = "lawnmower"
+    keyframe_rows: NDArray[np.int64], truth: Truth, rig: StereoRig, grid: MapGrid | None, pattern: str = "lawnmower"
 ) -> Footprints:
-    """True footprints of the key points of a survey of this pattern."""
-    pose = truth.trajectory.world_from_camera[key_frames]
+    """True footprints of the keyframes of a survey of this pattern."""
+    pose = truth.trajectory.world_from_camera[keyframe_rows]
     heading = geometry.heading_of_camera(pose)
     bow = np.column_stack([np.cos(heading), np.sin(heading)])
     whole = float(np.nanmean(truth.height_m)) if np.isfinite(truth.height_m).any() else np.nan
     depth = np.array([mean_depth(p[:3, 3], truth.height_m, whole, grid, rig) for p in pose])
-    travel, swath = travel_direction(truth.reference)[key_frames], swath_numbers(truth, pattern)[key_frames]
+    travel, swath = travel_direction(truth.reference)[keyframe_rows], swath_numbers(truth, pattern)[keyframe_rows]
     scale = depth / rig.focal_px
     return Footprints(pose[:, :2, 3], bow, travel, rig.width_px * scale, rig.height_px * scale, swath)
 
@@ -93,13 +93,13 @@ def _window(height_m: NDArray[np.float32], grid: MapGrid, position: Array, half_
 
 
 def along_overlap(prints: Footprints) -> Array:
-    """(m,) shared share of the area of consecutive key points that are on the same swath."""
+    """(m,) shared share of the area of consecutive keyframes that are on the same swath."""
     first = np.flatnonzero((prints.swath[:-1] == prints.swath[1:]) & (prints.swath[1:] >= 0))
     return _shared(prints, first, first + 1, prints.centre_m[first + 1] - prints.centre_m[first])
 
 
 def across_overlap(prints: Footprints) -> Array:
-    """(m,) shared share of the area of each key point with the nearest one of the next swath, were it abeam.
+    """(m,) shared share of the area of each keyframe with the nearest one of the next swath, were it abeam.
 
     Where legs run along the bow this is the shared width.
     """
@@ -113,7 +113,7 @@ def across_overlap(prints: Footprints) -> Array:
 
 
 def _neighbours(prints: Footprints, swath: int) -> NDArray[np.int64]:
-    """(2, m) key points of a swath and, for each, the nearest key point of the next swath."""
+    """(2, m) keyframes of a swath and, for each, the nearest keyframe of the next swath."""
     here, there = np.flatnonzero(prints.swath == swath), np.flatnonzero(prints.swath == swath + 1)
     if len(here) == 0 or len(there) == 0:
         return np.zeros((2, 0), dtype=np.int64)

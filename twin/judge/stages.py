@@ -1,4 +1,4 @@
-"""What each stage of positioning bought: the error of the same key points after one stage and after the next."""
+"""What each stage of positioning bought: the error of the same keyframes after one stage and after the next."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.links import Links
+from twin.core.records import Array, SurveyResult, Trajectory, Truth
 from twin.judge.links import node_numbers, steps_back
-from twin.judge.numbers import number, rms
+from twin.judge.summary_statistics import number, rms
 from twin.judge.trajectory import path_errors
-from twin.links import Links
-from twin.records import Array, SurveyResult, Trajectory, Truth
 
 #: In the order in which they correct one another.
 STAGES = ("f2f", "chain", "online", "final")
@@ -35,7 +35,7 @@ class StageRow(NamedTuple):
 def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, float | None]]:
     """`stages` of metrics.json: position errors of the network's nodes after each stage, anchored at the first node."""
     nodes = node_numbers(result.links)
-    frames = result.key_frames[nodes]
+    frames = result.keyframe_rows[nodes]
     paths = {name: getattr(result, name).world_from_camera[frames] for name in ("f2f", "online", "final")}
     paths["chain"] = compose_chain(result.links, nodes)
     true = Trajectory(truth.trajectory.times_s[frames], truth.trajectory.world_from_camera[frames])
@@ -79,7 +79,7 @@ def _uses(stage: str, scenario: Mapping[str, Any]) -> str:
     online = ["chain", *(["mosaic (F2M)"] if on["F2M"] else []), *aiding, *(["GA so far"] if on["GA"] else [])]
     return {
         "f2f": "flow from frame to frame",
-        "chain": "stereo pairs of consecutive key points",
+        "chain": "stereo pairs of consecutive keyframes",
         "online": ", ".join(online),
         "final": ", ".join(["all links", *aiding]) if on["GA"] else "as online",
     }[stage]

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin import geometry
-from twin.judge.numbers import number, rms
-from twin.records import Array, Trajectory
+from twin.core import geometry
+from twin.core.records import Array, Trajectory
+from twin.judge.summary_statistics import number, rms
 
 
 class PathErrors(NamedTuple):

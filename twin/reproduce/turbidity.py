@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.config import Scenario
+from twin.app.look import figures, look
+from twin.core.records import Image, StereoRig
 from twin.imaging.forward_scatter import ForwardScatter
 from twin.imaging.optics import Optics
 from twin.imaging.water import medium
-from twin.look import figures, look
-from twin.mission import prepare
-from twin.records import Image, StereoRig
 from twin.reproduce.block import block_on_sand
-from twin.scenario_file import load_scenario
+from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
+from twin.world.mission import prepare
 
 Array = NDArray[np.float64]
 

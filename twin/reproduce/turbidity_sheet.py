@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from twin.imaging.water import medium
-from twin.judge.style import FIGURE_STYLE
+from twin.report.style import FIGURE_STYLE
 from twin.reproduce.turbidity import JERLOV, RANGES_M, VISIBLE, Level
 
 BANDS = (("red", "#d55e00"), ("green", "#009e73"), ("blue", "#0072b2"))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from controllers.allocation import allocation
 from controllers.tracking import HullModel, Pilot
 from scenes.bluerov2 import BLUEROV2_HEAVY
-from twin import config
+from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import hull_of
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
@@ -18,14 +18,14 @@ Array = NDArray[np.float64]
 
 def nominal_pilot(natural_frequency_radps: float, frame_rate_hz: float) -> Pilot:
     """A pilot that believes the published hull and thrusters, and commands once a frame."""
-    hull = hull_of(config.Vehicle.model_validate({}))
+    hull = hull_of(VehicleConfig.model_validate({}))
     believed = HullModel(hull.inertia + hull.added, hull.added[3:], hull.linear_drag, hull.quadratic_drag)
     effects = angular_first(BLUEROV2_HEAVY.allocation)
     shares = allocation(effects, _thrust_n)
     return Pilot(believed, shares, natural_frequency_radps, 1 / frame_rate_hz)
 
 
-def top_speed_mps(vehicle: config.Vehicle, direction: Array) -> float:
+def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     """Steady speed along a unit direction (3,) of the body in still water at which a thruster gives its all [m/s].
 
     Drag takes linear v + quadratic v |v| along each axis, so the thrust of each thruster is p v + q v^2.

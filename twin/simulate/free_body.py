@@ -13,8 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
-from twin import config, geometry
+from twin.core import geometry
 from twin.errors import SurveyAborted
+from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_of_free_joint
 from twin.simulate.thrusters import LaggedThrusters, Thrusters, pass_step, set_command, wrench_of
@@ -55,7 +56,7 @@ class FreeBody:
         timestep_s: of the physics.
     """
 
-    def __init__(self, vehicle: config.Vehicle, current_mps: Array, world_from_body: Array, timestep_s: float):
+    def __init__(self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float):
         thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s).parts
         self.body = Body(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters, hull_of(vehicle),

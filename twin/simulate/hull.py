@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
-from twin import config
+from twin.scenario.model import VehicleConfig
 from twin.simulate.hydrodynamics import Hull, angular_first
 
 COARSEST_STEP_S = 1 / 120
@@ -20,7 +20,7 @@ def physics_timestep_s(frame_rate_hz: float) -> float:
     return 1 / (frame_rate_hz * math.ceil(1 / (frame_rate_hz * COARSEST_STEP_S) - 1e-9))
 
 
-def hull_of(vehicle: config.Vehicle) -> Hull:
+def hull_of(vehicle: VehicleConfig) -> Hull:
     """The trimmed hull of a scenario."""
     rov = BLUEROV2_HEAVY
     weight_n = rov.mass_kg * GRAVITY_MPS2

@@ -10,9 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.config import Navigation
-from twin.records import Readings, SensorNoise, Sighting, StereoRig
+from twin.core import geometry
+from twin.core.records import Readings, SensorNoise, Sighting, StereoRig
+from twin.scenario.model import NavigationConfig
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -32,7 +32,7 @@ class NavigationSensors:
 
     def __init__(
         self,
-        settings: Navigation,
+        settings: NavigationConfig,
         noise: SensorNoise,
         rig: StereoRig,
         rng: Mapping[str, np.random.Generator],
@@ -51,7 +51,7 @@ class NavigationSensors:
         Args:
             world_from_body: (4, 4) true pose.
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
-            depth_m: gives the true depth (height, width) of the left image at a key point; else None.
+            depth_m: gives the true depth (height, width) of the left image at a keyframe; else None.
         """
         readings = read_sensors(
             world_from_body, self._rig.body_from_camera, self._noise, self._aiding, self._rng["navigation"]
@@ -167,14 +167,14 @@ def _logged(velocity_mps, gain, sigma_mps, numbers):
 
 
 class AcousticFix:
-    """USBL: a position now and then. The key points trigger it, so that a fix belongs to a stereo pair's instant."""
+    """USBL: a position now and then. The keyframes trigger it, so that a fix belongs to a stereo pair's instant."""
 
     def __init__(self, noise: SensorNoise, interval_s: float, rng: np.random.Generator):
         self._sigma_m, self._interval_s, self._rng = noise.usbl_m, interval_s, rng
         self._next_s = 0.0
 
     def read(self, time_s: float, position_m: Array) -> Array | None:
-        """The fix (3,) at a key point where the true position is this (3,) [m]; None where none is due yet."""
+        """The fix (3,) at a keyframe where the true position is this (3,) [m]; None where none is due yet."""
         if time_s < self._next_s - 1e-9:
             return None
         self._next_s = time_s + self._interval_s

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from scenes.bluerov2 import Vehicle as Vessel
-from twin import geometry
+from twin.core import geometry
 from twin.simulate.hydrodynamics import angular_first
 
 Array = NDArray[np.float64]

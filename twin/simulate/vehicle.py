@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from scenes.gl import MjModel, mujoco
-from twin import config, geometry
+from twin.core import geometry
 from twin.errors import SurveyAborted
+from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, hull_of
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_of_free_joint
 from twin.simulate.thrusters import LaggedThrusters
@@ -39,7 +40,7 @@ class Vehicle:
         world_from_body: (4, 4) pose at the start, at rest.
     """
 
-    def __init__(self, world: HasModel, vehicle: config.Vehicle, current_mps: Array, world_from_body: Array):
+    def __init__(self, world: HasModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
         self._model, self._data = world.model, mujoco.MjData(world.model)
         self._hull, self._current = hull_of(vehicle), np.array(current_mps, dtype=float)
         self._body = self._model.body("vehicle").id

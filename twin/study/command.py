@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
-from twin import console
+from twin.app import console
 from twin.errors import TwinError
 from twin.study import campaign, findings, tuning, tuning_report, wording
 from twin.study.campaign import Ended

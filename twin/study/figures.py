@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 
-from twin.judge.figures import WIDTH_IN, to_data_uri
-from twin.judge.style import COLOURS, FIGURE_STYLE
+from twin.report.figures import WIDTH_IN, to_data_uri
+from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.study import statistics
 from twin.study.findings import Findings, Influence, Level
 from twin.study.statistics import Array, Interval

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from twin.config import Scenario
 from twin.errors import ScenarioError, TwinError
+from twin.scenario.model import Scenario
 from twin.study.surveys import Survey
 
 Row = dict[str, Any]
@@ -22,7 +22,7 @@ SHOWN = {"none": None, "metrics": None, "report": ("report",), "all": ("report",
 
 def check(scenario: Scenario) -> list[str]:
     """What stands in the way of flying this scenario."""
-    from twin.mission import prepare
+    from twin.world.mission import prepare
 
     try:
         prepare(scenario)

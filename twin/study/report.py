@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.judge.page import render_page
+from twin.report.html import render_page
 from twin.study import wording
 from twin.study.figures import draw_all
 from twin.study.findings import Findings

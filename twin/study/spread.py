@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri
 
-from twin.config import Section
+from twin.scenario.model import Section
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]

@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
-from twin.config import Section, Source
 from twin.errors import ScenarioError, TwinError
 from twin.judge.metrics import unflown
 from twin.judge.require import check_names
-from twin.scenario_file import find_scene, load_scenario, read_toml, validated
+from twin.scenario.file import find_scene, load_scenario, read_toml, validated
+from twin.scenario.model import Section, Source
 from twin.study.spread import KINDS, Spread
 
 METHODS = Literal["random", "lhs", "sobol", "saltelli", "grid"]

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.config import Scenario, Source
 from twin.errors import ScenarioError, TwinError
-from twin.scenario_file import read_tree, with_values
+from twin.scenario.file import read_tree, with_values
+from twin.scenario.model import Scenario, Source
 from twin.study.design import Sample, samples, seeds
 from twin.study.study_file import Study, named_keys
 

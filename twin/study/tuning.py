@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twin.config import Scenario
 from twin.errors import ScenarioError, TwinError
 from twin.judge.require import more_is_better
-from twin.scenario_file import read_tree
+from twin.scenario.file import read_tree
+from twin.scenario.model import Scenario
 from twin.study.campaign import fly_all, open_folder
 from twin.study.design import Sample, samples
 from twin.study.engine import Engine

@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from twin.judge.figures import to_data_uri
-from twin.judge.page import render_page
-from twin.judge.style import COLOURS, FIGURE_STYLE
-from twin.scenario_file import dump_toml
+from twin.report.figures import to_data_uri
+from twin.report.html import render_page
+from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.scenario.file import dump_toml
 from twin.study import wording
 from twin.study.figures import label_of, log_axis, make_panels, spans_decades, unit_axis
 from twin.study.study_file import Study, Tuning

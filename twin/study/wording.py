@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from twin.judge.require import more_is_better
-from twin.judge.wording import DASH, length
-from twin.judge.wording import plain as number
+from twin.report.wording import DASH, length
+from twin.report.wording import plain as number
 from twin.study.findings import Contrast, Findings
 from twin.study.statistics import LEVEL, Interval
 from twin.study.study_file import Study

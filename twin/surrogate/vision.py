@@ -1,7 +1,7 @@
 """Vision that measures what images would tell: the truth with errors drawn from a calibrated model.
 
 It stands on the left of the wall: it knows the truth and gives out measurements only, each with the covariance that the
-image estimators would claim. A few points of a key point stand for all that would be matched, with their noise scaled
+image estimators would claim. A few points of a keyframe stand for all that would be matched, with their noise scaled
 accordingly, and go through the very equations that the links are solved by; a node's own stereo noise is drawn once and
 enters all its links.
 """
@@ -16,23 +16,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin import geometry
-from twin.config import Estimation
-from twin.estimate import elevation, network, stereo
-from twin.estimate.f2f import MOST_POINTS as F2F_POINTS
-from twin.estimate.f2f import coast
-from twin.estimate.key_points import KeyPoint
-from twin.estimate.mosaic import Registration
-from twin.estimate.motion import Motion
-from twin.estimate.stereo import StereoPoints
-from twin.geometry import Array
-from twin.records import ElevationMap, Frame, Look, MapGrid, StereoRig, SurveyResult
-from twin.surrogate import drawn
-from twin.surrogate.chart import CellErrors, Chart
-from twin.surrogate.conditions import Conditions
-from twin.surrogate.floor import Floor
-from twin.surrogate.model import ErrorModel
-from twin.surrogate.owners import Cells, Owners, cells_of
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, StereoRig, SurveyResult
+from twin.estimate import network
+from twin.estimate.mapping import elevation
+from twin.estimate.vision import stereo
+from twin.estimate.vision.f2f import MOST_POINTS as F2F_POINTS
+from twin.estimate.vision.f2f import coast
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.mosaic import Registration
+from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.two_view_motion import Motion
+from twin.scenario.model import EstimateConfig
+from twin.surrogate import sampling
+from twin.surrogate.error_model import ErrorModel
+from twin.surrogate.floor_rays import Floor
+from twin.surrogate.map_model import CellErrors, Chart
+from twin.surrogate.matchability import Conditions
+from twin.surrogate.mosaic_model import Cells, Owners, cells_of
 
 _RASTER = (6, 8)  # rows and columns of points
 _FIELD = 128  # cells of the floor until what it makes matches err by is the same again
@@ -41,7 +43,7 @@ _BLOCK = 4096  # numbers drawn at a time
 
 
 class _Seen(NamedTuple):
-    """A key point.
+    """A keyframe.
 
     Args:
         pose: true pose (4, 4).
@@ -94,7 +96,7 @@ class SurrogateVision:
     def __init__(
         self,
         rig: StereoRig,
-        settings: Estimation,
+        settings: EstimateConfig,
         model: ErrorModel,
         truth: Callable[[], Array],
         floor: Floor,
@@ -113,10 +115,10 @@ class SurrogateVision:
         self._rays = stereo.normalised(self._pixels, rig)
         self.last_pose: Array | None = None  # true one of the last frame
         self.last_numbers = np.zeros(6)  # that its motion was drawn by
-        self._poses: dict[int, Array] = {}  # true ones of all key points
+        self._poses: dict[int, Array] = {}  # true ones of all keyframes
         self._seen: dict[int, _Seen] = {}  # those that links may be asked for
         self._now: _Seen | None = None
-        self.looks: list[Look] = []
+        self.stereo_observations: list[StereoObservation] = []
         self._f2f: FrameErrors | None = None
         self._last_motion = np.eye(4)
         self._owners = Owners()
@@ -141,22 +143,22 @@ class SurrogateVision:
 
     @property
     def bound_px(self) -> float:
-        """Cramer-Rao bound of a patch's place at the last key point."""
+        """Cramer-Rao bound of a patch's place at the last keyframe."""
         assert self._now is not None
         return self._now.bound_px
 
     @property
     def stand_for(self) -> float:
-        """By how much the points of the last key point are fewer than those they stand for."""
+        """By how much the points of the last keyframe are fewer than those they stand for."""
         assert self._now is not None
         return len(self._now.points) / self._now.n_points
 
     def way_in_depths(self, a_from_b: Array) -> float:
-        """Length of a motion (4, 4) by the depth of the floor under the last key point."""
+        """Length of a motion (4, 4) by the depth of the floor under the last keyframe."""
         assert self._now is not None
         return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._now.points[:, 2]) / self.rig.baseline_m)
 
-    def step(self, frame: Frame) -> tuple[Motion, str]:
+    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         now = self._truth()
         last, self.last_pose = self.last_pose, now
         if last is None:
@@ -164,38 +166,38 @@ class SurrogateVision:
         if self._f2f is None:
             return coast(self._last_motion)
         numbers = self.draw(1)[0]
-        self._last_motion = drawn.moved(self._f2f, last, now, numbers, self.last_numbers)
+        self._last_motion = sampling.moved(self._f2f, last, now, numbers, self.last_numbers)
         self.last_numbers = numbers
         return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
 
     @property
     def following(self) -> FrameErrors | None:
-        """What frames err by since the last key point; None where nothing can be followed."""
+        """What frames err by since the last keyframe; None where nothing can be followed."""
         return self._f2f
 
-    def look(self, frame: Frame, row: int) -> StereoPoints | None:
+    def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         self._f2f = None  # until `restart`: where stereo finds nothing, there is nothing to follow
         with self.watch("stereo"):
             pose, model = self._truth(), self.model
             self.chart.see(pose)
             depth_m = self.floor.depth_at(self._pixels, pose, self.rig)
             met = np.flatnonzero(depth_m < np.inf)
-            if len(met) < drawn.LEAST_POINTS:
-                self.looks.append(Look(row, 0, None))
+            if len(met) < sampling.LEAST_POINTS:
+                self.stereo_observations.append(StereoObservation(row, 0, None))
                 return None
             mean_m = float(depth_m[met].mean())
             bound_px = self._conditions.bound_px(mean_m)
             n_points = len(met) / len(self._rays) * model.points(bound_px) * self.settings.points
-            self.looks.append(Look(row, int(n_points), None))
+            self.stereo_observations.append(StereoObservation(row, int(n_points), None))
             met = met[self._shown(met, depth_m)]
-            if n_points < _LEAST_POINTS or len(met) < drawn.LEAST_POINTS:
+            if n_points < _LEAST_POINTS or len(met) < sampling.LEAST_POINTS:
                 return None
             depth_m = depth_m[met]
             truth = np.column_stack([self._rays[met], self.rig.baseline_m / depth_m])
             n = len(truth)
             place = model.place_px(bound_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
-            unit = drawn.unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
+            unit = sampling.unit_motion(truth, self.rig.baseline_m, float(F2F_POINTS))
             cells = cells_of(pose, truth, self.rig.baseline_m)
             uneven_px = self._conditions.uneven_px(mean_m)
             self._now = _Seen(pose, truth, met, noise, bound_px, uneven_px, n_points, *unit, cells)
@@ -206,14 +208,14 @@ class SurrogateVision:
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz)
 
     def _shown(self, rows: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Which of these points of the raster, whose depths are `depth_m[rows]`, both eyes see well inside."""
+        """Which of these points of the raster, whose depths are `depth_m[rows]`, both cameras see well inside."""
         shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[rows]
         left_px, right_px = self._pixels[rows], self._pixels[rows]
         right_px[:, 0] -= shift_px
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
         return in_left & in_right
 
-    def restart(self) -> None:
+    def restart_tracking(self) -> None:
         assert self._now is not None
         model = self.model
         root, cov = self._motion_errors(model.f2f_px(self._now.bound_px))
@@ -226,37 +228,37 @@ class SurrogateVision:
         sigma = sigma_px / self.rig.focal_px
         return self._now.unit_root * sigma, self._now.unit_cov * sigma**2
 
-    def register(self, world_from_camera: Array) -> Registration | None:
+    def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
         assert self._now is not None
         now = self._now.pose
         shares = self._owners.shares(self._now.cells)
         if shares is None:
             return None
         true = np.array([self._poses[number] for number in shares.numbers])
-        offset = drawn.mosaic_offset(shares.believed, true, shares.parts, now, world_from_camera)
+        offset = sampling.mosaic_offset(shares.believed, true, shares.parts, now, world_from_camera)
         root, cov = self._motion_errors(self.model.mosaic_px(self._now.bound_px))
         error = root @ self.draw(1)[0] * self.model.mosaic_excess
         found = Motion(geometry.exp(offset + error), cov, len(self._now.points), 1.0)
         return Registration(found, shares.numbers[int(np.searchsorted(np.cumsum(shares.parts), 0.5))])
 
-    def lay(self, number: int, world_from_camera: Array) -> None:
+    def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
         assert self._now is not None
         self._poses[number], self._seen[number] = self._now.pose, self._now
         self._owners.lay(number, world_from_camera, self._now.cells)
 
-    def relay(self, keys: Sequence[KeyPoint]) -> None:
+    def rebuild_mosaic(self, keys: Sequence[Keyframe]) -> None:
         self._owners.clear()
         for key in keys:
             self._owners.lay(key.number, key.world_from_camera, self._seen[key.number].cells)
 
-    def measure(self, node: KeyPoint, others: Sequence[KeyPoint]) -> list[Motion | None]:
+    def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
         return self.links(node, others, self.model)
 
-    def forget(self, numbers: range) -> None:
+    def discard(self, numbers: range) -> None:
         for number in numbers:
             self._seen.pop(number, None)
 
-    def links(self, node: KeyPoint, others: Sequence[KeyPoint], model: ErrorModel) -> list[Motion | None]:
+    def links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
         """What `measure` answers by this model."""
         with self.watch("network"):
             assert self._now is not None
@@ -264,7 +266,7 @@ class SurrogateVision:
             return [self._link(here, self._seen[k.number], node.number, k.number, model) for k in others]
 
     def _link(self, here: _Seen, there: _Seen, number: int, other: int, model: ErrorModel) -> Motion | None:
-        """The motion between two key points: one step of its equations from the truth, on noisy points.
+        """The motion between two keyframes: one step of its equations from the truth, on noisy points.
 
         Its numbers are its own, whichever link is measured first.
         """
@@ -274,14 +276,18 @@ class SurrogateVision:
         place = model.place_px(bound_px) * fewer
         excess = model.place_excess * np.hypot(1, model.lamps * self.lamp_share)
         numbers = self._numbers_of(number, other, n + 1)
-        in_view, motion, cov = drawn.link(
+        in_view, motion, cov = sampling.link(
             here.points, here.noise.reshape(-1, 3)[here.met], there.noise, self._relief, numbers, there.pose, here.pose,
             self._camera, self._unit_cov * place**2, self._unit_root * (place * excess), model.steady,
             model.relief * here.uneven_px / self.rig.focal_px * fewer, model.common_px / self.rig.focal_px, model.apart,
             network.COMMON_PX / self.rig.focal_px, model.correlation,
         )  # fmt: skip
         n_matched = int(in_view / n * here.n_points * model.matched(bound_px))
-        if in_view < drawn.LEAST_POINTS or n_matched < _LEAST_POINTS or model.matched(bound_px) < network.LEAST_SHARE:
+        if (
+            in_view < sampling.LEAST_POINTS
+            or n_matched < _LEAST_POINTS
+            or model.matched(bound_px) < network.LEAST_SHARE
+        ):
             return None
         return Motion(motion, cov, n_matched, 1.0)
 
@@ -292,12 +298,12 @@ class SurrogateVision:
             self._own.bit_generator.state = begin
             return self._own.standard_normal((n, 3))
 
-    def map(
+    def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         model, mapper, shape = self.model, elevation.ElevationMapper(grid), (grid.rows, grid.cols)
         shared, lost = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
-        believed = result.final.world_from_camera[result.key_frames]
+        believed = result.final.world_from_camera[result.keyframe_rows]
         true = [self._poses[k] for k in range(len(believed))]
         depths_m, bounds_px = self._conditions.depths_m, self._conditions.bounds_px
         depth_px, complete = (np.array([law(b) for b in bounds_px]) for law in (model.depth_px, model.complete))

@@ -1,0 +1,72 @@
+"""Bands of rows: an image does not depend on how many threads make it."""
+
+import types
+
+import numpy as np
+import pytest
+
+from twin.core import geometry
+from twin.imaging import row_parallel
+from twin.imaging.light import Light, Moment
+from twin.scenario.model import Scenario
+
+SCENARIO = Scenario.model_validate(
+    {
+        "rig": {"image_width_px": 160, "image_height_px": 120},
+        "lamps": [{"position_m": (0.25, y, -0.05), "pan_deg": -15 * np.sign(y)} for y in (0.6, -0.6)],
+        "water": {"jerlov": "II"},
+        "imaging": {"shadows": True, "forward_scatter": True},
+    }
+)
+SPIKES = types.SimpleNamespace(
+    height_m=np.random.default_rng(0).uniform(0, 0.3, (81, 81)).astype(np.float32),
+    spacing_m=0.1,
+    west_m=-4.0,
+    south_m=-4.0,
+)
+
+
+@pytest.mark.parametrize(("n_rows", "pixels", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
+def test_bands_are_cut_where_there_are_pixels_enough(monkeypatch, n_rows, pixels, n_bands):
+    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
+    seen = []
+    row_parallel.in_row_bands(lambda *band: seen.append(band), n_rows, pixels)
+    assert len(seen) == n_bands
+
+
+@pytest.mark.parametrize("n_rows", [1, 63, 64, 65, 481])
+def test_every_row_is_worked_on_once(monkeypatch, n_rows):
+    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
+    count = np.zeros(n_rows, int)
+
+    def work(first, end):
+        count[first:end] += 1
+
+    row_parallel.in_row_bands(work, n_rows)
+    assert (count == 1).all()
+
+
+def test_light_is_the_same_with_one_thread_and_with_two(monkeypatch):
+    """To the last bit, with shadows and forward scatter, over a floor as rough as can be."""
+    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+    albedo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    depth = np.random.default_rng(2).uniform(1.7, 2.0, (120, 160)).astype(np.float32)
+    seen = []
+    for processors in (1, 2):
+        monkeypatch.setattr(row_parallel, "_processors", lambda n=processors: n)
+        light = Light(SCENARIO, SPIKES, np.random.default_rng(0))
+        seen += [light.radiance(albedo, depth, eye, Moment(pose, 0.0)) for eye in (0, 1)]
+    np.testing.assert_array_equal(seen[0], seen[2])
+    np.testing.assert_array_equal(seen[1], seen[3])
+
+
+@pytest.mark.parametrize("bad_row", [0, 499])
+def test_a_fault_in_any_band_is_told(monkeypatch, bad_row):
+    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
+
+    def work(first, end):
+        if first <= bad_row < end:
+            raise ValueError(bad_row)
+
+    with pytest.raises(ValueError, match=str(bad_row)):
+        row_parallel.in_row_bands(work, 500)

@@ -1,0 +1,213 @@
+"""The report: self-contained, drawn from the run folder alone, readable for what is unfinished."""
+
+import base64
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+from judge_synthetic import SCENARIO, write_folder
+
+from twin.core.records import Trajectory
+from twin.errors import TwinError
+from twin.judge.budget import budget
+from twin.judge.stages import stage_rows
+from twin.report import figures, wording
+from twin.report.run_folder import load_run
+from twin.report.survey_page import sample_photos, write_report
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("whole") / "run")
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("part") / "run", finished=False)
+
+
+def test_a_run_folder_is_read_back_as_it_was_written(folder):
+    run = load_run(folder)
+    assert run.finished and set(run.trajectories) == {"truth", "f2f", "online", "final", "reference"}
+    assert len(run.network.positions) == len(run.keyframes.frames) == 87
+    assert run.network.edges.max() == 86
+    dem = run.rasters["dem"]
+    assert (dem.grid.west_m, dem.grid.north_m, dem.grid.cell_m) == (-2.5, 1.5, pytest.approx(0.02))
+    assert np.isnan(dem.values[44, 65]) and run.rasters["mosaic"].values.shape == (150, 250, 3)
+    assert run.imaged_frames() == run.keyframes.frames.tolist()
+
+
+def test_the_report_needs_nothing_but_itself(folder):
+    page = write_report(folder).read_text()
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert len(sources) > 8 + 1 + 2
+    assert all(source.startswith("data:image/") for source in sources)
+    assert not re.search(r"https?://|@import|url\(", page)
+    assert len(page) < 5_000_000
+
+
+def test_the_headline_bewares_of_what_metrics_json_warns_of_and_of_nothing_else(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert "Beware" not in wording.headline(metrics | {"warning": ""}, load_run(folder).scenario)
+    warned = wording.headline(metrics | {"warning": "surrogate: too murky"}, load_run(folder).scenario)
+    assert warned.endswith("Beware: surrogate: too murky.")
+
+
+def test_the_report_tells_the_figures_of_metrics_json(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    page = write_report(folder).read_text()
+    assert "The survey is complete" in page and "Jerlov type IB" in page
+    for value in (metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"], metrics["map"]["nmad_m"]):
+        assert wording.length(value) in page
+    for row in metrics["tracks"]:
+        assert f"<td>{wording.length(row['farthest_error_m'])}</td>" in page
+    assert '<td class="good">passed</td>' in page.replace("\n", "")
+    for where in ("along", "across"):
+        assert f"<td>{metrics['links'][where]['count']}</td>" in page
+    for stage in metrics["stages"].values():
+        assert f"<td>{wording.length(stage['ate_rmse_m'])}</td>" in page
+    for (
+        section
+    ) in "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing".split():
+        assert f'<section id="{section}">' in page, section
+
+
+def test_metrics_may_be_handed_in_before_they_are_on_disk(folder, tmp_path):
+    metrics = json.loads((folder / "metrics.json").read_text()) | {"status": "aborted", "reason": "disk <full>"}
+    assert "broke off (disk &lt;full&gt;)" in write_report(folder, metrics).read_text()
+
+
+def test_an_unfinished_run_still_has_a_report_that_says_so(part):
+    page = write_report(part).read_text()
+    assert "unfinished" in page
+    assert '<section id="plan_view">' in page and '<section id="elevation">' not in page
+
+
+def test_a_run_that_has_hardly_begun_still_has_a_report(tmp_path):
+    (tmp_path / "scenario.resolved.toml").write_text('name = "bare <b>"\n')
+    (tmp_path / "trajectory_truth.tum").write_text("")
+    page = write_report(tmp_path).read_text()
+    assert "unfinished" in page and "bare &lt;b&gt;" in page
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("metrics.json", "{broken"),
+        ("dem.tif", "no raster"),
+        ("trajectory_final.tum", "1 2 3\n"),
+        ("posegraph.g2o", "EDGE_SE3:QUAT 0 1\n"),
+        ("scenario.resolved.toml", "= ="),
+    ],
+)
+def test_a_broken_file_is_named(tmp_path, name, text):
+    (tmp_path / "scenario.resolved.toml").write_text("")
+    (tmp_path / name).write_text(text)
+    with pytest.raises(TwinError, match="cannot be read") as caught:
+        load_run(tmp_path)
+    assert caught.value.field.endswith(name)
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path):
+    with pytest.raises(TwinError, match="is no run folder"):
+        load_run(tmp_path)
+
+
+def test_trajectories_survive_the_tum_file(folder):
+    run = load_run(folder)
+    copy = folder / "copy.tum"
+    run.trajectories["f2f"].save(copy)
+    back = Trajectory.load(copy)
+    np.testing.assert_allclose(back.world_from_camera, run.trajectories["f2f"].world_from_camera, atol=1e-8)
+
+
+def test_a_run_judged_before_there_were_stages_and_links_still_has_its_report(folder):
+    metrics = json.loads((folder / "metrics.json").read_text())
+    page = write_report(folder, {k: v for k, v in metrics.items() if k not in ("links", "stages")}).read_text()
+    assert '<section id="network">' in page and '<section id="stages">' not in page and "Eq. (2)" not in page
+
+
+def stages(**errors_m):
+    return {"stages": {stage: {"ate_rmse_m": error_m, "ate_max_m": None} for stage, error_m in errors_m.items()}}
+
+
+def test_a_stage_gains_what_the_one_before_it_was_worse():
+    rows = stage_rows(stages(f2f=0.4, chain=0.04, online=0.08, final=0.001), {})
+    assert [row.gain for row in rows] == [None, pytest.approx(10), pytest.approx(0.5), pytest.approx(80)]
+    assert [wording.better(row.gain) for row in rows] == ["", "10 × better", "2.0 × worse", "80 × better"]
+
+
+def test_a_broken_chain_is_left_out_and_the_next_stage_measured_against_the_one_before():
+    rows = stage_rows(stages(f2f=0.4, chain=None, online=0.1, final=0.0), {})
+    assert [(row.stage, row.gain) for row in rows] == [("f2f", None), ("online", pytest.approx(4)), ("final", None)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "online", "final"),
+    [
+        ({}, "chain, mosaic (F2M), ahrs, GA so far", "all links, ahrs"),
+        ({"use_f2m": False}, "chain, ahrs, GA so far / F2M switched off", "all links, ahrs"),
+        ({"use_ga": False}, "chain, mosaic (F2M), ahrs / GA switched off", "as online / GA switched off"),
+        (
+            {"use_f2m": False, "use_ga": False},
+            "chain, ahrs / F2M and GA switched off",
+            "as online / GA switched off",
+        ),
+    ],
+)
+def test_stages_say_what_they_work_from_and_what_was_switched_off(settings, online, final):
+    scenario = {"navigation": {"aiding": ["ahrs"]}, "estimate": settings}
+    rows = {row.stage: row for row in stage_rows(stages(f2f=1.0, chain=1.0, online=1.0, final=1.0), scenario)}
+    told = {stage: " / ".join(filter(None, [row.uses, row.off])) for stage, row in rows.items()}
+    assert (told["online"], told["final"]) == (online, final)
+    assert rows["f2f"].off == rows["chain"].off == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (None, "–"),
+        (0.00034, "0.34 mm"),
+        (0.0042, "4.2 mm"),
+        (0.0234, "2.3 cm"),
+        (-0.5, "-50.0 cm"),
+        (17.456, "17.46 m"),
+    ],
+)
+def test_lengths_are_told_in_the_unit_that_suits(value, words):
+    assert wording.length(value) == words
+
+
+def test_the_budget_is_the_papers():
+    stages = {"f2f": {"count": 300, "mean_ms": 40.0, "p95_ms": 60.0, "total_s": 12.0}}
+    stages |= {k: {"count": 10, "mean_ms": 30.0, "p95_ms": 30.0, "total_s": 0.3} for k in ("stereo", "f2m", "flow")}
+    rows = {row.what: row for row in budget({"timing": {"stages": stages, "keyframes": 10}}, SCENARIO.model_dump(), 15)}
+    assert rows["frame to frame"].budget_ms == pytest.approx(1000 / 30) and rows["frame to frame"].within is False
+    work = rows["all work at a keyframe"]
+    assert work.budget_ms == pytest.approx(500)  # P26: N / frame rate = 15 / 30 s
+    assert work.mean_ms == pytest.approx(90) and work.within is True
+    assert rows["stereo"].within is None
+
+
+def test_pictures_keep_their_colours(folder):
+    run = load_run(folder)
+    image = cv2.imread(str(run.image_file(0, "left")), cv2.IMREAD_COLOR_RGB)
+    assert image[..., 1].mean() > image[..., 2].mean() > image[..., 0].mean()  # the fixture's tint: green, blue, red
+
+    data = base64.b64decode(sample_photos(run)[0][1].split(",")[1])
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), image.mean(axis=(0, 1)), atol=2)
+
+
+def test_a_wild_height_leaves_the_rest_its_relief():
+    x, y = np.meshgrid(np.linspace(0, 20, 120), np.linspace(0, 15, 90))
+    tame = np.sin(x) * np.cos(y)
+    wild = tame.copy()
+    wild[40, 60] = -50.0
+    drawn, expected = figures._relief(wild, "gray"), figures._relief(tame, "gray")
+    away = np.hypot(*np.ogrid[-40:50, -60:60]) > 2
+    # not equal: the hill shade is stretched to the darkest slope, which is the pit's
+    assert drawn[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
+    assert np.abs(drawn[away] - expected[away]).max() < 0.2

@@ -1,0 +1,65 @@
+"""Faults of a scenario that only show beside its floor are told by line, before anything is flown."""
+
+import pytest
+
+from twin.errors import ScenarioError
+from twin.scenario.file import load_scenario
+from twin.world.mission import prepare
+
+BAD_BEACONS = [
+    (
+        '[navigation]\naiding = ["beacons"]',
+        ["3: navigation.aiding: 'beacons': the scenario has none (allowed: with a [[beacons]] position_m)"],
+    ),
+    (
+        "[[beacons]]\nposition_m = [0, 0, 1]\n[[beacons]]\nposition_m = [5, 1, 1]\n"
+        "[[beacons]]\nposition_m = [1, 1, 0.4]",
+        [
+            "5: beacons.1.position_m: (5, 1) lies outside the terrain (allowed: x -4.50 to 4.50, y -3.50 to 3.50 m)",
+            "7: beacons.2.position_m: z 0.4 lies in the floor (allowed: above 0.500 m)",
+        ],
+    ),
+]
+
+
+BAD_SENSORS = [
+    (
+        "[sensor]\nexposure_min_ms = 20.0",
+        [
+            "3: sensor.exposure_min_ms: 20: longer than the longest exposure"
+            " (allowed: up to sensor.exposure_max_ms = 15)"
+        ],
+    ),
+    (
+        "[sensor]\nexposure_min_ms = 60\nexposure_max_ms = 50\nreadout_ms = 34.0",
+        [
+            "3: sensor.exposure_min_ms: 60: longer than the longest exposure"
+            " (allowed: up to sensor.exposure_max_ms = 50)",
+            "4: sensor.exposure_max_ms: 50: longer than a frame (allowed: up to 33.33 at rig.frame_rate_hz = 30)",
+            "5: sensor.readout_ms: 34: longer than a frame (allowed: up to 33.33 at rig.frame_rate_hz = 30)",
+        ],
+    ),
+    (
+        "[sensor]\n[rig]\nframe_rate_hz = 120.0",
+        ["2: sensor.exposure_max_ms: 15: longer than a frame (allowed: up to 8.33 at rig.frame_rate_hz = 120)"],
+    ),
+]
+
+
+@pytest.mark.parametrize(("text", "faults"), BAD_SENSORS)
+def test_a_sensor_that_cannot_be_is_told_by_line_all_at_once(tmp_path, text, faults):
+    file = tmp_path / "sensor.toml"
+    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
+    with pytest.raises(ScenarioError) as told:
+        prepare(load_scenario(file))
+    assert told.value.lines == [f"{file}:{fault}" for fault in faults]
+
+
+@pytest.mark.parametrize(("text", "faults"), BAD_BEACONS)
+def test_beacons_that_cannot_be_are_told_by_line_all_at_once(tmp_path, text, faults):
+    file = tmp_path / "beacons.toml"
+    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
+    flat = ["terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.5"]
+    with pytest.raises(ScenarioError) as told:
+        prepare(load_scenario(file, flat))
+    assert told.value.lines == [f"{file}:{fault}" for fault in faults]

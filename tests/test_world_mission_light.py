@@ -1,0 +1,67 @@
+"""Water, lamps and sun that cannot be are told with file, line, key and what is allowed, before anything is flown."""
+
+import pytest
+
+from twin.errors import ScenarioError
+from twin.scenario.file import dump_toml, load_scenario
+from twin.world.mission import prepare
+
+SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "fault"),
+    [
+        (
+            ["water.absorption_per_m=[-0.1, 0, 0]"],
+            r"water\.absorption_per_m\.0: -0\.1: not allowed .*greater than or e",
+        ),
+        (["water.scattering_per_m=[0.1, 0]"], r"water\.scattering_per_m\.2: missing"),
+        (["water.scattering_per_m=[0.1, 0, 0]"], r"water\.absorption_per_m: missing, as there is a water\.scatt"),
+        (["water.turbidity=-1.0"], r"water\.turbidity: -1\.0: not allowed"),
+        (["water.mean_cosine=1.0"], r"water\.mean_cosine: 1\.0: not allowed"),
+        (["water.kept_share=1.1"], r"water\.kept_share: 1\.1: not allowed"),
+        (["water.spectrum_file=none.csv"], r"water\.spectrum_file: .*none\.csv cannot be read"),
+        (["snow.albedo=1.2"], r"snow\.albedo: 1\.2: not allowed .*less than or equal to 1"),
+        (["lamps.0.intensity_cd=-5.0"], r"lamps\.0\.intensity_cd: -5\.0: not allowed"),
+        (["lamps.1.beam=[[10, 1], [20, 0]]"], r"lamps\.1\.beam: angles do not rise from 0"),
+        (["lamps.1.beam=[[0, 1], [20, 0.5], [20, 0]]"], r"lamps\.1\.beam: angles do not rise from 0"),
+        (["lamps.1.beam=[[0, 1], [120, 0]]"], r"lamps\.1\.beam\.1\.0: 120: not allowed"),
+        (["lamps.0.colour_temperature_k=100.0"], r"lamps\.0\.colour_temperature_k: 100\.0: not allowed"),
+        (["sun.caustics=0.5"], r"sun\.caustics: 0\.5: there is no surface"),
+        (["sun.depth_m=1.5"], r"sun\.depth_m: 1\.5: the cameras fly above the surface \(allowed: more than 2\)"),
+        (
+            ["lamps.0.position_m=[0.25, 0.35, -2.0]"],
+            r"lamps\.0\.position_m: lies 0\.\d\d m in the floor at x .*allowed: -1\.\d\d up or more",
+        ),
+    ],
+)
+def test_light_that_cannot_be_is_told(overrides, fault):
+    with pytest.raises(ScenarioError, match=fault) as told:
+        prepare(load_scenario("quickstart", [*SMALL, *overrides]))
+    assert len(told.value.lines) == 1
+
+
+def test_a_lamp_that_is_told_to_be_in_the_floor_is_free_at_the_height_that_is_allowed():
+    with pytest.raises(ScenarioError) as told:
+        prepare(load_scenario("quickstart", [*SMALL, "lamps.0.position_m=[0.25, 0.35, -2.0]"]))
+    height_m = float(told.value.lines[0].rpartition("allowed: ")[2].split()[0])
+    prepare(load_scenario("quickstart", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
+
+
+def test_water_lamps_and_sun_survive_a_round_trip_and_a_spectrum_lies_beside_its_scenario(tmp_path):
+    (tmp_path / "lake.csv").write_text("400, 0.1, 0.2\n700, 0.3, 0.2\n")
+    file = tmp_path / "lake.toml"
+    file.write_text(
+        'extends = "quickstart.toml"\n[water]\nspectrum_file = "lake.csv"\nkept_share = 0.5\n'
+        "[sun]\nilluminance_lx = 500.0\ndepth_m = 9.0\ncaustics = 0.7\n"
+        "[[lamps]]\nposition_m = [0.2, 0.3, 0.0]\nbeam = [[0, 1], [30.5, 0.25]]\ncolour_temperature_k = 4000.0\n"
+    )
+    (tmp_path / "quickstart.toml").write_text(dump_toml(load_scenario("quickstart")))
+    scenario = load_scenario(file)
+    assert scenario.water.spectrum_file == str(tmp_path / "lake.csv")
+    assert scenario.water.label == "lake.csv, turbidity 1"
+    again = tmp_path / "again.toml"
+    again.write_text(dump_toml(scenario))
+    assert load_scenario(again).model_dump() == scenario.model_dump()
+    prepare(scenario)

@@ -1,0 +1,1 @@
+"""The Kalman depth filter and the elevation map."""

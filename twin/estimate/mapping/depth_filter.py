@@ -1,0 +1,287 @@
+"""Kalman depth mapping along the path (part P18 of the method): one scalar filter per pixel of the current keyframe.
+
+State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step carries
+the state into the next keyframe, fuses the new stereo depth and the depth from the motion between the two, and hands
+over ("retires") every pixel of the old map that could not be carried: what a pixel knows leaves the filter once.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import StereoRig
+from twin.estimate.vision import epipolar
+from twin.estimate.vision.disparity import Disparity
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+#: Gate of the innovation, (z - h)^2 < GATE (P + R): 99.9 % of a chi-square with one degree of freedom.
+GATE = 10.83
+#: Pixels whose disparities differ by more than this [px] are on different surfaces: nothing is interpolated between.
+JUMP_PX = 1.2
+#: Standard deviation of depth from motion beyond its own noise [px of stereo disparity].
+MOTION_FLOOR_PX = 0.03
+
+
+class DepthMap(NamedTuple):
+    """Depth (H, W) float32 [m], NaN where unknown, and its variance (H, W) float32 [m^2], of one left camera."""
+
+    depth_m: Map
+    variance_m2: Map
+
+
+class Carried(NamedTuple):
+    """The fused map of the new keyframe, and which of its pixels took information of the old map in."""
+
+    fused: DepthMap
+    taken: Mask
+
+
+def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
+    """Depth and variance of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d."""
+    focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
+    depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
+    variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2
+    return DepthMap(depth.astype(np.float32), variance.astype(np.float32))
+
+
+def fuse(prior: DepthMap, seen: DepthMap) -> DepthMap:
+    """Scalar Kalman update of every pixel that passes the gate (z - h)^2 < GATE (P + R); others keep their prior.
+
+    Where only one of the two knows, that one stands.
+    """
+    depth, variance = prior.depth_m.copy(), prior.variance_m2.copy()
+    _fuse(depth, variance, seen.depth_m, seen.variance_m2, GATE)
+    return DepthMap(depth, variance)
+
+
+def carry(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> Carried:
+    """Carries the old map into the new keyframe and fuses it with the new stereo depth.
+
+    Each new pixel's stereo depth is the point of linearisation: where that point lay in the old image, the old map is
+    sampled bilinearly (backward, so without holes or rounding; not across jumps of depth) and its difference in depth
+    is brought over along the surface. A pixel without new stereo keeps what falls on it.
+
+    Args:
+        new_from_old: (4, 4) pose of the old camera in the new one.
+        step_cov: (6, 6) covariance of that relative pose [rotation, translation], in the new camera (rad, m).
+    """
+    args = (rig.focal_px, rig.focal_px * rig.baseline_m, JUMP_PX)
+    old_from_new = geometry.inverse(new_from_old)
+    guess = new.depth_m.copy()
+    _scatter(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, args[0])
+    prior = DepthMap(*_pull(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args))
+    depth, variance = new.depth_m.copy(), new.variance_m2.copy()
+    taken = _fuse(depth, variance, prior.depth_m, prior.variance_m2, GATE)
+    return Carried(DepthMap(depth, variance), taken)
+
+
+def motion_depth(
+    gray: Map, old_gray: Map, current: DepthMap, old_from_new: Array, step_cov: Array, rig: StereoRig
+) -> DepthMap:
+    """Depth from the flow between two keyframes (Negahdaripour & Madjidi 2003, eq. 1, in its exact two-view form).
+
+    The relative pose and the current depth predict the flow; what remains of it along the epipolar line is measured
+    with the same window as the disparity, and is linear in inverse depth. Errors of the relative pose enter R.
+
+    Found on rendered strips (grey noise sd 2, true poses): error of motion depth 0.044 px on a reef and 0.063 px on a
+    fractal floor, in units of its own sigma 0.9 and 0.9, bias 0.001 px; with it the error of the filter falls from
+    0.045 to 0.035 px and from 0.040 to 0.029 px. A dense two-dimensional flow is not used: its bias of some 0.1 px is
+    common to the image and would stay in the map.
+
+    Args:
+        gray, old_gray: (H, W) float32 left images.
+        current: depth of the new keyframe, the prediction.
+        old_from_new: (4, 4) pose of the new camera in the old one.
+        step_cov: (6, 6) covariance of the relative pose, in the new camera (rad, m).
+    """
+    focal_baseline = rig.focal_px * rig.baseline_m
+    view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
+    flow = epipolar.refine(gray, old_gray, np.float32(focal_baseline) / current.depth_m, view, iterations=1)
+    pose_variance = _pose_variance(
+        flow.disparity_px,
+        old_from_new[:3, :3].copy(),
+        old_from_new[:3, 3].copy(),
+        step_cov,
+        rig.focal_px,
+        focal_baseline,
+    )
+    sigma = np.sqrt(flow.own_sigma_px**2 + pose_variance + np.float32(MOTION_FLOOR_PX**2))
+    return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
+
+
+@njit(cache=True, nogil=True)
+def _fuse(depth, variance, seen, seen_variance, gate):
+    """Updates depth and variance in place; returns which pixels took the other's information in."""
+    taken = np.zeros(depth.shape, np.bool_)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z, r = seen[v, u], seen_variance[v, u]
+            if not z > 0:
+                continue
+            h, p = depth[v, u], variance[v, u]
+            if not h > 0:
+                depth[v, u], variance[v, u], taken[v, u] = z, r, True
+            elif (z - h) ** 2 < gate * (p + r):
+                gain = p / (p + r)
+                depth[v, u] = h + gain * (z - h)
+                variance[v, u] = p * r / (p + r)
+                taken[v, u] = True
+    return taken
+
+
+@njit(cache=True, nogil=True)
+def _scatter(old, rotation, translation, guess, focal):
+    """Fills pixels without stereo with the nearest old depth that falls on them."""
+    height, width = old.shape
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    filled = np.zeros(old.shape, np.bool_)
+    for v in range(height):
+        for u in range(width):
+            if not old[v, u] > 0:
+                continue
+            x, y, z = _moved(u, v, old[v, u], rotation, translation, focal, cx, cy)
+            if z <= 0:
+                continue
+            j, i = int(np.floor(focal * x / z + cx + 0.5)), int(np.floor(focal * y / z + cy + 0.5))
+            if not (0 <= i < height and 0 <= j < width):
+                continue
+            if np.isnan(guess[i, j]) or (filled[i, j] and z < guess[i, j]):
+                guess[i, j] = z
+                filled[i, j] = True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _moved(u, v, depth, rotation, translation, focal, cx, cy):
+    """The point of pixel (u, v) at a depth, in the other camera [m]."""
+    x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * depth + translation[1],
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * depth + translation[2],
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bilinear(depth, variance, x, y, focal_baseline, jump):
+    """Depth and variance at (x, y) if its four neighbours are one surface, else NaN. Inverse depth is interpolated:
+    it is linear on planes. The variance is interpolated as if neighbours erred alike: windows overlap."""
+    height, width = depth.shape
+    if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
+        return np.nan, np.nan
+    j, i = min(int(x), width - 2), min(int(y), height - 2)
+    a, b, c, e = depth[i, j], depth[i, j + 1], depth[i + 1, j], depth[i + 1, j + 1]
+    near, far = min(min(a, b), min(c, e)), max(max(a, b), max(c, e))
+    if not (near > 0 and focal_baseline * (1 / near - 1 / far) < jump) or np.isnan(a + b + c + e):
+        return np.nan, np.nan
+    s, t = x - j, y - i
+    wa, wb, wc, we = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
+    inverse = wa / a + wb / b + wc / c + we / e
+    return 1 / inverse, wa * variance[i, j] + wb * variance[i, j + 1] + wc * variance[i + 1, j] + we * variance[
+        i + 1, j + 1
+    ]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
+    """Normal of the surface at a pixel, scaled so that normal . ray = 1 / depth; facing the ray where it is unknown."""
+    height, width = depth.shape
+    z = depth[v, u]
+    slope_u, slope_v = 0.0, 0.0
+    if 0 < u < width - 1:
+        slope_u = 0.5 / depth[v, u + 1] - 0.5 / depth[v, u - 1]
+    if 0 < v < height - 1:
+        slope_v = 0.5 / depth[v + 1, u] - 0.5 / depth[v - 1, u]
+    if not focal_baseline * abs(slope_u) < 0.5 * jump:
+        slope_u = 0.0
+    if not focal_baseline * abs(slope_v) < 0.5 * jump:
+        slope_v = 0.0
+    nx, ny = focal * slope_u, focal * slope_v
+    return nx, ny, 1 / z - nx * (u - cx) / focal - ny * (v - cy) / focal
+
+
+@njit(cache=True, nogil=True)
+def _pull(old, old_variance, guess, rotation, translation, step_cov, focal, focal_baseline, jump):
+    """Old depth and variance, brought to each pixel of the new map; NaN where the old map does not know it."""
+    height, width = old.shape
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
+    uncertain = np.trace(step_cov) > 0
+    row = np.empty(6)
+    for v in range(height):
+        for u in range(width):
+            z = guess[v, u]
+            if not z > 0:
+                continue
+            x, y, w = _moved(u, v, z, rotation, translation, focal, cx, cy)
+            if w <= 0:
+                continue
+            ox, oy = x / w, y / w
+            h, p = _bilinear(old, old_variance, focal * ox + cx, focal * oy + cy, focal_baseline, jump)
+            if np.isnan(h):
+                continue
+            nx, ny, nz = _normal(guess, u, v, focal, cx, cy, focal_baseline, jump)
+            # the old ray seen from the new camera
+            rx = rotation[0, 0] * ox + rotation[1, 0] * oy + rotation[2, 0]
+            ry = rotation[0, 1] * ox + rotation[1, 1] * oy + rotation[2, 1]
+            rz = rotation[0, 2] * ox + rotation[1, 2] * oy + rotation[2, 2]
+            ratio = min(max(z * (nx * rx + ny * ry + nz * rz), 0.5), 2.0)
+            depth[v, u] = z + (h - w) * ratio
+            variance[v, u] = p * ratio**2
+            if uncertain:
+                px, py = (u - cx) / focal * z, (v - cy) / focal * z
+                row[0], row[1], row[2] = py * nz - z * ny, z * nx - px * nz, px * ny - py * nx
+                row[3], row[4], row[5] = nx, ny, nz
+                variance[v, u] += z * z * _quadratic(row, step_cov)
+    return depth, variance
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _quadratic(row, cov):
+    total = 0.0
+    for i in range(6):
+        for j in range(6):
+            total += row[i] * cov[i, j] * row[j]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _pose_variance(disparity, rotation, translation, step_cov, focal, focal_baseline):
+    """Variance of disparity from motion [px^2] by the covariance of the relative pose alone: J cov J'.
+
+    A small motion of the old camera's image of a point, projected on the epipolar line, is taken for a change of depth.
+    """
+    height, width = disparity.shape
+    cx, cy = (width - 1) / 2, (height - 1) / 2
+    result = np.zeros(disparity.shape, np.float32)
+    if np.trace(step_cov) <= 0:
+        return result
+    row = np.empty(6)
+    for v in range(height):
+        for u in range(width):
+            d = disparity[v, u]
+            if not d > 0:
+                continue
+            z = focal_baseline / d
+            x, y, w = _moved(u, v, z, rotation, translation, focal, cx, cy)
+            ex = (translation[0] * w - translation[2] * x) / (w * w) * focal * z / focal_baseline
+            ey = (translation[1] * w - translation[2] * y) / (w * w) * focal * z / focal_baseline
+            # flow by a displacement of the point in the new camera, projected on the epipolar line
+            length = ex * ex + ey * ey
+            gx, gy = ex / length * focal / w, ey / length * focal / w
+            gz = -(gx * x + gy * y) / w
+            nx = gx * rotation[0, 0] + gy * rotation[1, 0] + gz * rotation[2, 0]
+            ny = gx * rotation[0, 1] + gy * rotation[1, 1] + gz * rotation[2, 1]
+            nz = gx * rotation[0, 2] + gy * rotation[1, 2] + gz * rotation[2, 2]
+            px, py = (u - cx) / focal * z, (v - cy) / focal * z
+            row[0], row[1], row[2] = py * nz - z * ny, z * nx - px * nz, px * ny - py * nx
+            row[3], row[4], row[5] = nx, ny, nz
+            result[v, u] = _quadratic(row, step_cov)
+    return result

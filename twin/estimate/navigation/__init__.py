@@ -1,0 +1,1 @@
+"""The online pose filter and the navigation sensors that aid it."""

@@ -1,0 +1,283 @@
+"""The survey in Rerun: run.rrd, drawn from the run folder, and a live view. The only importer of rerun."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from twin.core import geometry
+from twin.core.records import Array, Estimate, Frame, Image, StereoRig, Trajectory
+from twin.judge.trajectory import path_errors
+from twin.report import recording_surfaces, wording
+from twin.report.images import jpeg_bytes, read_rgb
+from twin.report.recording_data import N_STAGES, Moments, sampled, stage_times, stages_of, step_of
+from twin.report.run_folder import SCENARIO_FILE, Run, load_run
+from twin.report.style import ESTIMATES, LABELS, rgb
+from twin.scenario import file as scenario_file
+
+#: Images are shown of at most so many keyframes, and so large.
+N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
+
+#: The viewer of this Python; without --bind it would listen to everybody.
+VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
+#: The true floor lets the map shine through, and is drawn a little lower: a good map would flicker with it.
+TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
+
+
+def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
+    """Writes run.rrd into a run folder from what is there, and returns its path.
+
+    Raises:
+        TwinError: the folder is no run, or one of its files is broken.
+    """
+    run = load_run(folder, metrics)
+    file = run.folder / "run.rrd"
+    rig = scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
+    recording = rr.RecordingStream("twin", recording_id=run.folder.name)
+    recording.save(file, default_blueprint=blueprint(_view_point(run)))
+    log_scene(recording, run)
+    log_paths(recording, run)
+    log_map(recording, run, rig)
+    log_cameras(recording, run, rig)
+    log_curves(recording, run)
+    recording.flush()
+    recording.disconnect()
+    return file
+
+
+def open_viewer(folder: Path) -> int:
+    """Opens a run in the Rerun viewer, written first where it is missing; returns the viewer's exit status."""
+    file = Path(folder) / "run.rrd"
+    if not file.is_file():
+        write_recording(Path(folder))
+    return subprocess.run([*VIEWER, str(file)], check=False).returncode
+
+
+def blueprint(eye: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
+    """The survey large on the left; cameras, mosaic and curves on the right."""
+    cameras = rrb.Horizontal(
+        rrb.Spatial2DView(origin="/world/rig/left", name="Left camera"),
+        rrb.Spatial2DView(origin="/world/rig/right", name="Right camera"),
+    )
+    pictures = rrb.Tabs(
+        rrb.Spatial2DView(origin="/mosaic", name="Mosaic"), rrb.TextDocumentView(origin="/summary", name="Summary")
+    )
+    curves = rrb.Tabs(
+        rrb.TimeSeriesView(origin="/error/position", name="Position error [m]"),
+        rrb.TimeSeriesView(origin="/error/height", name="Height error [m]"),
+        rrb.TimeSeriesView(origin="/error/heading", name="Heading error [deg]"),
+    )
+    timing = rrb.TimeSeriesView(origin="/timing", name="Time per call [ms]")
+    survey = rrb.Spatial3DView(origin="/world", name="Survey", eye_controls=eye)
+    return rrb.Blueprint(
+        rrb.Horizontal(survey, rrb.Vertical(cameras, pictures, curves, timing), column_shares=[3, 2]),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+        rrb.SelectionPanel(state="hidden"),
+    )
+
+
+def _view_point(run: Run) -> rrb.EyeControls3D | None:
+    """From the south and above, far enough to see the whole survey."""
+    paths = [path.positions for path in run.trajectories.values() if len(path)]
+    if not paths:
+        return None
+    low, high = (getattr(np.concatenate(paths), side)(axis=0) for side in ("min", "max"))
+    target = np.array([*(low + high)[:2] / 2, low[2] / 2])
+    away = max(1.0, float(np.linalg.norm((high - low)[:2])))
+    return rrb.EyeControls3D(position=target + away * np.array([0.0, -0.75, 0.9]), look_target=target, eye_up=[0, 0, 1])
+
+
+def log_scene(recording: rr.RecordingStream, run: Run) -> None:
+    """What does not change: axes, true floor, planned path, mosaic, and the survey in words."""
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    summary = "\n".join(
+        [f"# {run.scenario.get('name', run.folder.name)}", wording.headline(run.metrics, run.scenario), ""]
+        + [f"- **{row.what}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
+    )
+    recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
+    if "dem_truth" in run.rasters:
+        floor = recording_surfaces.floor_surface(run.rasters["dem_truth"])
+        recording.log("world/true_floor", rr.Transform3D(translation=(0, 0, -TRUTH_BELOW_M)), static=True)
+        recording.log("world/true_floor", surface_mesh(floor, alpha=TRUTH_ALPHA), static=True)
+    if "reference" in run.trajectories:
+        positions = run.trajectories["reference"].positions
+        planned = line(positions[:: step_of(len(positions))], "reference")
+        recording.log("world/path/reference", planned, static=True)
+    if "mosaic" in run.rasters:
+        recording.log("mosaic", jpeg(run.rasters["mosaic"].values, MOSAIC_PX), static=True)
+
+
+def log_paths(recording: rr.RecordingStream, run: Run) -> None:
+    """Trajectories and network as they grow, stage by stage."""
+    paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
+    for name, path in paths.items():
+        for end in np.unique(np.linspace(1, len(path), min(N_STAGES, len(path))).astype(int)):
+            _set_time(recording, end - 1, float(path.times_s[end - 1]))
+            recording.log(f"world/path/{name}", line(path.positions[: end : step_of(end)], name))
+    for last, moment in stages_of(run):
+        edges = run.network.edges[run.network.edges.max(axis=1) <= last]
+        _set_time(recording, *moment)
+        recording.log("world/network", segments(run.network.positions[edges], "link"))
+    recording.reset_time()
+
+
+def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
+    """The elevation map in the mosaic's colours, each piece from the moment that a keyframe first looked at it.
+
+    The heights are those of the finished map.
+    """
+    if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
+        return
+    surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters.get("mosaic"))
+    stages = list(stages_of(run))
+    poses = run.trajectories["final"].world_from_camera[run.keyframes.frames]
+    groups = np.split(poses, [last + 1 for last, _ in stages])[:-1]
+    first_seen = recording_surfaces.first_seen(surface.points, groups, rig)
+    for number, (_, moment) in enumerate(stages):
+        piece = recording_surfaces.piece(surface, first_seen, number)
+        if len(piece.triangles):
+            _set_time(recording, *moment)
+            recording.log(f"world/map/{number:02d}", surface_mesh(piece))
+    recording.reset_time()
+
+
+def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
+    """The rig along the true path (the online one where the truth is missing), its cameras and their images."""
+    name = "truth" if "truth" in run.trajectories else "online"
+    if name not in run.trajectories or not len(run.trajectories[name]):
+        return
+    path = run.trajectories[name]
+    rows = sampled(len(path))
+    log_rig(recording, rig)
+    poses = path.world_from_camera[rows]
+    quaternions = [geometry.quaternion_xyzw(pose[:3, :3]) for pose in poses]
+    columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternions)
+    recording.send_columns("world/rig", time_columns(Moments(rows, path.times_s[rows])), columns)
+    frames = [frame for frame in run.imaged_frames() if frame < len(path)]
+    shown = np.array(frames, dtype=np.int64)[:: step_of(len(frames), N_IMAGED)]
+    for eye in ("left", "right"):
+        _send_images(recording, run, eye, Moments(shown, path.times_s[shown]))
+
+
+def _send_images(recording: rr.RecordingStream, run: Run, eye: str, moments: Moments) -> None:
+    images = [read_rgb(run.image_file(int(f), eye)) for f in moments.frames]
+    there = np.array([image is not None for image in images], dtype=bool)
+    if there.any():
+        data = [jpeg_bytes(image, IMAGE_WIDTH_PX) for image in images if image is not None]
+        columns = rr.EncodedImage.columns(blob=data, media_type=["image/jpeg"] * len(data))
+        kept = Moments(moments.frames[there], moments.times_s[there])
+        recording.send_columns(f"world/rig/{eye}", time_columns(kept), columns)
+
+
+def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
+    """The two cameras in the rig, whose frame is the left camera; the image plane is as wide as the logged images."""
+    scale = min(1.0, IMAGE_WIDTH_PX / rig.width_px)
+    camera = rr.Pinhole(
+        image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,
+        resolution=[round(rig.width_px * scale), round(rig.height_px * scale)],
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.4,
+    )
+    recording.log("world/rig/left", camera, static=True)
+    recording.log("world/rig/right", rr.Transform3D(translation=rig.left_from_right[:3, 3]), camera, static=True)
+
+
+def log_curves(recording: rr.RecordingStream, run: Run) -> None:
+    """Errors of every estimate, and how long the stages took."""
+    if "truth" in run.trajectories:
+        for name in ESTIMATES:
+            if name in run.trajectories:
+                _log_errors(recording, name, run.trajectories[name], run.trajectories["truth"])
+    for stage, (moments, values) in stage_times(run).items():
+        log_curve(recording, f"timing/{stage}", moments, values)
+        if len(values) == 1:
+            recording.log(f"timing/{stage}", rr.SeriesPoints(marker_sizes=4), static=True)
+
+
+def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, truth: Trajectory) -> None:
+    errors = path_errors(estimate, truth)
+    rows = sampled(len(errors.travelled_m))
+    moments = Moments(rows, truth.times_s[rows])
+    log_curve(recording, f"error/position/{name}", moments, errors.distance_m[rows], name)
+    log_curve(recording, f"error/height/{name}", moments, errors.position_m[rows, 2], name)
+    log_curve(recording, f"error/heading/{name}", moments, np.rad2deg(errors.heading_rad[rows]), name)
+
+
+def log_curve(
+    recording: rr.RecordingStream, entity: str, moments: Moments, values: Array, role: str | None = None
+) -> None:
+    """One curve over both timelines, in the colour of its role."""
+    if len(values):
+        look: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
+        look |= {"colors": rgb(role)} if role else {}
+        recording.log(entity, rr.SeriesLines(**look), static=True)
+        recording.send_columns(entity, time_columns(moments), rr.Scalars.columns(scalars=values))
+
+
+class Live:
+    """A viewer that shows the survey while it is flown: images, pose and path as believed online."""
+
+    def __init__(self, rig: StereoRig, recording: rr.RecordingStream | None = None) -> None:
+        """Starts the viewer, unless a recording is given that already goes somewhere."""
+        self.recording = recording or rr.RecordingStream("twin_live")
+        self.path: list[Array] = []
+        if recording is None:
+            subprocess.Popen(VIEWER, start_new_session=True)
+            self.recording.connect_grpc(default_blueprint=blueprint())
+        self.recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        log_rig(self.recording, rig)
+
+    def log_frame(self, frame: Frame, estimate: Estimate) -> None:
+        """One frame: the pose always, the images and the path at keyframes."""
+        pose = estimate.world_from_camera
+        _set_time(self.recording, frame.index, frame.time_s)
+        quaternion = rr.Quaternion(xyzw=geometry.quaternion_xyzw(pose[:3, :3]))
+        self.recording.log("world/rig", rr.Transform3D(translation=pose[:3, 3], quaternion=quaternion))
+        self.recording.log("error/position/sigma", rr.Scalars(estimate.sigma_m))
+        if frame.right is not None:
+            self.path.append(pose[:3, 3].copy())
+            self.recording.log("world/path/online", line(np.array(self.path), "online"))
+            self.recording.log("world/rig/left", jpeg(frame.left, IMAGE_WIDTH_PX))
+            self.recording.log("world/rig/right", jpeg(frame.right, IMAGE_WIDTH_PX))
+
+
+def colour(role: str) -> tuple[int, int, int]:
+    """The colour of a role before the viewer's dark ground: the truth is white there."""
+    return (245, 245, 245) if role == "truth" else rgb(role)
+
+
+def line(positions: Array, role: str) -> rr.LineStrips3D:
+    """Positions (n, 3) as one line in the colour of its role."""
+    return rr.LineStrips3D([positions.astype(np.float32)], colors=[colour(role)], radii=rr.Radius.ui_points(1.5))
+
+
+def segments(pairs: Array, role: str) -> rr.LineStrips3D:
+    """Pairs of points (n, 2, 3) as separate lines."""
+    return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
+
+
+def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Mesh3D:
+    return rr.Mesh3D(
+        albedo_factor=(255, 255, 255, alpha),
+        vertex_positions=surface.points, triangle_indices=surface.triangles, vertex_colors=surface.colours,
+        vertex_normals=surface.normals,
+    )  # fmt: skip
+
+
+def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
+    return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
+
+
+def time_columns(moments: Moments) -> list[rr.TimeColumn]:
+    return [rr.TimeColumn("frame", sequence=moments.frames), rr.TimeColumn("sim_time", duration=moments.times_s)]
+
+
+def _set_time(recording: rr.RecordingStream, frame: int, time_s: float) -> None:
+    recording.set_time("frame", sequence=int(frame))
+    recording.set_time("sim_time", duration=float(time_s))

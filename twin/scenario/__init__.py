@@ -1,0 +1,1 @@
+"""The scenario: its models and its TOML file."""

@@ -1,0 +1,1 @@
+"""One survey assembled, watched and concluded."""

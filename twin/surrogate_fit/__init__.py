@@ -1,0 +1,1 @@
+"""Fits the surrogate's error model to rendered surveys."""

@@ -1,0 +1,112 @@
+"""Which cells of the floor the survey truly saw, with both cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.core.records import Array, MapGrid, StereoRig
+
+#: Neighbouring pixels whose depths differ by more than this share are an occluding edge, not a slope: at 0.2 deg a
+#: pixel a slope of 86 deg still counts.
+EDGE_SHARE = 0.05
+#: Slack of the agreement of left and right depth, as a share of depth.
+AGREE_SHARE = 0.005
+_ROWS = 64
+
+
+class Coverage:
+    """Accumulates `seen` (rows, cols): cells whose centre lies in a quad of pixels that both cameras see."""
+
+    def __init__(self, grid: MapGrid, rig: StereoRig) -> None:
+        self.grid, self.rig = grid, rig
+        self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
+
+    def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
+        """Marks what a keyframe saw: true pose (4, 4), true depths (height, width) along the optical axis [m]."""
+        grid, rig = self.grid, self.rig
+        camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.baseline_m)
+        raster = (grid.west_m, grid.north_m, grid.cell_m)
+        pose = np.ascontiguousarray(world_from_left, dtype=np.float64)
+        left, right = np.ascontiguousarray(depth_left, np.float32), np.ascontiguousarray(depth_right, np.float32)
+        _mark_seen(self.seen, raster, pose, camera, left, right)
+
+
+def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
+    """(rows, cols) true height at the cell centres [m]; `height_at(x, y)` takes and gives arrays of one shape."""
+    x, y = grid.centres()
+    height = np.empty((grid.rows, grid.cols), np.float32)
+    for row in range(0, grid.rows, _ROWS):  # a large grid at once would take many times its memory
+        height[row : row + _ROWS] = height_at(*np.meshgrid(x, y[row : row + _ROWS]))
+    return height
+
+
+@njit(cache=True, nogil=True)
+def _mark_seen(seen, raster, pose, camera, left, right):
+    """Two rows of floor points at a time: each pixel's point [cells], then every quad between four visible pixels."""
+    height, width = left.shape
+    col, row = np.zeros((2, width)), np.zeros((2, width))
+    visible = np.zeros((2, width), dtype=np.bool_)
+    for v in range(height):
+        new, old = v % 2, 1 - v % 2
+        for u in range(width):
+            visible[new, u] = _in_both(u, v, left, right, camera)
+            if visible[new, u]:
+                col[new, u], row[new, u] = _floor_cell(u, v, left[v, u], pose, camera, raster)
+        if v == 0:
+            continue
+        for u in range(width - 1):
+            whole = visible[0, u] and visible[0, u + 1] and visible[1, u] and visible[1, u + 1]
+            if whole and _is_surface(left, u, v - 1):
+                _mark_triangle(
+                    seen, col[old, u], row[old, u], col[old, u + 1], row[old, u + 1], col[new, u], row[new, u]
+                )
+                _mark_triangle(
+                    seen, col[new, u + 1], row[new, u + 1], col[old, u + 1], row[old, u + 1], col[new, u], row[new, u]
+                )
+
+
+@njit(cache=True, nogil=True)
+def _in_both(u, v, left, right, camera):
+    """A left pixel is seen by both if its projection is in the right image and lies between the depths around it."""
+    z = left[v, u]
+    if not (z > 0 and z < np.inf):
+        return False
+    k = int(np.floor(u - camera[0] * camera[3] / z))
+    if k < 0 or k + 1 >= right.shape[1]:
+        return False
+    a, b, slack = right[v, k], right[v, k + 1], AGREE_SHARE * z
+    return min(a, b) - slack <= z <= max(a, b) + slack
+
+
+@njit(cache=True, nogil=True)
+def _floor_cell(u, v, z, pose, camera, raster):
+    """Column and row of the point that a pixel sees; whole numbers are cell centres."""
+    xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
+    x = pose[0, 0] * xc + pose[0, 1] * yc + pose[0, 2] * z + pose[0, 3]
+    y = pose[1, 0] * xc + pose[1, 1] * yc + pose[1, 2] * z + pose[1, 3]
+    return (x - raster[0]) / raster[2] - 0.5, (raster[1] - y) / raster[2] - 0.5
+
+
+@njit(cache=True, nogil=True)
+def _is_surface(left, u, v):
+    a, b, c, d = left[v, u], left[v, u + 1], left[v + 1, u], left[v + 1, u + 1]
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    return high - low <= EDGE_SHARE * low
+
+
+@njit(cache=True, nogil=True)
+def _mark_triangle(seen, ca, ra, cb, rb, cc, rc):
+    """Marks the cells whose centre lies in a triangle of points (column, row); the edges count as inside."""
+    row0, row1 = max(0, int(np.ceil(min(ra, rb, rc)))), min(seen.shape[0] - 1, int(np.floor(max(ra, rb, rc))))
+    col0, col1 = max(0, int(np.ceil(min(ca, cb, cc)))), min(seen.shape[1] - 1, int(np.floor(max(ca, cb, cc))))
+    for r in range(row0, row1 + 1):
+        for c in range(col0, col1 + 1):
+            if not seen[r, c]:
+                p = (cb - ca) * (r - ra) - (rb - ra) * (c - ca)
+                q = (cc - cb) * (r - rb) - (rc - rb) * (c - cb)
+                s = (ca - cc) * (r - rc) - (ra - rc) * (c - cc)
+                seen[r, c] = (p >= 0 and q >= 0 and s >= 0) or (p <= 0 and q <= 0 and s <= 0)

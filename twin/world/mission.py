@@ -1,0 +1,297 @@
+"""What is to be flown, checked before anything is: scenario, floor, plan and the cells of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import terrains
+from controllers import lawnmower, loops, segments
+from controllers.forecast import least_clearance
+from controllers.survey_plan import PlanFault, SurveyPlan, SurveyRequest
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import MapGrid, StereoRig
+from twin.errors import ScenarioError, TwinError
+from twin.imaging.lamps import daylight_at, lights_of_eye
+from twin.imaging.true_cameras import View, make_view
+from twin.imaging.water import medium
+from twin.judge.metrics import check_require
+from twin.scenario.model import BeaconConfig, CalibrationErrorConfig, Scenario, SensorConfig, Source
+from twin.simulate.autopilot import top_speed_mps
+
+#: Between places along the path at which a lamp is looked for in the floor.
+LAMP_STEP_M = 0.02
+
+
+class Step(NamedTuple):
+    """One frame of the survey: where the left camera shall be, whether it is a keyframe, whether it keeps station."""
+
+    reference: segments.Reference
+    keyframe: bool
+    holding: bool
+
+
+@dataclass(frozen=True)
+class Course:
+    """Frames that follow one another: a sequence of steps.
+
+    Args:
+        reference: of the left camera, at each.
+        keyframe: (n,) bool.
+        holding: whether they keep station.
+    """
+
+    reference: segments.Reference
+    keyframe: NDArray[np.bool_]
+    holding: bool
+
+    def __len__(self) -> int:
+        return len(self.keyframe)
+
+    def __getitem__(self, k: int) -> Step:
+        return Step(self.reference.row(k), bool(self.keyframe[k]), self.holding)
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A checked survey."""
+
+    scenario: Scenario
+    terrain: terrains.Terrain
+    plan: SurveyPlan
+    rig: StereoRig
+    grid: MapGrid
+    view: View
+
+    @property
+    def start(self) -> Array:
+        """(4, 4) reference position: world_from_camera where the survey begins, level, bow to the east."""
+        return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
+
+    @property
+    def start_of_body(self) -> Array:
+        """(4, 4) world_from_body there."""
+        return self.start @ geometry.inverse(self.rig.body_from_camera)
+
+    def fly(self, track: int) -> Course:
+        """The frames of a track (from 1); every N-th is a keyframe, and the last one."""
+        times_s, keyframes = self.plan.frames_of_track(track)
+        return Course(self.plan.references(track, times_s), keyframes, holding=False)
+
+    def hold(self, track: int) -> Course:
+        """The frames of half the station keeping after a track."""
+        n = self._n_holding
+        end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
+        return Course(end, np.zeros(n, np.bool_), holding=True)
+
+    @property
+    def _n_holding(self) -> int:
+        return max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))
+
+    @property
+    def n_frames(self) -> int:
+        """Frames of the whole survey."""
+        return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
+
+    @property
+    def tracks(self) -> range:
+        """Numbers of the tracks, from 1."""
+        return range(1, self.plan.n_tracks + 1)
+
+
+def prepare(scenario: Scenario) -> Mission:
+    """Loads the floor and plans the survey.
+
+    Raises:
+        ScenarioError: all that stands in the way, each with file and line.
+    """
+    faults: list[str] = []
+    source = scenario.source
+    terrain = _attempt(lambda: load_terrain(scenario), source, faults)
+    plan = _attempt(lambda: make_plan(scenario), source, faults)
+    _attempt(lambda: _check_speed(scenario), source, faults)
+    _attempt(lambda: _check_current(scenario), source, faults)
+    if (sensor := scenario.sensor) is not None:
+        _attempt(lambda: _check_exposure(sensor), source, faults)
+        for key, time_ms in (("exposure_max_ms", sensor.exposure_max_ms), ("readout_ms", sensor.readout_ms)):
+            _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, faults)
+    view = _attempt(lambda: make_view(scenario), source, faults)
+    _attempt(lambda: _check_light(scenario), source, faults)
+    _attempt(lambda: _check_surrogate(scenario), source, faults)
+    _attempt(lambda: check_require(scenario.require), source, faults)
+    _attempt(lambda: _check_beacons_listed(scenario), source, faults)
+    if terrain is not None:
+        for k, beacon in enumerate(scenario.beacons):
+            _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, faults)
+    if terrain is not None and plan is not None:
+        _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
+        for k in range(len(scenario.lamps)):
+            _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, faults)
+    if faults or terrain is None or plan is None or view is None:
+        raise ScenarioError(faults)
+    return Mission(scenario, terrain, plan, scenario.believed_rig(), _grid(scenario, plan), view)
+
+
+def _attempt(build, source: Source, faults: list[str]):
+    """What `build` returns, or None with its fault told."""
+    try:
+        return build()
+    except (terrains.TerrainFault, PlanFault) as fault:
+        faults.append(source.fault(TwinError(fault.field, fault.problem, fault.allowed)))
+    except TwinError as fault:
+        faults.append(source.fault(fault))
+    return None
+
+
+def load_terrain(scenario: Scenario) -> terrains.Terrain:
+    """The floor of the scenario, generated or read."""
+    t = scenario.terrain
+    if t.kind != "file":
+        if t.height_file or t.texture_file:
+            key = "height_file" if t.height_file else "texture_file"
+            raise TwinError(f"terrain.{key}", f"is not read by a generated floor ({t.kind})", 'terrain.kind = "file"')
+        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # nobody looks at it
+        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
+    if t.height_file is None:
+        raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
+    return terrains.load(
+        t.height_file, t.texture_file, t.texture_px_m, t.height_spacing_m, t.height_range_m, scenario.seed
+    )
+
+
+_PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
+
+
+def make_plan(scenario: Scenario) -> SurveyPlan:
+    """The plan of the scenario."""
+    p, rig = scenario.plan, scenario.believed_rig()
+    request = SurveyRequest(
+        p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
+        rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz,
+    )  # fmt: skip
+    return _PATTERNS[p.pattern](request)
+
+
+def _check_speed(scenario: Scenario) -> None:
+    """The vehicle can fly as fast as planned: along the bow, on loops in every direction."""
+    if scenario.vehicle.dynamics == "kinematic":
+        return
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
+    directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
+    reach = min(top_speed_mps(scenario.vehicle, direction) for direction in directions)
+    if scenario.plan.speed_mps > reach:
+        raise TwinError(
+            "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
+        )
+
+
+def _check_surrogate(scenario: Scenario) -> None:
+    """The surrogate knows noise, light and geometry; what else befalls images it would silently leave out."""
+    if scenario.imaging.fidelity == "rendered":
+        return
+    plain = scenario.port.kind == "none" and scenario.calibration_error == CalibrationErrorConfig()
+    absent = {"port, calibration": not plain, "snow": scenario.snow.density_per_m3 > 0}
+    for section, given in absent.items():
+        if given:
+            raise TwinError("imaging.fidelity", f"'surrogate' knows nothing of [{section}]", '"rendered"')
+
+
+def _check_beacons_listed(scenario: Scenario) -> None:
+    """Where beacons aid, there are some."""
+    if "beacons" in scenario.navigation.aiding and not scenario.beacons:
+        raise TwinError("navigation.aiding", "'beacons': the scenario has none", "with a [[beacons]] position_m")
+
+
+def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
+    """The beacon stands on the floor or above it."""
+    x, y, z = beacon.position_m
+    floor_m = float(terrain.height_at(x, y))
+    if np.isnan(floor_m):
+        east, north = terrain.east_m, terrain.north_m
+        raise TwinError(
+            f"beacons.{number}.position_m", f"({x:g}, {y:g}) lies outside the terrain",
+            f"x {terrain.west_m:.2f} to {east:.2f}, y {terrain.south_m:.2f} to {north:.2f} m",
+        )  # fmt: skip
+    if z < floor_m:
+        raise TwinError(f"beacons.{number}.position_m", f"z {z:g} lies in the floor", f"above {floor_m:.3f} m")
+
+
+def _check_current(scenario: Scenario) -> None:
+    """A current moves a hull, not a carrier."""
+    if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
+        raise TwinError("current.velocity_mps", "moves no kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
+
+
+def _check_light(scenario: Scenario) -> None:
+    """Water, daylight and beams are what they should be."""
+    daylight = daylight_at(scenario.sun, medium(scenario.water), scenario.plan.altitude_m)
+    lights_of_eye(scenario.believed_rig(), scenario.lamps, daylight, 0)
+
+
+def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+    """The lamp stays above the floor, bow to the east, all along the path."""
+    corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
+    offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along = np.append(np.arange(0.0, lengths[-1], LAMP_STEP_M), lengths[-1])
+    x, y, z = (np.interp(along, lengths, corners[:, k]) + offset[k] for k in range(3))
+    above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
+    if (least := above.min()) < 0:
+        raise TwinError(
+            f"lamps.{number}.position_m", f"lies {-least:.2f} m in the floor at x {x[above.argmin()]:.1f},"
+            f" y {y[above.argmin()]:.1f}", f"{scenario.lamps[number].position_m[2] - least:.2f} up or more",
+        )  # fmt: skip
+
+
+def _check_exposure(sensor: SensorConfig) -> None:
+    """The limits of exposure are in order."""
+    if sensor.exposure_min_ms > sensor.exposure_max_ms:
+        raise TwinError(
+            "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
+            f"up to sensor.exposure_max_ms = {sensor.exposure_max_ms:g}",
+        )  # fmt: skip
+
+
+def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
+    """What the sensor does for a frame is done before the next."""
+    if time_ms > 1000 / frame_rate_hz:
+        raise TwinError(
+            f"sensor.{key}", f"{time_ms:g}: longer than a frame",
+            f"up to {np.floor(1e5 / frame_rate_hz) / 100:g} at rig.frame_rate_hz = {frame_rate_hz:g}",
+        )  # fmt: skip
+
+
+def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+    """The plan stays over the floor and clear of it."""
+    size = terrain.size_m
+    if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
+        shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
+        raise TwinError(
+            "plan.area_m", f"{shown} m is larger than the terrain", f"up to {size[0]:.2f} x {size[1]:.2f} m"
+        )
+    clearance = least_clearance(plan, terrain.height_at)
+    if not clearance.inside:
+        raise TwinError("plan.area_m", "the path leaves the terrain", f"a path inside {size[0]:.2f} x {size[1]:.2f} m")
+    if clearance.least_m < scenario.plan.clearance_m:
+        needed = scenario.plan.altitude_m - clearance.least_m + scenario.plan.clearance_m
+        raise TwinError(
+            "plan.altitude_m",
+            f"{scenario.plan.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
+            f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
+            f"at least {needed:.2f} for {scenario.plan.clearance_m:g} m of clearance",
+        )
+
+
+def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
+    """Cells that cover all that the plan can see at the reference plane, and half a metre more."""
+    corners = plan.outline()[:, :2]
+    across_m, along_m = plan.footprint_m
+    margin = np.array([along_m, across_m]) / 2 + 0.5
+    cell = scenario.map.cell_m
+    west, south = np.floor((corners.min(axis=0) - margin) / cell) * cell
+    east, north = np.ceil((corners.max(axis=0) + margin) / cell) * cell
+    return MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))
