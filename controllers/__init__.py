@@ -1,1 +1,1 @@
-"""Where to go and how to get there."""
+"""Survey planning and vehicle control."""

@@ -1,4 +1,4 @@
-"""Thrust allocation: from a wrench on the body to the commands of its thrusters."""
+"""Thrust allocation: from a wrench on the body to thruster commands."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Allocation(NamedTuple):
-    """Shares a wrench [moment, force] among n thrusters.
+class ThrustAllocation(NamedTuple):
+    """Distributes a wrench [moment, force] over n thrusters.
 
     Args:
-        thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrusters' effect on the body.
-        command_table: (k,) commands, rising, over the part of the curve where the thrust rises with them.
-        thrust_table_n: (k,) their steady thrusts [N].
+        thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrust configuration matrix.
+        command_table: (k,) increasing commands, over the range in which thrust increases with the command.
+        thrust_table_n: (k,) steady thrust at these commands [N].
     """
 
     thrusts_from_wrench: Array
@@ -27,20 +27,25 @@ class Allocation(NamedTuple):
 
     @property
     def range_n(self) -> tuple[float, float]:
-        """Most thrust astern (negative) and ahead of one thruster [N]."""
+        """Returns the greatest reverse (negative) and forward thrust of one thruster [N]."""
         return float(self.thrust_table_n[0]), float(self.thrust_table_n[-1])
 
     def commands(self, wrench: Array) -> tuple[Array, float]:
-        """Commands in [-1, 1] (n,) and the share (0, 1] of the wrench [N m, N] that the thrusters can give.
+        """Computes thruster commands for a wrench.
 
-        A wrench beyond reach is scaled down as a whole: its direction is kept.
+        A wrench that would saturate a thruster is scaled down; its direction is kept.
+
+        Args:
+            wrench: (6,) [moment, force] in the body [N m, N].
+        Returns:
+            Commands (n,) in [-1, 1], and the factor in (0, 1] by which the wrench was scaled.
         """
-        return share_out(self, wrench)
+        return allocate_wrench(self, wrench)
 
 
 @njit(cache=True, nogil=True)
-def share_out(allocation, wrench):
-    """As `Allocation.commands`."""
+def allocate_wrench(allocation, wrench):
+    """Compiled kernel of `ThrustAllocation.commands`."""
     thrusts, table = allocation.thrusts_from_wrench @ wrench, allocation.thrust_table_n
     load = 1.0
     for thrust in thrusts:
@@ -48,18 +53,22 @@ def share_out(allocation, wrench):
     return np.interp(thrusts / load, table, allocation.command_table), 1 / load
 
 
-def allocation(effects: Array, thrust_of_command: Callable[[Array], Array], weights: Array | None = None) -> Allocation:
-    """The allocation of least weighted effort: f = W^-1 B' (B W^-1 B')^-1 tau minimises f' W f subject to B f = tau.
+def pseudo_inverse_allocation(
+    configuration: Array, thrust_of_command: Callable[[Array], Array], weights: Array | None = None
+) -> ThrustAllocation:
+    """Returns the allocation by the weighted pseudo-inverse of the thrust configuration matrix.
+
+    The thrusts f = W^-1 B' (B W^-1 B')^-1 tau minimise f' W f subject to B f = tau (Fossen 2011, section 12.3).
 
     Args:
-        effects: B (6, n), wrench [moment, force] in the body per newton of each thruster.
-        thrust_of_command: steady thrust [N] of commands in [-1, 1], rising around 0.
-        weights: diagonal of W (n,): a thruster of great weight is spared; all equal where None.
+        configuration: thrust configuration matrix B (6, n): wrench [moment, force] in the body per newton of thrust.
+        thrust_of_command: steady thrust [N] of commands in [-1, 1], increasing around 0.
+        weights: diagonal of W (n,); a thruster with a greater weight is used less. None: equal weights.
     """
-    eased = effects / (np.ones(effects.shape[1]) if weights is None else weights)
-    inverse = eased.T @ np.linalg.inv(effects @ eased.T)
+    weighted = configuration / (np.ones(configuration.shape[1]) if weights is None else weights)
+    inverse = weighted.T @ np.linalg.inv(configuration @ weighted.T)
     command = np.linspace(-1, 1, 2001)
     thrust = thrust_of_command(command)
-    # Fitted curves bend back just below full command: the inverse lives where the thrust still rises.
+    # The fitted thrust curve decreases near full command: only its increasing part can be inverted.
     low, high = int(np.argmin(thrust)), int(np.argmax(thrust))
-    return Allocation(inverse, command[low : high + 1], thrust[low : high + 1])
+    return ThrustAllocation(inverse, command[low : high + 1], thrust[low : high + 1])

@@ -1,4 +1,4 @@
-"""What a plan will cost and promise before anything is flown: keyframes, time, overlaps, depth noise, clearance."""
+"""Forecast of a survey plan: keyframes, duration, overlaps, depth noise and clearance."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ Array = NDArray[np.float64]
 
 
 class Forecast(NamedTuple):
-    """The plan in numbers, at the reference plane z = 0.
+    """Figures of a survey plan, for a floor at the reference plane z = 0.
 
     Args:
-        n_frames_per_keyframe: N.
-        keyframes_per_swath: M, of a leg or a loop.
-        n_tracks: L.
-        n_keyframes, n_frames: in all, without station keeping.
-        duration_s, path_m: of the whole flight, without station keeping.
-        speed_mps: along the swaths.
-        footprint_m: width (across the bow) and height (along it) of the image.
-        keyframe_spacing_m, swath_spacing_m: distance of neighbouring keyframes; greatest one of neighbouring swaths.
-        overlap_along, overlap_across: true shares, along the sides of the image on which the pattern counts them.
+        n_frames_per_keyframe: N, frames from one keyframe to the next.
+        keyframes_per_swath: M, keyframes of a leg or a loop.
+        n_tracks: L, number of tracks.
+        n_keyframes, n_frames: totals of the survey, without station keeping.
+        duration_s, path_m: totals of the survey, without station keeping.
+        speed_mps: cruise speed along the swaths.
+        footprint_m: width (across the bow) and height (along the bow) of the image on the floor.
+        keyframe_spacing_m: distance between consecutive keyframes.
+        swath_spacing_m: greatest distance between neighbouring swaths.
+        overlap_along: overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`.
+        overlap_across: sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`.
         disparity_px: expected disparity.
-        depth_sigma_m: expected depth noise of one stereo pair.
+        depth_sigma_m: expected standard deviation of the depth from one stereo pair.
     """
 
     n_frames_per_keyframe: int
@@ -48,9 +50,14 @@ class Forecast(NamedTuple):
 
 
 def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> Forecast:
-    """The plan's numbers (Negahdaripour & Madjidi 2003, section III-A).
+    """Computes the forecast of a plan (Negahdaripour & Madjidi 2003, section III-A).
 
-    With d = f b / Z the depth noise is sigma_Z = Z^2 / (f b) sigma_d.
+    With the disparity d = f b / Z, the standard deviation of depth is sigma_Z = Z^2 / (f b) sigma_d.
+
+    Args:
+        plan: the survey plan.
+        baseline_m: stereo baseline b.
+        disparity_sigma_px: standard deviation of disparity sigma_d.
     """
     tracks = range(1, plan.n_tracks + 1)
     keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
@@ -75,12 +82,12 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
 
 
 class Clearance(NamedTuple):
-    """How close the path comes to the floor.
+    """Clearance of a planned path above the floor.
 
     Args:
-        least_m: least vertical distance to the floor in sight; infinite where there is none.
-        x_m, y_m: the highest spot of the floor in sight.
-        inside: whether there is floor below the whole path.
+        least_m: least height of the camera above the floor in view; infinite if no floor is in view.
+        x_m, y_m: position of the highest point of the floor in view.
+        inside: whether the whole path lies above the terrain.
     """
 
     least_m: float
@@ -90,17 +97,18 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """How close the planned path comes to the floor under the camera's footprint, and between swaths.
+    """Computes the clearance of the planned path above the floor in the camera's footprint and between swaths.
 
     Args:
-        height_at: height of the floor [m] at arrays of x and y [m]; NaN where there is no floor. Floors are rectangles,
-            so that the waypoints tell whether all of the path lies inside.
-        sample_m: spacing of the heights looked at.
+        plan: the survey plan.
+        height_at: height of the floor [m] at arrays of x and y [m]; NaN outside the terrain. The terrain is a
+            rectangle, so the path lies inside it if all waypoints do.
+        sample_m: sampling distance of the heights.
     """
     path = plan.outline()[:, :2]
     along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along x
     south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
-    # row by row: a large floor at fine spacing would fill the memory
+    # Row by row, to limit memory on a large floor.
     tops = []
     for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
         near = path[np.abs(path[:, 1] - y) <= across_m + 1e-9, 0]

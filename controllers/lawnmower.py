@@ -1,7 +1,7 @@
-"""The lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
+"""Lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
 
-The vehicle keeps its bow to the east and flies every second leg backwards, so the top of the image always points east:
-keyframes follow each other along the image height, swaths lie side by side along the image width.
+The bow always points east and every second leg is flown backwards, so the top of the image always points east:
+consecutive keyframes are displaced along the image height, neighbouring swaths along the image width.
 """
 
 from __future__ import annotations
@@ -10,25 +10,27 @@ import math
 from itertools import pairwise
 
 from controllers.segments import Point, Segment, line
-from controllers.survey_plan import SurveyPlan, SurveyRequest, frames_per_keyframe, refuse_impossible, tracks_to_fly
+from controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, frames_per_keyframe, n_tracks_to_fly
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
-    """The survey that keeps the overlaps over an area (Negahdaripour & Madjidi 2003, section III-A).
+    """Plans a lawnmower survey of an area (Negahdaripour & Madjidi 2003, section III-A).
 
-    Legs run along x, at most (1 - overlap_across) ImgSize Altitude / FocalLength apart (ImgSize is the image width),
-    and split the area into equal strips, an even number of them; the first is in the south.
+    The legs run along x, at most (1 - overlap_across) ImgSize Altitude / FocalLength apart (ImgSize is the image
+    width). They divide the area into an even number of equal strips; the first leg is the southernmost.
 
+    Args:
+        request: requirements of the survey.
     Raises:
-        PlanFault: the key at fault, what is wrong, what is allowed.
+        TwinError: a requirement is invalid or cannot be met.
     """
-    refuse_impossible(request)
+    check_request(request)
     length_m, width_m = request.area_m
-    widest_m = (1 - request.overlap_across) * request.footprint_m[0]
-    # A strip that exceeds the limit by rounding alone must not cost a track.
-    filling = math.ceil(width_m / widest_m / 2 - 1e-9)
-    n_tracks = tracks_to_fly(request, filling)
-    spacing_m = width_m / (2 * filling)
+    max_spacing_m = (1 - request.overlap_across) * request.footprint_m[0]
+    # The tolerance: a strip that exceeds the limit only by rounding must not add a track.
+    n_filling = math.ceil(width_m / max_spacing_m / 2 - 1e-9)
+    n_tracks = n_tracks_to_fly(request, n_filling)
+    spacing_m = width_m / (2 * n_filling)
     return SurveyPlan(
         paths=tuple(_track(request, spacing_m, track, last=track == n_tracks) for track in range(1, n_tracks + 1)),
         area_m=request.area_m,
@@ -47,7 +49,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
 
 
 def _track(request: SurveyRequest, spacing_m: float, track: int, last: bool) -> tuple[Segment, ...]:
-    """A track (from 1): leg out, over, leg back, on to the next but from the last."""
+    """Returns a track (from 1): leg, cross segment, return leg and, unless it is the last, the segment to the next."""
     half_x, half_y = request.area_m[0] / 2, request.area_m[1] / 2
     south = (2 * track - 1.5) * spacing_m - half_y
     out = [(-half_x, south), (half_x, south)]

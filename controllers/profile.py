@@ -1,4 +1,4 @@
-"""The trapezoidal speed profile of a straight segment, from rest to rest."""
+"""Trapezoidal speed profile along a segment, from rest to rest."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Speeds up at a constant rate, cruises, slows down at the same rate; a triangle where the segment is too short.
+    """Trapezoidal speed profile: constant acceleration, cruise, constant deceleration; triangular on a short segment.
 
     Args:
         length_m: length of the segment.
         cruise_mps: speed limit.
-        acceleration_mps2: rate of speeding up and slowing down.
+        acceleration_mps2: acceleration, and deceleration at the end.
     """
 
     length_m: float
@@ -23,15 +23,19 @@ class SpeedProfile:
 
     @cached_property
     def peak_mps(self) -> float:
-        """The speed that is reached."""
+        """Returns the greatest speed on the segment."""
         return min(self.cruise_mps, math.sqrt(self.length_m * self.acceleration_mps2))
 
     @cached_property
     def duration_s(self) -> float:
+        """Returns the time from start to end."""
         return self.length_m / self.peak_mps + self.peak_mps / self.acceleration_mps2
 
     def at(self, time_s: float) -> tuple[float, float, float]:
-        """Distance [m], speed [m/s] and acceleration [m/s2] at a time since the start; at rest before and after."""
+        """Returns distance [m], speed [m/s] and acceleration [m/s2] at a time since the start.
+
+        The speed is 0 before the start and after the end.
+        """
         duration, peak, rate = self.duration_s, self.peak_mps, self.acceleration_mps2
         if not 0 <= time_s < duration:
             return (0.0 if time_s < 0 else self.length_m), 0.0, 0.0
@@ -40,5 +44,5 @@ class SpeedProfile:
             return 0.5 * rate * time_s**2, rate * time_s, rate
         if time_s < duration - ramp:
             return peak * (time_s - 0.5 * ramp), peak, 0.0
-        left = duration - time_s
-        return self.length_m - 0.5 * rate * left**2, rate * left, -rate
+        remaining = duration - time_s
+        return self.length_m - 0.5 * rate * remaining**2, rate * remaining, -rate

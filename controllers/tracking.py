@@ -1,4 +1,4 @@
-"""Trajectory following and station keeping: from where the vehicle believes it is to the commands of its thrusters."""
+"""Trajectory tracking and station keeping: from the estimated pose and velocity to thruster commands."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from controllers.allocation import Allocation, share_out
+from controllers.allocation import ThrustAllocation, allocate_wrench
 from controllers.segments import Reference
 
 Array = NDArray[np.float64]
 
-ATTITUDE_BANDWIDTH = 2.0  # of attitude over position: the inner loop must be the faster one
-INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # of the integral's pole over the natural frequency
-INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: more than any current worth flying in asks
+ATTITUDE_BANDWIDTH = 2.0  # attitude bandwidth over position bandwidth: the inner loop must be faster
+INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action over the natural frequency
+INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: more than any survey current requires
 
 
 class HullModel(NamedTuple):
-    """What the controller believes about the hull; each (6,), about and along the body's x, y, z axes.
+    """Model of the hull in the controller; (6,) arrays are about, then along the body's x, y, z axes.
 
     Args:
-        inertia: moments of inertia [kg m2] and masses [kg], with added mass.
-        added_mass: (3,) the added masses alone [kg].
-        linear_drag: [N m s/rad], [N s/m], positive.
-        quadratic_drag: [N m s2/rad2], [N s2/m2], positive.
+        inertia: (6,) moments of inertia [kg m2] and masses [kg], including added mass.
+        added_mass: (3,) added masses [kg].
+        linear_drag: (6,) [N m s/rad], [N s/m], positive.
+        quadratic_drag: (6,) [N m s2/rad2], [N s2/m2], positive.
     """
 
     inertia: Array
@@ -35,10 +35,11 @@ class HullModel(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def cruise_wrench(hull: HullModel, velocity: Array) -> Array:
-    """The wrench (6,) that keeps up a velocity (3,) in still water: drag, and v x M_A v against the Munk moment.
+def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
+    """Returns the wrench (6,) that sustains a body velocity (3,) in still water: drag, and minus the Munk moment.
 
-    The Munk moment turns a hull broadside. At survey speed it outweighs this vehicle's righting moment in pitch.
+    The Munk moment -v x M_A v turns a hull broadside. At survey speed it exceeds the righting moment in
+    pitch of the BlueROV2.
     """
     u, v, w = velocity
     x, y, z = hull.added_mass
@@ -47,124 +48,136 @@ def cruise_wrench(hull: HullModel, velocity: Array) -> Array:
 
 
 class Gains(NamedTuple):
-    """Gains of error, its rate and its integral, each (6,) [1/s2, 1/s, 1/s3]."""
+    """PID gains of the pose error, each (6,) [1/s2, 1/s, 1/s3]."""
 
-    error: Array
-    rate: Array
+    proportional: Array
+    derivative: Array
     integral: Array
 
 
-def critical_gains(natural_frequency_radps: float) -> Gains:
-    """Gains that give a free mass the poles (s + w)^2 (s + a), a = INTEGRAL_BANDWIDTH w, on each axis."""
+def pole_placement_gains(natural_frequency_radps: float) -> Gains:
+    """Returns the gains that give a free mass the poles (s + w)^2 (s + a), a = INTEGRAL_BANDWIDTH w, on each axis."""
     w = natural_frequency_radps * np.array([ATTITUDE_BANDWIDTH] * 3 + [1.0] * 3)
     a = INTEGRAL_BANDWIDTH * w
-    return Gains(error=w**2 + 2 * w * a, rate=2 * w + a, integral=a * w**2)
+    return Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w**2)
 
 
 def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Where a level body shall be so that a point of it (3,) [m, in the body] follows its own reference."""
-    return camera._replace(position=camera.position - level_arm(float(camera.yaw), lever_arm_m))
+    """Returns the reference of a level body whose camera follows a reference.
+
+    Args:
+        camera: reference of the camera.
+        lever_arm_m: (3,) position of the camera in the body.
+    """
+    return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), lever_arm_m))
 
 
 @njit(cache=True, nogil=True)
-def level_arm(yaw: float, lever_arm_m: Array) -> Array:
-    """From a level body to a point of it (3,) [m, in the body], in the world."""
+def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
+    """Rotates a lever arm (3,) [m] from a level body with this yaw [rad] to the world."""
     c, s = np.cos(yaw), np.sin(yaw)
     forward, left, up = lever_arm_m
     return np.array([c * forward - s * left, s * forward + c * left, up])
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
-    """Velocity (3,) [m/s] that takes a point to its reference: along with it, and back to it in a time 1 / w."""
+    """Returns the velocity command (3,) [m/s]: reference velocity plus a correction of the position error at rate w.
+
+    Args:
+        position: (3,) estimated position [m].
+        reference: reference of the same point.
+        natural_frequency_radps: w.
+    """
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
-class Steering(NamedTuple):
-    """What a pilot goes by.
+class ControllerState(NamedTuple):
+    """Parameters and integral of the pose controller; `integral` is modified in place.
 
     Args:
-        hull: the believed hull.
-        allocation: of the thrusters.
-        gains: of its errors.
+        hull: hull model.
+        allocation: thrust allocation.
+        gains: PID gains.
         period_s: time between commands.
-        integral: (6,) of its errors [rad/s2 in the body, m/s2 in the world: currents and buoyancy do not turn with
-            us], changed in place.
+        integral: (6,) integral action [rad/s2 in the body, m/s2 in the world]. The linear part is in the world because
+            current and buoyancy do not rotate with the vehicle.
     """
 
     hull: HullModel
-    allocation: Allocation
+    allocation: ThrustAllocation
     gains: Gains
     period_s: float
     integral: Array
 
 
-class Pilot:
-    """Follows a reference of the body with level attitude: feed-forward of drag and acceleration, PD and integral.
+class PoseController:
+    """PID controller of position and level attitude, with feed-forward of drag and acceleration.
 
     Args:
-        hull: the believed hull.
-        allocation: of the thrusters.
+        hull: hull model.
+        allocation: thrust allocation.
         natural_frequency_radps: closed-loop bandwidth of position.
         period_s: time between commands.
     """
 
-    def __init__(self, hull: HullModel, allocation: Allocation, natural_frequency_radps: float, period_s: float):
-        self.steering = Steering(hull, allocation, critical_gains(natural_frequency_radps), period_s, np.zeros(6))
+    def __init__(self, hull: HullModel, allocation: ThrustAllocation, natural_frequency_radps: float, period_s: float):
+        gains = pole_placement_gains(natural_frequency_radps)
+        self.state = ControllerState(hull, allocation, gains, period_s, np.zeros(6))
 
     def command(self, world_from_body: Array, twist_body: Array, reference: Reference) -> Array:
-        """Thruster commands in [-1, 1] (n,) for one period.
+        """Computes the thruster commands (n,) in [-1, 1] for one period.
 
         Args:
             world_from_body: (4, 4) estimated pose.
             twist_body: (6,) estimated [angular, linear] velocity in the body [rad/s, m/s].
-            reference: of the body, in the world.
+            reference: reference of the body in the world.
         """
-        return commanded(
-            self.steering, world_from_body, twist_body, reference.position, reference.velocity,
+        return control_thrusters(
+            self.state, world_from_body, twist_body, reference.position, reference.velocity,
             reference.acceleration, float(reference.yaw),
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def commanded(steering, pose, twist, position, velocity, acceleration, yaw):
-    """As `Pilot.command`."""
+def control_thrusters(controller, pose, twist, position, velocity, acceleration, yaw):
+    """Compiled kernel of `PoseController.command`; position, velocity, acceleration and yaw are the reference."""
     wrench, error = _wrench(
-        pose, twist, position, velocity, acceleration, yaw, steering.hull, steering.gains, steering.integral
+        pose, twist, position, velocity, acceleration, yaw, controller.hull, controller.gains, controller.integral
     )
-    commands, share = share_out(steering.allocation, wrench)
-    _integrate(steering.integral, steering.gains.integral * steering.period_s, error, share < 1)
+    commands, scale = allocate_wrench(controller.allocation, wrench)
+    _integrate(controller.integral, controller.gains.integral * controller.period_s, error, scale < 1)
     return commands
 
 
 @njit(cache=True, nogil=True)
 def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, integral):
-    """Wrench [moment, force] in the body (6,), and the error behind it, [rotation in the body, way in the world]."""
+    """Returns the wrench [moment, force] in the body (6,) and the error [rotation in body, position in world] (6,)."""
     error = _pose_error(pose, position, yaw)
-    ahead = _into_body(pose, velocity)
-    push = _into_body(pose, integral[3:] + acceleration)
-    wanted = gains.error * error - gains.rate * twist
+    velocity_body = _rotate_to_body(pose, velocity)
+    feedforward = _rotate_to_body(pose, integral[3:] + acceleration)
+    target = gains.proportional * error - gains.derivative * twist
     for k in range(3):
-        wanted[k] += integral[k]
-        wanted[3 + k] += gains.rate[3 + k] * ahead[k] + push[k]
-    wrench = hull.inertia * wanted + cruise_wrench(hull, ahead)
-    in_world = error.copy()
+        target[k] += integral[k]
+        target[3 + k] += gains.derivative[3 + k] * velocity_body[k] + feedforward[k]
+    wrench = hull.inertia * target + feedforward_wrench(hull, velocity_body)
+    integrated_error = error.copy()
     for i in range(3):
-        in_world[3 + i] = position[i] - pose[i, 3]
-    return wrench, in_world
+        integrated_error[3 + i] = position[i] - pose[i, 3]
+    return wrench, integrated_error
 
 
 @njit(cache=True, nogil=True)
 def _integrate(integral, gain, error, saturated):
-    """Lets the integral grow within its limits; while the thrusters saturate it may only shrink (anti-windup)."""
+    """Updates the integral in place within its limits; while thrusters saturate, it can only shrink (anti-windup)."""
     for k in range(6):
-        grown = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
-        if not (saturated and abs(grown) > abs(integral[k])):
-            integral[k] = grown
+        updated = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
+        if not (saturated and abs(updated) > abs(integral[k])):
+            integral[k] = updated
 
 
 @njit(cache=True, nogil=True)
-def _into_body(pose, vector):
-    """A vector (3,) of the world in the axes of a body."""
+def _rotate_to_body(pose, vector):
+    """Rotates a vector (3,) from the world to the body."""
     result = np.zeros(3)
     for i in range(3):
         for k in range(3):
@@ -174,11 +187,11 @@ def _into_body(pose, vector):
 
 @njit(cache=True, nogil=True)
 def _pose_error(pose, position, yaw):
-    """What is missing from the pose to a level reference, [rotation, translation] in the body [rad, m]. -> (6,)."""
+    """Returns the error (6,) from the pose to a level reference, [rotation, translation] in the body [rad, m]."""
     c, s = np.cos(yaw), np.sin(yaw)
-    # of body_from_wanted, column by column: the body's axes seen from the level reference
-    x, y = _into_body(pose, np.array([c, s, 0.0])), _into_body(pose, np.array([-s, c, 0.0]))
-    z = _into_body(pose, np.array([0.0, 0.0, 1.0]))
-    way = _into_body(pose, position - pose[:3, 3])
+    # columns of body_from_reference
+    x, y = _rotate_to_body(pose, np.array([c, s, 0.0])), _rotate_to_body(pose, np.array([-s, c, 0.0]))
+    z = _rotate_to_body(pose, np.array([0.0, 0.0, 1.0]))
+    t = _rotate_to_body(pose, position - pose[:3, 3])
     # half the antisymmetric part: the rotation vector for small angles, bounded for large ones
-    return np.array([0.5 * (y[2] - z[1]), 0.5 * (z[0] - x[2]), 0.5 * (x[1] - y[0]), way[0], way[1], way[2]])
+    return np.array([0.5 * (y[2] - z[1]), 0.5 * (z[0] - x[2]), 0.5 * (x[1] - y[0]), t[0], t[1], t[2]])

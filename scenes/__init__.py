@@ -1,1 +1,1 @@
-"""The world: vehicle, rig, lamps, water, missions, and the builder that turns them into a MuJoCo model."""
+"""Vehicle parameters, the builder of the MuJoCo scene model, and the scenario files."""

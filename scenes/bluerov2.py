@@ -1,8 +1,8 @@
-"""BlueROV2 Heavy in numbers.
+"""Physical parameters of the BlueROV2 Heavy.
 
 Source: von Benzon et al. 2022, "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot",
 J. Mar. Sci. Eng. 10, 1898, Table A1. That paper's body axes are x forward, y right, z down; here they are x forward,
-y left, z up, about the centre of gravity, so that y and z change sign (the horizontal thrusters sit 0.085 m BELOW it).
+y left, z up, about the centre of gravity, so y and z change sign (the horizontal thrusters are 0.085 m BELOW it).
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ Array = NDArray[np.float64]
 
 
 def _array(*rows: object) -> Array:
+    """Returns a read-only array."""
     values = np.array(rows, dtype=np.float64)
     values.setflags(write=False)
     return values
 
 
 def _thruster_positions_m() -> Array:
+    """Returns the default thruster positions (8, 3) [m]."""
     x, y, z = 0.156, 0.111, -0.085
     fore, side = 0.12, 0.218
     horizontal = [[x, -y, z], [x, y, z], [-x, -y, z], [-x, y, z]]
@@ -30,25 +32,29 @@ def _thruster_positions_m() -> Array:
 
 
 def _thruster_directions() -> Array:
+    """Returns the default thruster directions (8, 3)."""
     c = np.sqrt(0.5)  # vectored at 45 deg, the front pair inwards, the rear pair outwards
     horizontal = [[c, c, 0.0], [c, -c, 0.0], [c, -c, 0.0], [c, c, 0.0]]
     return _array(*horizontal, *([[0.0, 0.0, 1.0]] * 4))
 
 
 @dataclass(frozen=True)
-class Vehicle:
-    """A vehicle's rigid body, hydrodynamics and thrusters; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
+class VehicleParameters:
+    """Rigid body, hydrodynamics and thrusters of a vehicle; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
 
     Args:
-        mass_kg, displaced_volume_m3: dry mass, displaced water.
+        mass_kg, displaced_volume_m3: dry mass, volume of displaced water.
         inertia_kgm2: (3,) principal moments about the centre of gravity, along the body axes.
         centre_of_buoyancy_m: (3,) from the centre of gravity, in the body.
-        added_mass: (6,) diagonal of M_A [kg, kg m2].
-        linear_damping, quadratic_damping: (6,) diagonals of D(nu) = D_l + D_q |nu|.
-        thruster_positions_m, thruster_directions: (8, 3) in the body: four horizontal (front right, front left, rear
-            right, rear left), four vertical in the same order. Positive thrust pushes the vehicle along its direction.
-        thrust_coefficients: of u^9, u^7, u^5, u^3, u: thrust [N] of the T200 at command u in [-1, 1].
-        thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) of the transfer function from command to thrust.
+        added_mass: (6,) diagonal of the added mass matrix M_A [kg, kg m2].
+        linear_damping, quadratic_damping: (6,) diagonals of D_l and D_q in D(nu) = D_l + D_q |nu|.
+        thruster_positions_m, thruster_directions: (8, 3) in the body: four horizontal thrusters (front right, front
+            left, rear right, rear left), then four vertical ones in the same order. Positive thrust pushes the vehicle
+            along the direction.
+        thrust_coefficients: polynomial coefficients of u^9, u^7, u^5, u^3, u for the thrust [N] of a T200 thruster at
+            command u in [-1, 1].
+        thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) of the transfer function from steady
+            thrust to thrust.
         size_m: (3,) length, width, height of the hull.
     """
 
@@ -68,10 +74,13 @@ class Vehicle:
     size_m: Array = field(default_factory=lambda: _array(0.457, 0.575, 0.254))
 
     @property
-    def allocation(self) -> Array:
-        """(6, 8) wrench [N, N m] about the centre of gravity per newton of each thruster."""
+    def thrust_configuration(self) -> Array:
+        """Returns the thrust configuration matrix (6, 8) (Fossen 2011, section 12.3).
+
+        Column k is the wrench [force, moment] about the centre of gravity per newton of thruster k [-, m].
+        """
         torque = np.cross(self.thruster_positions_m, self.thruster_directions)
         return np.vstack([self.thruster_directions.T, torque.T])
 
 
-BLUEROV2_HEAVY = Vehicle()
+BLUEROV2_HEAVY = VehicleParameters()

@@ -1,4 +1,4 @@
-"""The world as a MuJoCo model: the floor, a free-floating BlueROV2, its cameras and lamps."""
+"""MuJoCo model of the scene: the seafloor, a free-floating BlueROV2, its cameras and lamps."""
 
 from __future__ import annotations
 
@@ -8,29 +8,47 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.bluerov2 import BLUEROV2_HEAVY, Vehicle
+from scenes.bluerov2 import BLUEROV2_HEAVY, VehicleParameters
 from scenes.floor import add_floor
 from scenes.gl import MjModel, MjsBody, MjSpec, mujoco
 from terrains import Terrain
 
 Array = NDArray[np.float64]
-VEHICLE_GROUP = 2  #: of geoms that the survey's cameras do not draw
+VEHICLE_GROUP = 2  #: geom group of the vehicle, which the survey's cameras do not render
 CAMERAS = ("left", "right")
 
 
 @dataclass(frozen=True)
-class SceneModel:
-    """A compiled model and where its parts are.
+class CameraPair:
+    """The two identical cameras of the stereo rig.
 
     Args:
-        model: MuJoCo's model; mj_data is its user's.
-        terrain: the floor it was built from.
-        tile_geom_ids: (n,) geoms of the floor's tiles.
-        tile_low_m, tile_high_m: (n, 3) opposite corners of the tiles' boxes in the world.
-        body_id: the vehicle; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
-        camera_ids: left, right.
-        thruster_site_ids: (8,), in the order of the vehicle's allocation; a site's z axis is the direction of thrust.
-        lamp_site_ids: in the order given.
+        width_px, height_px: image size.
+        vfov_deg: vertical field of view.
+        baseline_m: distance of the right camera from the left one, along the left camera's +x axis.
+        body_from_camera: (4, 4) pose of the left camera in the body; camera axes x right, y down, z forward.
+    """
+
+    width_px: int
+    height_px: int
+    vfov_deg: float
+    baseline_m: float
+    body_from_camera: Array
+
+
+@dataclass(frozen=True)
+class SceneModel:
+    """Compiled MuJoCo model and the ids of its parts.
+
+    Args:
+        model: MuJoCo model, without any MjData.
+        terrain: the terrain that the floor was built from.
+        tile_geom_ids: (n,) geom ids of the floor tiles.
+        tile_low_m, tile_high_m: (n, 3) lowest and highest corners of the tiles' bounding boxes in the world.
+        body_id: body of the vehicle; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
+        camera_ids: ids of the left and the right camera.
+        thruster_site_ids: (8,) in the order of `VehicleParameters`; the z axis of a site is the direction of thrust.
+        lamp_site_ids: (n,) in the order of the lamp positions.
     """
 
     model: MjModel
@@ -46,26 +64,24 @@ class SceneModel:
 
 def build(
     terrain: Terrain,
-    image_width_px: int,
-    image_height_px: int,
-    vfov_deg: float,
-    baseline_m: float,
-    body_from_camera: Array,
+    cameras: CameraPair,
     timestep_s: float,
     lamp_positions_m: Sequence[Sequence[float]] | Array = (),
 ) -> SceneModel:
-    """Floor and vehicle as one model, with gravity; buoyancy, drag and thrust are the physics' part.
+    """Compiles the floor and the vehicle into one MuJoCo model.
+
+    The model contains gravity; `twin.simulate` adds buoyancy, drag and thrust.
 
     Args:
-        vfov_deg: vertical field of view of both cameras.
-        baseline_m: the right camera's distance at +x of the left.
-        body_from_camera: (4, 4) pose of the left camera in the body, x right, y down, z forward.
+        terrain: the seafloor.
+        cameras: the stereo rig.
+        timestep_s: physics timestep.
         lamp_positions_m: (n, 3) in the body.
     """
-    spec = _empty_model(image_width_px, image_height_px, timestep_s)
+    spec = _empty_model(cameras.width_px, cameras.height_px, timestep_s)
     tiles = add_floor(spec, terrain)
     body = _add_vehicle(spec, BLUEROV2_HEAVY)
-    _add_cameras(body, baseline_m, body_from_camera, vfov_deg)
+    _add_cameras(body, cameras)
     for k, position in enumerate(lamp_positions_m):
         body.add_site(name=f"lamp_{k}", pos=np.asarray(position, dtype=np.float64), group=VEHICLE_GROUP)
     model = spec.compile()
@@ -83,19 +99,20 @@ def build(
 
 
 def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -> MjSpec:
+    """Returns a model specification without bodies, lights or multisampling."""
     spec = mujoco.MjSpec()
     spec.modelname = "seabed"
     spec.option.timestep = timestep_s
-    spec.stat.extent = 1.0  # MuJoCo multiplies the clipping distances by it
+    spec.stat.extent = 1.0  # MuJoCo scales the clipping distances by it
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = 0  # resolving samples would shift depth by a fraction of a pixel
+    spec.visual.quality.offsamples = 0  # multisampling would shift depth by a fraction of a pixel
     spec.visual.quality.shadowsize = 0
     spec.visual.global_.offwidth, spec.visual.global_.offheight = image_width_px, image_height_px
     return spec
 
 
-def _add_vehicle(spec: MjSpec, vehicle: Vehicle) -> MjsBody:
-    """The rigid body about its centre of gravity, with sites at its thrusters and a simple hull to look at."""
+def _add_vehicle(spec: MjSpec, vehicle: VehicleParameters) -> MjsBody:
+    """Adds the rigid body, its origin in the centre of gravity, with a visual hull and a site at each thruster."""
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint(name="vehicle")
     body.explicitinertial = True
@@ -109,19 +126,20 @@ def _add_vehicle(spec: MjSpec, vehicle: Vehicle) -> MjsBody:
     return body
 
 
-def _add_hull(body: MjsBody, vehicle: Vehicle) -> None:
-    """Float and frame as two boxes, blue over black; massless, since the body's inertia is given."""
+def _add_hull(body: MjsBody, vehicle: VehicleParameters) -> None:
+    """Adds float and frame as two boxes, blue above black; they are massless because the body has its own inertia."""
     length, width, height = vehicle.size_m / 2
-    looks = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
-    body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **looks)
-    body.add_geom(name="frame", size=[length, width / 2, height / 2], pos=[0, 0, -0.03], rgba=[0.1] * 3 + [1], **looks)
+    common = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
+    body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **common)
+    body.add_geom(name="frame", size=[length, width / 2, height / 2], pos=[0, 0, -0.03], rgba=[0.1] * 3 + [1], **common)
 
 
-def _add_cameras(body: MjsBody, baseline_m: float, body_from_camera: Array, vfov_deg: float) -> None:
-    """The stereo pair; MuJoCo's cameras have y up and look along -z."""
+def _add_cameras(body: MjsBody, cameras: CameraPair) -> None:
+    """Adds the stereo pair; a MuJoCo camera has y up and points along -z."""
+    body_from_camera = cameras.body_from_camera
     rotation = body_from_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
-    for name, offset_m in zip(CAMERAS, (0.0, baseline_m), strict=True):
+    for name, offset_m in zip(CAMERAS, (0.0, cameras.baseline_m), strict=True):
         position = body_from_camera[:3, 3] + offset_m * body_from_camera[:3, 0]
-        body.add_camera(name=name, pos=position, quat=quaternion, fovy=vfov_deg)
+        body.add_camera(name=name, pos=position, quat=quaternion, fovy=cameras.vfov_deg)

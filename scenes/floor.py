@@ -1,7 +1,7 @@
-"""The floor as drawn: a terrain cut into textured tiles, so that only what a camera sees need be drawn.
+"""Seafloor as textured mesh tiles in a MuJoCo model, so that only the tiles in view have to be rendered.
 
-A tile is a mesh and not a height field: MuJoCo draws it twice as fast (shared vertices), places its texture exactly
-(its own texture coordinates) and gives it no walls.
+A tile is a mesh and not a height field: MuJoCo renders it twice as fast (shared vertices), maps its texture exactly
+(explicit texture coordinates) and adds no side walls.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from scenes.gl import MjSpec, mujoco
 from terrains import Terrain
+from twin.core.grid_triangles import grid_triangles
 
-TILE_CELLS = 48  #: measured: smaller tiles cost state changes, larger ones vertices that no camera sees
-MAX_TILES = 900  #: MuJoCo draws at most 1000 textures
-MARGIN_TEXELS = 16  #: of neighbouring texture around each tile: enough for filtering 4 mip-map levels down
+TILE_CELLS = 48  #: cells along a tile; measured: smaller tiles cost state changes, larger ones vertices out of view
+MAX_TILES = 900  #: MuJoCo supports at most 1000 textures
+MARGIN_TEXELS = 16  #: margin of neighbouring texture around each tile: enough to filter 4 mip-map levels
 FLOOR_GROUP = 0
 
 
 class Tile(NamedTuple):
-    """One piece of the floor: its name and its corners low, high (3,) in the world [m]."""
+    """One tile of the floor: geom name, lowest and highest corner (3,) of its bounding box in the world [m]."""
 
     name: str
     low_m: NDArray[np.float64]
@@ -30,7 +31,7 @@ class Tile(NamedTuple):
 
 
 def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
-    """Adds the terrain to the model's world as fixed, glowing tiles without contact."""
+    """Adds the terrain to the model as static, self-lit tiles without contact; returns the tiles."""
     ny, nx = terrain.height_m.shape
     cells = tile_cells(ny - 1, nx - 1)
     tiles = []
@@ -42,7 +43,7 @@ def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
 
 
 def tile_cells(n_rows: int, n_cols: int) -> int:
-    """Cells along a tile's side: the usual number, or as many more as keep the number of tiles down."""
+    """Returns the cells along a tile's side: TILE_CELLS, or more where that would exceed MAX_TILES tiles."""
     cells = TILE_CELLS
     while -(-n_rows // cells) * -(-n_cols // cells) > MAX_TILES:
         cells += 16
@@ -50,12 +51,13 @@ def tile_cells(n_rows: int, n_cols: int) -> int:
 
 
 def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
+    """Adds the tile of these grid nodes: texture, material, mesh and geom."""
     name = f"floor_{rows.start}_{cols.start}"
     texture, texcoord = _tile_texture(terrain, rows, cols)
     image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     image.height, image.width = texture.shape[:2]
     image.data = texture.tobytes()
-    # emission alone: with no light in the scene the drawn colour is the texture's
+    # emission only: without a light in the scene the rendered colour is the texture's
     material = spec.add_material(name=name, emission=1.0, specular=0.0, shininess=0.0, reflectance=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     vertices = _add_mesh(spec, name, terrain, rows, cols, texcoord)
@@ -74,7 +76,7 @@ def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
 def _add_mesh(
     spec: MjSpec, name: str, terrain: Terrain, rows: slice, cols: slice, texcoord: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Adds a tile's triangles, two a cell along (r, c)-(r + 1, c + 1); returns its vertices (n, 3) in the world [m]."""
+    """Adds the mesh of a tile, with cells split along (r, c)-(r + 1, c + 1); returns its vertices (n, 3) [m]."""
     heights = terrain.height_m[rows, cols]
     x_m = terrain.west_m + terrain.spacing_m * np.arange(cols.start, cols.stop)
     y_m = terrain.south_m + terrain.spacing_m * np.arange(rows.start, rows.stop)
@@ -84,25 +86,25 @@ def _add_mesh(
     mesh.uservert = vertices.ravel()
     mesh.userface = _faces(*heights.shape).ravel()
     mesh.usertexcoord = texcoord.ravel()
-    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit: one normal lets the driver share vertices
+    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit: equal normals let the driver share vertices
     return vertices
 
 
 def _faces(n_rows: int, n_cols: int) -> NDArray[np.int32]:
-    """(2 * cells, 3) vertex numbers, counter-clockwise from above."""
+    """Returns the vertex indices (2 * cells, 3) of the triangles, counter-clockwise as seen from above."""
     node = np.arange(n_rows * n_cols, dtype=np.int32).reshape(n_rows, n_cols)
-    sw, se, ne, nw = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
-    return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
+    return grid_triangles(node)
 
 
 def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A tile's cut of the texture with margins, and where each node lies on it.
+    """Returns the texture of a tile with margins, and the texture coordinates of its nodes.
 
-    The margins belong to the neighbours: filtering reads the same texels on both sides of a border, so none shows. The
-    cut starts and ends at multiples of 16 texels, which keeps the mip-map levels aligned from tile to tile as well.
+    The margins repeat the texture of the neighbouring tiles: filtering reads the same texels on both sides of a border,
+    so no seam is visible. The cutout starts and ends at multiples of 16 texels, which aligns the mip-map levels of
+    adjacent tiles.
 
     Returns:
-        (h, w, 3) uint8; (nodes, 2) texture coordinates, 0 to 1, from the cut's north-west corner.
+        (h, w, 3) uint8 texture; (nodes, 2) texture coordinates, 0 to 1, from the cutout's north-west corner.
     """
     ny, nx = terrain.height_m.shape
     h, w = terrain.texture.shape[:2]
@@ -118,5 +120,6 @@ def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[n
 
 
 def _aligned(low: float, high: float) -> tuple[int, int]:
+    """Returns the interval, rounded outwards to multiples of MARGIN_TEXELS and extended by one margin on each side."""
     step = MARGIN_TEXELS
     return int(np.floor(low / step) - 1) * step, int(np.ceil(high / step) + 1) * step

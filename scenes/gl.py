@@ -1,6 +1,6 @@
-"""The one door to MuJoCo: ``from scenes.gl import mujoco`` makes sure that it can draw without a window.
+"""MuJoCo, configured for offscreen rendering. All modules import it from here: ``from scenes.gl import mujoco``.
 
-MuJoCo imports PyOpenGL when it is imported itself, so what follows has to happen before, here and nowhere else.
+MuJoCo imports PyOpenGL when it is imported itself, so the OpenGL backend must be chosen before that.
 """
 
 from __future__ import annotations
@@ -10,42 +10,38 @@ import os
 import sys
 from typing import Any, TypeAlias
 
+from twin.errors import TwinError
+
 INSTALL_LINE = "apt-get install -y libegl1 libgl1 libgl1-mesa-dri"
 
 
-class GlMissing(RuntimeError):  # noqa: N818 (said as it is)
-    """No OpenGL to draw with: the field, what is wrong, what would be right."""
-
-    def __init__(self, problem: str):
-        self.field, self.problem = "rendering", f"no OpenGL on this machine: {problem}"
-        self.allowed = f"a working EGL, on Debian or Ubuntu by: {INSTALL_LINE}"
-        super().__init__(f"{self.field}: {self.problem} (allowed: {self.allowed})")
-
-
-def _prepare() -> str:
-    """Chooses EGL unless told otherwise and mends old PyOpenGL; returns why EGL cannot be had ("" if it can).
+def _configure_egl() -> str:
+    """Selects EGL unless MUJOCO_GL is set, and patches old PyOpenGL versions.
 
     PyOpenGL 3.1.0, which pyrender pins, lacks the type EGLDeviceEXT that MuJoCo needs; it is an opaque pointer.
+
+    Returns:
+        Why EGL cannot be loaded; "" if it can, or if another backend is selected.
     """
     if sys.platform != "linux" or os.environ.setdefault("MUJOCO_GL", "egl").strip().lower() != "egl":
         return ""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     try:
         from OpenGL import EGL
-    except (ImportError, AttributeError, OSError, TypeError) as error:  # PyOpenGL's ways of saying: no libEGL
-        os.environ["MUJOCO_GL"] = "disabled"  # physics works without
+    except (ImportError, AttributeError, OSError, TypeError) as error:  # PyOpenGL raises any of these without libEGL
+        os.environ["MUJOCO_GL"] = "disabled"  # physics works without OpenGL
         return f"{type(error).__name__}: {error}"
     if not hasattr(EGL, "EGLDeviceEXT"):
         EGL.EGLDeviceEXT = ctypes.c_void_p  # pyright: ignore[reportAttributeAccessIssue]
     return ""
 
 
-_why_missing = _prepare()
+_egl_error = _configure_egl()
 
 import mujoco as _mujoco  # noqa: E402
 
-mujoco: Any = _mujoco  #: its names come from compiled modules, which type checkers cannot see into
-#: For signatures: MuJoCo's model, its source and a body of that, what is drawn.
+mujoco: Any = _mujoco  #: typed as Any: its names come from compiled modules, which type checkers cannot read
+#: Type aliases for signatures: compiled model, model specification, body of a specification, renderable scene.
 MjModel: TypeAlias = Any
 MjSpec: TypeAlias = Any
 MjsBody: TypeAlias = Any
@@ -53,20 +49,26 @@ MjvScene: TypeAlias = Any
 
 
 def offscreen_context(width_px: int, height_px: int) -> Any:
-    """A current OpenGL context without a window; ``free()`` gives it back.
+    """Returns a current OpenGL context without a window; call its ``free()`` when done.
 
     Raises:
-        GlMissing: with the line that installs what is missing.
+        TwinError: OpenGL is missing; the message contains the command that installs it.
     """
-    if _why_missing:
-        raise GlMissing(_why_missing)
+    if _egl_error:
+        raise _opengl_missing(_egl_error)
     try:
         if os.environ.get("MUJOCO_GL", "").strip().lower() == "egl":
-            from mujoco.egl import GLContext  # also where somebody imported mujoco before this module
+            from mujoco.egl import GLContext  # also correct if mujoco was imported before this module
         else:
             GLContext = mujoco.GLContext
         context = GLContext(width_px, height_px)
         context.make_current()
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise GlMissing(f"{type(error).__name__}: {error}") from error
+        raise _opengl_missing(f"{type(error).__name__}: {error}") from error
     return context
+
+
+def _opengl_missing(reason: str) -> TwinError:
+    """Returns the error that reports missing OpenGL and the command that installs it."""
+    allowed = f"a working EGL, on Debian or Ubuntu by: {INSTALL_LINE}"
+    return TwinError("rendering", f"no OpenGL on this machine: {reason}", allowed)

@@ -1,7 +1,7 @@
-"""The sea floor as numbers."""
+"""Seafloor terrains: height grids with textures, generated or read from files."""
 
 from terrains.generate import generate
 from terrains.load import load
-from terrains.terrain import Terrain, TerrainFault
+from terrains.terrain import Terrain
 
-__all__ = ["Terrain", "TerrainFault", "generate", "load"]
+__all__ = ["Terrain", "generate", "load"]

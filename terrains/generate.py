@@ -1,4 +1,4 @@
-"""Procedural floors: flat, sand ripples, fractal ground, coral reef."""
+"""Procedural terrains: flat, sand ripples, fractal ground, coral reef."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrains.noise import fractal_field
-from terrains.terrain import Terrain, TerrainFault, texture_shape
-from terrains.textures import paint
+from terrains.terrain import Terrain, texture_shape
+from terrains.textures import generate_texture
+from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
-STEEPEST = float(np.tan(np.deg2rad(60.0)))  #: slope that generated floors keep to, but for one cell in 200
+MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: greatest slope of generated reefs, exceeded by at most one cell in 200
 
 
 def generate(
@@ -25,38 +26,47 @@ def generate(
     texture_px_m: float,
     seed: int | np.random.SeedSequence,
 ) -> Terrain:
-    """A floor centred at the origin, its lowest point at base_m and its highest relief_m above (a flat one is flat).
+    """Generates a terrain centred at the origin, with heights from base_m to base_m + relief_m.
+
+    The kind "flat" has the height base_m everywhere.
 
     Args:
-        size_m: least extent along x and y; whole cells of grid_m make it up.
+        kind: a key of KINDS.
+        size_m: extent along x and y; rounded up to whole cells.
+        relief_m: difference between the greatest and the least height.
+        base_m: least height.
+        grid_m: distance between grid nodes.
+        texture_px_m: side of a texel.
+        seed: seed of shape and texture.
     Raises:
-        TerrainFault: unknown kind, or a floor too large for memory.
+        TwinError: the kind is unknown, or the terrain too large for memory.
     """
     if kind not in KINDS:
-        raise TerrainFault("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
+        raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
     shape = texture_shape((ny, nx), grid_m, texture_px_m)
-    form, colours = np.random.default_rng(seed).spawn(2)
-    form_of = KINDS[kind] if relief_m > 0 else _flat
-    height_m = span(form_of((ny, nx), grid_m, relief_m, form), relief_m, base_m)
+    shape_rng, texture_rng = np.random.default_rng(seed).spawn(2)
+    heights = KINDS[kind] if relief_m > 0 else _flat
+    height_m = scale_to_relief(heights((ny, nx), grid_m, relief_m, shape_rng), relief_m, base_m)
     texel_m = (nx - 1) * grid_m / shape[1]
-    texture = paint(kind, height_m, shape, texel_m, colours)
+    texture = generate_texture(kind, height_m, shape, texel_m, texture_rng)
     return Terrain(height_m, grid_m, -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2, texture, texel_m)
 
 
-def span(shape_of_floor: Heights, relief_m: float, base_m: float) -> Heights:
-    """The same floor, its heights mapped linearly onto [base_m, base_m + relief_m]; a flat one stays flat at base_m."""
-    low, extent = float(shape_of_floor.min()), float(np.ptp(shape_of_floor))
-    share = (shape_of_floor - low) / extent if extent > 0 else np.zeros_like(shape_of_floor)
-    return (base_m + relief_m * share.astype(np.float64)).astype(np.float32)
+def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:
+    """Scales heights (ny, nx) linearly to [base_m, base_m + relief_m]; equal heights all become base_m."""
+    low, extent = float(heights.min()), float(np.ptp(heights))
+    fraction = (heights - low) / extent if extent > 0 else np.zeros_like(heights)
+    return (base_m + relief_m * fraction.astype(np.float64)).astype(np.float32)
 
 
 def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
+    """Returns zero heights."""
     return np.zeros(shape, np.float32)
 
 
 def _ripples(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Sand ripples: wandering crests with a gentle and a steep flank, a tenth of their length high, on broad swells."""
+    """Generates asymmetric ripples with meandering crests, height up to 0.1 wavelength, on broad undulations."""
     length_m = max(0.35, 8 * grid_m)
     crest_m = min(0.1 * length_m, 0.6 * relief_m)
     row, col = np.indices(shape, dtype=np.float32)
@@ -70,29 +80,29 @@ def _ripples(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
 
 
 def _fractal(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Fractional Brownian ground with Hurst exponent 0.9, which is that of many sea floors."""
+    """Generates a fractional Brownian surface with Hurst exponent 0.9, typical of many seafloors."""
     return fractal_field(shape, max(max(shape) / 4, 8), 2**-0.9, rng)
 
 
 def _reef(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """A spur-and-groove base under coral heads (bommies), mounds and ledges, roughened, up to about 60 deg steep."""
+    """Generates a reef: a rough base with ledges and coral heads (bommies), slopes up to about 60 deg."""
     base = 0.14 * relief_m * fractal_field(shape, 4.0 / grid_m, 0.5, rng)
     ledge_m = 0.25 * relief_m
     height = base + 0.6 * ledge_m * _staircase(base / ledge_m)
     height = np.maximum(height, height.mean() + _bommies(shape, grid_m, relief_m, rng))
     height += 0.025 * relief_m * fractal_field(shape, 0.3 / grid_m, 0.6, rng)
-    return _soften(height.astype(np.float32), relief_m, grid_m)
+    return _limit_slope(height.astype(np.float32), relief_m, grid_m)
 
 
 def _staircase(level: Heights) -> Heights:
-    """Whole steps with smooth risers."""
+    """Rounds levels down to whole steps, joined by smooth risers."""
     step = np.floor(level)
-    share = np.clip((level - step - 0.35) / 0.3, 0, 1)
-    return (step + share * share * (3 - 2 * share)).astype(np.float32)
+    t = np.clip((level - step - 0.35) / 0.3, 0, 1)
+    return (step + t * t * (3 - 2 * t)).astype(np.float32)
 
 
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Domes with steep, lobed flanks, 0.25 to 0.9 m in radius, about one to 3 square metres; -relief_m elsewhere."""
+    """Generates domes with steep, lobed flanks, radius 0.25 to 0.9 m, one per 3 square metres; -relief_m elsewhere."""
     result = np.full(shape, -relief_m, np.float32)
     ny, nx = shape
     lobes = fractal_field(shape, 0.5 / grid_m, 0.6, rng)
@@ -112,12 +122,12 @@ def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
     return result
 
 
-def _soften(height: Heights, relief_m: float, grid_m: float) -> Heights:
-    """The floor smoothed just as far as its steepest half percent, once spanned to the relief, keeps to 60 deg."""
+def _limit_slope(height: Heights, relief_m: float, grid_m: float) -> Heights:
+    """Smooths the floor until, at the given relief, the 99.5th percentile of its slope is at most MAX_SLOPE."""
     sigma_px = 0.5
     for _ in range(12):
-        north, east = np.gradient(span(height, relief_m, 0.0), grid_m)
-        if np.percentile(np.hypot(north, east), 99.5) <= STEEPEST:
+        north, east = np.gradient(scale_to_relief(height, relief_m, 0.0), grid_m)
+        if np.percentile(np.hypot(north, east), 99.5) <= MAX_SLOPE:
             return height
         height = np.asarray(cv2.GaussianBlur(height, (0, 0), sigma_px), np.float32)
         sigma_px *= 1.3

@@ -1,4 +1,4 @@
-"""Random fields with detail at every scale, by summing octaves of noise."""
+"""Random fields with detail at every scale: sums of octaves of noise."""
 
 from __future__ import annotations
 
@@ -10,48 +10,52 @@ from numpy.typing import NDArray
 def fractal_field(
     shape: tuple[int, int], coarsest_px: float, gain: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Fractional Brownian surface: octave k has details of coarsest_px / 2^k and amplitude gain^k.
+    """Generates a fractional Brownian surface; octave k has wavelength coarsest_px / 2^k and amplitude gain^k.
 
     Args:
         shape: (rows, cols) of the field.
-        coarsest_px: size of the coarsest details [cells].
-        gain: ratio of the amplitudes of successive octaves, 2^-H for a Hurst exponent H.
+        coarsest_px: wavelength of the coarsest octave [cells].
+        gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
+        rng: random generator.
     Returns:
-        (rows, cols) float32 of zero mean and unit deviation.
+        (rows, cols) float32 field with zero mean and unit standard deviation.
     """
     total = np.zeros(shape, np.float32)
     amplitude, scale_px = 1.0, float(max(coarsest_px, 2.0))
     while scale_px >= 1.0:
         cells = [max(4, int(np.ceil(n / scale_px)) + 3) for n in shape]
         noise = rng.standard_normal(cells, dtype=np.float32)
-        total += amplitude * _stretch(noise, shape, scale_px)
+        total += amplitude * _upsample(noise, shape, scale_px)
         amplitude, scale_px = amplitude * gain, scale_px / 2
     return (total - total.mean()) / total.std()
 
 
-def _stretch(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: float) -> NDArray[np.float32]:
-    """Noise cells drawn out to scale_px each, smoothly."""
+def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: float) -> NDArray[np.float32]:
+    """Upsamples noise so that each of its cells covers scale_px cells, by cubic interpolation."""
     affine = np.array([[1 / scale_px, 0, 1], [0, 1 / scale_px, 1]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    drawn = cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
-    return np.asarray(drawn, np.float32)
+    upsampled = cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(upsampled, np.float32)
 
 
-def grain(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Pink noise in 8 bits, the same contrast in every octave from single texels up, for vision at any range.
+def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Generates 8-bit pink noise: equal contrast in every octave, so that images have texture at any range.
 
-    Built from the coarse end, doubling the size each time, so that the cost is 4/3 of that of the finest octave.
+    It is built from the coarsest octave, doubling the size each time, at 4/3 of the cost of the finest octave.
 
     Args:
-        contrast: deviation of one octave [grey levels].
+        shape: (rows, cols) of the result.
+        octaves: number of octaves, the finest of single texels.
+        contrast: standard deviation of one octave [grey levels].
+        rng: random generator.
     Returns:
-        (rows, cols) uint8 around 128.
+        (rows, cols) uint8 with mean 128.
     """
     sizes = [tuple(-(-n // 2**k) for n in shape) for k in range(octaves)][::-1]
     value = np.full(sizes[0], 128, np.uint8)
-    spread = contrast * np.sqrt(12) / 255  # uniform noise of 256 levels has deviation 256 / sqrt(12)
+    weight = contrast * np.sqrt(12) / 255  # uniform noise of 256 levels has standard deviation 256 / sqrt(12)
     for rows, cols in sizes:
         value = cv2.resize(value, (cols, rows), interpolation=cv2.INTER_LINEAR)
         noise = np.frombuffer(rng.bytes(rows * cols), np.uint8).reshape(rows, cols)
-        value = cv2.addWeighted(value, 1.0, noise, spread, -128 * spread)
+        value = cv2.addWeighted(value, 1.0, noise, weight, -128 * weight)
     return np.asarray(value, np.uint8)

@@ -1,4 +1,4 @@
-"""The sea floor as numbers: a grid of heights, joined by triangles, under a texture."""
+"""Seafloor model: a triangulated height grid with a texture."""
 
 from __future__ import annotations
 
@@ -7,30 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-#: What fits into memory on an ordinary machine: the drawn model needs about 400 bytes a node and 9 bytes a texel.
+from twin.errors import TwinError
+
+#: Limits set by memory: the rendered model needs about 400 bytes per node and 9 bytes per texel.
 MAX_NODES = 6_000_000
 MAX_TEXELS = 250_000_000
 
 
-class TerrainFault(ValueError):  # noqa: N818 (a fault, as in the scenario's)
-    """A floor that cannot be had: the scenario key, what is wrong, what would be right."""
-
-    def __init__(self, field: str, problem: str, allowed: str = ""):
-        self.field, self.problem, self.allowed = field, problem, allowed
-        super().__init__(f"{field}: {problem}" + (f" (allowed: {allowed})" if allowed else ""))
-
-
 @dataclass(frozen=True)
 class Terrain:
-    """A floor over the rectangle from (west_m, south_m), x east, y north, z up [m].
+    """Seafloor over a rectangle whose south-west corner is (west_m, south_m); x east, y north, z up [m].
 
     Args:
-        height_m: (ny, nx) float32 heights of the nodes; row 0 = SOUTH, column 0 = west; outer nodes on the edge.
-        spacing_m: distance of neighbouring nodes along x and y.
+        height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west, outer nodes on the edge.
+        spacing_m: distance between neighbouring nodes along x and y.
         west_m, south_m: position of node (0, 0).
-        texture: (h, w, 3) uint8 RGB albedo over exactly the extent; row 0 = NORTH.
-        texture_px_m: size of a texel.
-        n_filled: nodes that had no height and were filled.
+        texture: (h, w, 3) uint8 RGB albedo that covers exactly the extent; row 0 = NORTH.
+        texture_px_m: side of a texel.
+        n_filled: number of nodes without a height in the source, filled by their nearest neighbour.
     """
 
     height_m: NDArray[np.float32]
@@ -43,31 +37,38 @@ class Terrain:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Extent along x and y [m]."""
+        """Returns the extent along x and y [m]."""
         ny, nx = self.height_m.shape
         return (nx - 1) * self.spacing_m, (ny - 1) * self.spacing_m
 
     @property
     def east_m(self) -> float:
+        """Returns x of the eastern edge [m]."""
         return self.west_m + self.size_m[0]
 
     @property
     def north_m(self) -> float:
+        """Returns y of the northern edge [m]."""
         return self.south_m + self.size_m[1]
 
     @property
     def lowest_m(self) -> float:
+        """Returns the least height [m]."""
         return float(self.height_m.min())
 
     @property
     def highest_m(self) -> float:
+        """Returns the greatest height [m]."""
         return float(self.height_m.max())
 
     def height_at(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        """Height [m] of the floor at (x, y) of any, equal shape; NaN outside.
+        """Returns the height of the floor at points (x, y) [m]; NaN outside the terrain.
 
-        Linear on the two triangles of each cell, split along its diagonal from node (r, c) to (r + 1, c + 1): the very
-        surface that is drawn and that rays meet.
+        The height is linear on the two triangles of each cell, split along the diagonal from node (r, c) to
+        (r + 1, c + 1). This is the same surface that is rendered and that rays intersect.
+
+        Args:
+            x_m, y_m: coordinates of any shape, the same for both.
         """
         ny, nx = self.height_m.shape
         col = (np.asarray(x_m, dtype=np.float64) - self.west_m) / self.spacing_m
@@ -83,15 +84,19 @@ class Terrain:
 
 
 def texture_shape(height_shape: tuple[int, ...], spacing_m: float, texture_px_m: float) -> tuple[int, int]:
-    """Rows and columns of a texture over all the cells of a height grid; at least 2 by 2.
+    """Returns the rows and columns of a texture that covers all cells of a height grid; at least 2 x 2.
 
+    Args:
+        height_shape: (ny, nx) of the height grid.
+        spacing_m: distance between grid nodes.
+        texture_px_m: side of a texel.
     Raises:
-        TerrainFault: more nodes or texels than memory holds.
+        TwinError: more than MAX_NODES nodes or MAX_TEXELS texels.
     """
     ny, nx = height_shape
     if nx * ny > MAX_NODES:
-        raise TerrainFault("terrain.grid_m", f"{nx} x {ny} height nodes", f"at most {MAX_NODES} nodes")
+        raise TwinError("terrain.grid_m", f"{nx} x {ny} height nodes", f"at most {MAX_NODES} nodes")
     rows, cols = (max(2, round((n - 1) * spacing_m / texture_px_m)) for n in (ny, nx))
     if rows * cols > MAX_TEXELS:
-        raise TerrainFault("terrain.texture_px_m", f"{cols} x {rows} texels", f"at most {MAX_TEXELS} texels")
+        raise TwinError("terrain.texture_px_m", f"{cols} x {rows} texels", f"at most {MAX_TEXELS} texels")
     return rows, cols

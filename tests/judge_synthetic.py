@@ -1,4 +1,4 @@
-"""A survey that was never flown: smooth truth, drifting estimates, a made-up floor; for tests of judge and view."""
+"""Synthetic survey for the tests of judge and report: smooth true path, drifting estimates, analytic floor."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from twin.core import geometry
 from twin.core.links import Link, Links
 from twin.core.records import Alignment, ElevationMap, MapGrid, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
-from twin.judge import metrics as judge
 from twin.judge.map_error import height_error
+from twin.judge.metrics import EvaluationInput, evaluate
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 
@@ -25,7 +25,11 @@ SPEED_MPS, ALTITUDE_M, LEG_M, SPACING_M = 0.25, 2.2, 4.0, 0.5
 
 
 def reference_path(rate_hz: float, legs: int = 4, hold_s: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A lawnmower at constant speed: positions (n, 3) [m], holding (n,), track (n,); two legs a track, then a hold."""
+    """Returns a lawnmower path at constant speed: two legs per track, followed by station keeping.
+
+    Returns:
+        (n, 3) positions [m]; (n,) bool, station keeping; (n,) track number.
+    """
     step = SPEED_MPS / rate_hz
     points, holding, track = [], [], []
     for leg in range(legs):
@@ -44,18 +48,18 @@ def reference_path(rate_hz: float, legs: int = 4, hold_s: float = 1.0) -> tuple[
 
 
 def true_poses(reference: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Down-looking camera poses (n, 4, 4) that follow the reference with a smooth wobble of 1 cm and 1 deg."""
+    """Returns down-looking camera poses (n, 4, 4) that oscillate about the reference by 1 cm and 1 deg."""
     t = np.arange(len(reference)) / 30
-    wobble = np.stack([np.sin(t * rng.uniform(0.2, 0.6) + rng.uniform(0, 6)) for _ in range(6)], axis=1)
+    oscillation = np.stack([np.sin(t * rng.uniform(0.2, 0.6) + rng.uniform(0, 6)) for _ in range(6)], axis=1)
     poses = np.tile(np.eye(4), (len(t), 1, 1))
-    poses[:, :3, 3] = reference + 0.01 * wobble[:, :3]
-    for k, angles in enumerate(np.deg2rad(wobble[:, 3:])):
+    poses[:, :3, 3] = reference + 0.01 * oscillation[:, :3]
+    for k, angles in enumerate(np.deg2rad(oscillation[:, 3:])):
         poses[k, :3, :3] = geometry.rotation_from_rpy(*angles) @ geometry.BODY_FROM_DOWN_CAMERA
     return poses
 
 
 def drifted(poses: np.ndarray, rng: np.random.Generator, sigma: float) -> np.ndarray:
-    """The same path with a random small motion [rad, m] added at every frame: what dead reckoning does."""
+    """Returns the poses with the drift of dead reckoning: a random motion [rad, m] added at every frame."""
     result = poses.copy()
     for k in range(1, len(poses)):
         noise = geometry.exp(rng.normal(0, sigma, 6) * [0.2, 0.2, 0.2, 1, 1, 1])
@@ -64,13 +68,13 @@ def drifted(poses: np.ndarray, rng: np.random.Generator, sigma: float) -> np.nda
 
 
 def floor(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Height of the made-up floor [m]."""
+    """Returns the height of the floor [m]."""
     bumps = 0.12 * np.sin(2.1 * x) * np.cos(1.7 * y) + 0.05 * np.sin(7 * x + 3 * y)
     return 0.25 + bumps + 0.25 * np.exp(-((x - 0.5) ** 2 + y**2) / 0.15)
 
 
 def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, ElevationMap, Truth, StereoRig]:
-    """Everything that `evaluate` wants, of one synthetic survey."""
+    """Returns result, elevation map, truth and rig of a synthetic survey."""
     rng = np.random.default_rng(seed)
     reference, holding, track = reference_path(rate_hz)
     poses = true_poses(reference, rng)
@@ -90,18 +94,17 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     mosaic = np.where(np.isfinite(estimate)[..., None], shade, 0).astype(np.uint8)
     links = Links(link_between(poses[keys], i, i + d, rng) for d in (1, 2, 4) for i in range(len(keys) - d))
     ends = [int((track[keys] <= t).sum()) for t in (1, 2)]
-    result = SurveyResult(
-        f2f, online, final, keys, track[keys], np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (len(keys), 1, 1)), links,
-        [Alignment(t, 100.0 * t, n, 3 * n, 2) for t, n in enumerate(ends, 1)],
-        [online.positions[keys[:n]] for n in ends],
-        [final.positions[keys[:n]] for n in ends],
-    )  # fmt: skip
+    node_cov = np.tile(np.diag([1e-6] * 3 + [1e-4] * 3), (len(keys), 1, 1))
+    result = SurveyResult(f2f, online, final, keys, track[keys], node_cov, links=links)
+    result.alignments = [Alignment(t, 100.0 * t, n, 3 * n, 2) for t, n in enumerate(ends, 1)]
+    result.before_ga = [online.positions[keys[:n]] for n in ends]
+    result.after_ga = [final.positions[keys[:n]] for n in ends]
     truth = Truth(Trajectory(times, poses), reference, holding, track, height, seen)
     return result, ElevationMap(grid, estimate, np.where(np.isfinite(estimate), sigma, np.nan), mosaic), truth, rig
 
 
 def link_between(world_from_keyframe: np.ndarray, i: int, j: int, rng: np.random.Generator) -> Link:
-    """A link that errs as its covariance says, and its closed form, three times as far off."""
+    """Returns a link with an error drawn from its covariance, and a closed form with three times that error."""
     true = geometry.inverse(world_from_keyframe[i]) @ world_from_keyframe[j]
     error = rng.normal(0, 1, 6) * [2e-4, 2e-4, 2e-4, 5e-4, 5e-4, 5e-4]
     cov = 3 * np.diag([4e-8] * 3 + [25e-8] * 3)
@@ -110,7 +113,7 @@ def link_between(world_from_keyframe: np.ndarray, i: int, j: int, rng: np.random
 
 
 def evaluated(result: SurveyResult, elevation: ElevationMap | None, truth: Truth, rig: StereoRig) -> dict:
-    """metrics.json of it, with plausible timing."""
+    """Returns the metrics of a survey, with plausible timing."""
     stages = Stopwatch().summary()
     stages["f2f"] = {"count": 900, "mean_ms": 14.0, "p95_ms": 21.0, "total_s": 12.6}
     stages["stereo"] = {"count": 100, "mean_ms": 35.0, "p95_ms": 50.0, "total_s": 3.5}
@@ -118,11 +121,11 @@ def evaluated(result: SurveyResult, elevation: ElevationMap | None, truth: Truth
     timing = {"wall_s": 60.0, "simulated_s": 72.0, "peak_rss_mb": 800.0, "stages": stages}
     identity = dict(name="synthetic", seed=7, version="0.1", scenario_hash="ab12", status="complete", reason=None)
     plan = {"overlap_along": 0.9, "overlap_across": 0.8}
-    return judge.evaluate(result, elevation, truth, rig, plan, timing, identity, SCENARIO.require)
+    return evaluate(EvaluationInput(result, elevation, truth, rig, plan, timing, identity, SCENARIO.require))
 
 
 def write_folder(folder: Path, finished: bool = True) -> Path:
-    """A whole run folder of the synthetic survey; unfinished: no maps, no metrics, no final trajectory."""
+    """Writes a run folder of the synthetic survey; an unfinished one has no maps, metrics and final trajectory."""
     result, elevation, truth, rig = survey()
     (folder / "keyframes").mkdir(parents=True)
     (folder / "scenario.resolved.toml").write_text(dump_toml(SCENARIO))
@@ -147,7 +150,7 @@ def write_folder(folder: Path, finished: bool = True) -> Path:
 
 
 def write_tif(file: Path, grid: MapGrid, bands: np.ndarray) -> None:
-    """Bands (n, rows, cols) as GeoTIFF, row 0 = north; floats have NaN as nodata."""
+    """Writes bands (n, rows, cols) as GeoTIFF; row 0 is the northernmost, and the nodata value of floats is NaN."""
     transform = rasterio.Affine(grid.cell_m, 0, grid.west_m, 0, -grid.cell_m, grid.north_m)
     profile = dict(driver="GTiff", height=grid.rows, width=grid.cols, count=len(bands), dtype=bands.dtype)
     nodata = np.nan if bands.dtype.kind == "f" else None
@@ -178,6 +181,6 @@ def _write_keyframes(folder: Path, result: SurveyResult, rig: StereoRig) -> None
     ground = np.clip(110 + 45 * ground / ground.std(), 0, 255).astype(np.uint8)
     for k, frame in enumerate(result.keyframe_rows):
         view = np.roll(ground, (-k, -2 * k), (0, 1))[: rig.height_px, : rig.width_px]
-        for eye, tint in (("left", (0.6, 0.9, 0.8)), ("right", (0.6, 0.85, 0.8))):
+        for side, tint in (("left", (0.6, 0.9, 0.8)), ("right", (0.6, 0.85, 0.8))):
             image = (view[..., None] * np.array(tint)).astype(np.uint8)
-            cv2.imwrite(str(folder / f"{frame:06d}_{eye}.png"), np.ascontiguousarray(image[..., ::-1]))
+            cv2.imwrite(str(folder / f"{frame:06d}_{side}.png"), np.ascontiguousarray(image[..., ::-1]))

@@ -1,4 +1,4 @@
-"""A small ray-caster of height fields: truth for tests of `twin.estimate`, without GL and sharing no code with it."""
+"""Ray caster for height fields: ground truth for tests of `twin.estimate`, without OpenGL and independent of `twin`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from twin.core.records import StereoRig
 
 
 class Seafloor(NamedTuple):
-    """Heights at nodes [m] (row 0 = south, col 0 = west), bilinear between them, under a tiled grey texture."""
+    """Height grid [m] (row 0 = south, column 0 = west) with bilinear interpolation and a tiled grey texture."""
 
     height_m: np.ndarray
     spacing_m: float
@@ -23,21 +23,21 @@ class Seafloor(NamedTuple):
     texture_px_m: float
 
     def height_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """True height of points of any (equal) shape [m]."""
+        """Returns the true height [m] at points (x, y) of any shape, the same for both."""
         shape = np.broadcast(x_m, y_m).shape
         x, y = np.broadcast_to(x_m, shape).ravel(), np.broadcast_to(y_m, shape).ravel()
         return _heights(self.height_m, self.spacing_m, self.west_m, self.south_m, x, y).reshape(shape)
 
 
 def smooth_texture(seed: int, size_px: int = 512, blur_px: float = 1.6) -> np.ndarray:
-    """A tileable random texture, grey level 127, standard deviation 40."""
+    """Generates a tileable random texture with mean grey level 127 and standard deviation 40."""
     noise = np.random.default_rng(seed).normal(size=(size_px, size_px))
     soft = cv2.GaussianBlur(np.tile(noise, (3, 3)), (0, 0), blur_px)[size_px : 2 * size_px, size_px : 2 * size_px]
     return np.clip(127 + 40 * soft / soft.std(), 0, 255).astype(np.float32)
 
 
 def plane(slope_x: float = 0.0, slope_y: float = 0.0, texture_px_m: float = 0.006, seed: int = 0) -> Seafloor:
-    """The floor z = slope_x x + slope_y y, 16 m x 16 m."""
+    """Returns the floor z = slope_x x + slope_y y, 16 m x 16 m."""
     nodes = np.linspace(-8, 8, 33)
     height = slope_x * nodes[None, :] + slope_y * nodes[:, None]
     return Seafloor(height, 0.5, -8.0, -8.0, smooth_texture(seed), texture_px_m)
@@ -46,24 +46,24 @@ def plane(slope_x: float = 0.0, slope_y: float = 0.0, texture_px_m: float = 0.00
 def down_camera(
     x_m: float, y_m: float, z_m: float, rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """world_from_camera of a down-looking camera at a position, its body turned by roll, pitch, yaw."""
+    """Returns the pose world_from_camera (4, 4) of a down-looking camera on a body with this roll, pitch and yaw."""
     return geometry.pose(
         geometry.rotation_from_rpy(*rpy_rad) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([x_m, y_m, z_m])
     )
 
 
 def small_rig(width_px: int = 320, height_px: int = 240, hfov_deg: float = 60.0, baseline_m: float = 0.15) -> StereoRig:
-    """The rig of the reef survey, or one like it."""
+    """Returns a stereo rig at the origin of the body, by default that of the reef survey."""
     focal_px = width_px / 2 / np.tan(np.deg2rad(hfov_deg / 2))
     return StereoRig(
         width_px, height_px, focal_px, baseline_m, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
     )
 
 
-def look(
+def render_view(
     floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, samples: int = 2
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Grey image (H, W) float32, area-sampled, and true depth (H, W) [m] at pixel centres of one camera."""
+    """Renders a grey image (H, W) float32 with samples x samples rays per pixel, and the depth (H, W) [m]."""
     pose = np.ascontiguousarray(world_from_camera)
     args = (
         np.ascontiguousarray(floor.height_m, dtype=np.float64),
@@ -85,19 +85,20 @@ def look(
 def stereo_pair(
     floor: Seafloor, rig: StereoRig, world_from_camera: np.ndarray, rng: np.random.Generator, noise: float = 2.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Left and right grey uint8 with noise [grey levels], and the left camera's true depth [m]."""
-    left, depth = look(floor, rig, world_from_camera)
-    right, _ = look(floor, rig, world_from_camera @ rig.left_from_right)
+    """Renders the left and right image (H, W) uint8 with image noise [grey levels], and the left depth (H, W) [m]."""
+    left, depth = render_view(floor, rig, world_from_camera)
+    right, _ = render_view(floor, rig, world_from_camera @ rig.left_from_right)
     return digitise(left, rng, noise), digitise(right, rng, noise), depth
 
 
 def digitise(image: np.ndarray, rng: np.random.Generator, noise: float) -> np.ndarray:
-    """What a sensor of that noise [grey levels] makes of an image."""
+    """Adds image noise [grey levels] and quantises to uint8."""
     return np.clip(np.round(image + rng.normal(size=image.shape) * noise), 0, 255).astype(np.uint8)
 
 
 @njit(cache=True, nogil=True)
 def _height(z, spacing, west, south, x, y):
+    """Returns the bilinear height at one point [m]."""
     c = min(max((x - west) / spacing, 0.0), z.shape[1] - 1.000001)
     r = min(max((y - south) / spacing, 0.0), z.shape[0] - 1.000001)
     i, j = int(r), int(c)
@@ -107,6 +108,7 @@ def _height(z, spacing, west, south, x, y):
 
 @njit(cache=True, nogil=True)
 def _heights(z, spacing, west, south, x, y):
+    """Returns the bilinear heights at points (n,) [m]."""
     out = np.empty(x.size)
     for n in range(x.size):
         out[n] = _height(z, spacing, west, south, x[n], y[n])
@@ -115,6 +117,7 @@ def _heights(z, spacing, west, south, x, y):
 
 @njit(cache=True, nogil=True)
 def _colour(texture, px, x, y):
+    """Returns the bilinear grey level of the tiled texture at one point."""
     n, m = texture.shape
     c, r = x / px, y / px
     j, i = int(np.floor(c)), int(np.floor(r))
@@ -127,6 +130,7 @@ def _colour(texture, px, x, y):
 
 @njit(cache=True, nogil=True)
 def _cast(z, spacing, west, south, texture, px, rotation, position, focal, width, height, samples):
+    """Renders image and depth (H, W): ray marching, then bisection; depth is NaN unless samples is 1."""
     image = np.zeros((height, width), np.float32)
     depth = np.full((height, width), np.nan)
     top = z.max() + 1e-6

@@ -1,11 +1,11 @@
-"""Studies and surveys that take no time: errors by a known law of turbidity, altitude and seed."""
+"""A study and surveys that take no time: the map error is a known function of turbidity, altitude and seed."""
 
 import numpy as np
 
 from twin.study.engine import Outcome
 from twin.study.flight import row_of
 from twin.study.study_file import load_study
-from twin.study.worker import describe
+from twin.study.worker import describe_exception
 
 STUDY = """
 scenario = "quickstart"
@@ -32,7 +32,7 @@ LOST = "vision lost at 2.0 s: too few points matched"
 
 
 def study_of(folder, text=STUDY, *changes):
-    """The study of a text, with (old, new) changes."""
+    """Returns the study of a TOML text, with (old, new) replacements."""
     for old, new in changes:
         assert old in text, old
         text = text.replace(old, new)
@@ -42,7 +42,7 @@ def study_of(folder, text=STUDY, *changes):
 
 
 def fly(survey):
-    """Map errors grow with turbidity; in the murkiest water vision is lost."""
+    """Returns a row whose map error is proportional to turbidity; at a turbidity above 25 the survey is aborted."""
     turbidity, altitude_m = survey.values["water.turbidity"], survey.values["plan.altitude_m"]
     noise = float(np.exp(0.1 * np.random.default_rng(survey.seed).standard_normal()))
     if turbidity > 25:
@@ -57,19 +57,19 @@ def fly(survey):
 
 
 def fail(survey):
-    """What a full disk does to a survey."""
+    """Returns the row of a survey that failed because the disk is full."""
     return row_of(survey, "failed", "[Errno 28] No space left on device")
 
 
-def crash_in_murk(survey):
-    """A program that breaks in murky water."""
+def crash_in_turbid_water(survey):
+    """Raises an exception at a turbidity above 10."""
     if survey.values["water.turbidity"] > 10:
         raise ZeroDivisionError("no contrast")
     return fly(survey)
 
 
-class Here:
-    """Runs tasks one after another in this process; stops as by Ctrl-C before the task of this number."""
+class SerialEngine:
+    """Engine that runs tasks one after another in this process, and simulates Ctrl-C before a given task."""
 
     def __init__(self, stop_before=None):
         self.stop_before, self.flown = stop_before, []
@@ -82,4 +82,4 @@ class Here:
             try:
                 yield Outcome(task, function(task), "", 1)
             except ArithmeticError as error:
-                yield Outcome(task, None, describe(error), 1)
+                yield Outcome(task, None, describe_exception(error), 1)

@@ -1,4 +1,4 @@
-"""Tasks for workers: plain ones, and such that go wrong in every way."""
+"""Tasks for worker processes: correct ones, and ones that fail in every possible way."""
 
 import os
 import signal
@@ -10,21 +10,22 @@ def square(number):
     return number * number
 
 
-def processor(_):
+def process_and_cores(_):
+    """Returns the id of the process and the CPU cores that it may use."""
     return os.getpid(), os.sched_getaffinity(0)
 
 
 def misbehave(task):
-    """Does as the word says; `die once` leaves a mark at the path and survives the second time."""
-    word, path = task
-    if word == "raise":
+    """Performs the named action; "die once" creates the file `path` and succeeds at the second attempt."""
+    action, path = task
+    if action == "raise":
         raise ValueError("the sea is closed")
-    if word == "hang":
+    if action == "hang":
         time.sleep(600)
-    if word == "die" or (word == "die once" and not Path(path).exists()):
+    if action == "die" or (action == "die once" and not Path(path).exists()):
         Path(path).touch()
         os.kill(os.getpid(), signal.SIGKILL)
-    return word
+    return action
 
 
 def slow_square(number):

@@ -1,4 +1,4 @@
-"""The command line: exit status, what goes to stdout and stderr, and nothing written where nothing was flown."""
+"""The command line: exit status, stdout and stderr; nothing is written if no survey runs."""
 
 import json
 import os
@@ -43,14 +43,14 @@ def result(**changes):
 
 @pytest.fixture
 def twin_command(monkeypatch, tmp_path, capsys):
-    """Runs the command line in an empty folder, its survey replaced by one whose outcome is given."""
+    """Runs the command line in an empty folder, with the survey replaced by a given outcome."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(doctor, "graphics", lambda: doctor.Finding("OpenGL", True, "a renderer"))
+    monkeypatch.setattr(doctor, "check_rendering", lambda: doctor.Check("OpenGL", True, "a renderer"))
 
     def command(*words, outcome=None):
         surveys = []
         fake = types.ModuleType("twin.survey")
-        fake.run = lambda *asked: surveys.append(asked) or outcome
+        fake.run = lambda *arguments: surveys.append(arguments) or outcome
         monkeypatch.setitem(sys.modules, "twin.survey", fake)
         monkeypatch.setattr(twin, "survey", fake, raising=False)
         monkeypatch.setattr(sys, "argv", ["twin", *words])
@@ -72,26 +72,26 @@ def twin_command(monkeypatch, tmp_path, capsys):
         ({"status": "aborted", "reason": "interrupted"}, 130),
     ],
 )
-def test_the_exit_status_tells_how_the_survey_went(twin_command, changes, status):
+def test_the_exit_status_depends_on_the_outcome_of_the_survey(twin_command, changes, status):
     assert twin_command("run", "quickstart", outcome=result(**changes)).status == status
 
 
-def test_json_is_all_that_stands_on_stdout(twin_command):
+def test_with_json_stdout_contains_nothing_else(twin_command):
     done = twin_command("run", "quickstart", "--json", outcome=result())
     assert json.loads(done.out) == METRICS
 
 
-def test_the_error_table_and_the_report_stand_on_stdout(twin_command, tmp_path, monkeypatch):
+def test_key_figures_and_outputs_are_printed_on_stdout(twin_command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("runs/quickstart-1").mkdir(parents=True)
     for name in ("report.html", "run.rrd"):
         Path("runs/quickstart-1", name).touch()
     done = twin_command("demo", outcome=result())
-    assert done.status == 0 and "1.2 cm" in done.out and "98.0 %" in done.out
+    assert done.status == 0 and "1.2 cm" in done.out and "98 %" in done.out
     assert done.out.endswith("Open the recording: twin view runs/quickstart-1\n")
 
 
-def test_a_missed_requirement_is_named(twin_command):
+def test_a_missed_requirement_is_printed(twin_command):
     missed = {"map.le90_m": {"value": 0.06, "limit": 0.05, "passed": False}}
     assert "MISSED" in twin_command("run", "quickstart", outcome=result(require=missed)).out
 
@@ -104,34 +104,41 @@ def test_options_reach_the_survey(twin_command):
 
 
 @pytest.mark.parametrize(
-    ("words", "fault"),
+    ("words", "message"),
     [
         (["run", "quikstart"], "quikstart: no such scenario (did you mean quickstart?)"),
         (["run", "quickstart", "--set", "plan.overlap_along=1"], "--set: plan.overlap_along: 1: not allowed"),
         (["plan", "quickstart", "--set", "plan.area_m=[90.0,2.0]"], "--set: plan.area_m: 90 x 2 m is larger"),
-        (["report", "nowhere"], "nowhere: is no run folder"),
-        (["run", "quickstart", "--out", str(ROOT)], f"--out: {ROOT} is there and not empty"),
+        (["report", "nowhere"], "nowhere: is not a run folder"),
+        (["run", "quickstart", "--out", str(ROOT)], f"--out: {ROOT} is not empty"),
         (["run", "quickstart", "--seed", "-1"], "Invalid value for '--seed'"),
         (["run"], "Missing argument 'SCENE'"),
         (["fly"], "No such command 'fly'"),
+        (["calibrate", "fit_reef", "--out", "x.toml"], "calibrate: renamed to fit-surrogate"),
+        (
+            ["plan", "quickstart", "--set", "imaging.calibration=x"],
+            "imaging.calibration: renamed to imaging.error_model",
+        ),
     ],
 )
-def test_a_fault_of_the_user_ends_with_2_a_line_on_stderr_and_nothing_written(twin_command, tmp_path, words, fault):
+def test_a_user_error_gives_exit_status_2_a_message_on_stderr_and_no_files(twin_command, tmp_path, words, message):
     done = twin_command(*words)
     assert (done.status, done.out, done.surveys) == (2, "", [])
-    assert fault in done.err and "Traceback" not in done.err
+    assert message in done.err and "Traceback" not in done.err
     assert not list(tmp_path.iterdir())
 
 
-def test_without_opengl_doctors_line_is_told_and_nothing_written(twin_command, tmp_path, monkeypatch):
-    monkeypatch.setattr(doctor, "graphics", lambda: doctor.Finding("OpenGL", False, "no EGL", "sudo apt-get install x"))
+def test_without_opengl_the_remedy_is_printed_and_nothing_is_written(twin_command, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        doctor, "check_rendering", lambda: doctor.Check("OpenGL", False, "no EGL", "sudo apt-get install x")
+    )
     done = twin_command("run", "quickstart", outcome=result())
     assert (done.status, done.out, done.surveys) == (2, "", [])
-    assert done.err == "LACKING  OpenGL: no EGL\n         mend it by: sudo apt-get install x\n"
+    assert done.err == "FAILED   OpenGL: no EGL\n         to fix it: sudo apt-get install x\n"
     assert not list(tmp_path.iterdir())
 
 
-def test_runs_of_one_name_and_seed_are_counted(tmp_path, monkeypatch):
+def test_run_folders_of_the_same_name_and_seed_are_numbered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scenario = types.SimpleNamespace(name="reef", seed=3)
     folders = []
@@ -142,7 +149,7 @@ def test_runs_of_one_name_and_seed_are_counted(tmp_path, monkeypatch):
     assert [str(f) for f in folders] == ["runs/reef-3", "runs/reef-3-2", "runs/reef-3-3"]
 
 
-def test_an_empty_folder_is_used_and_a_file_is_not(tmp_path):
+def test_an_empty_folder_is_accepted_and_any_other_path_is_not(tmp_path):
     assert cli._new_folder(None, tmp_path) == tmp_path
     (tmp_path / "file").touch()
     for taken in (tmp_path, tmp_path / "file", tmp_path / "file" / "below"):
@@ -163,12 +170,12 @@ def test_the_plan_is_a_table_and_a_picture(twin_command, tmp_path):
     assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_progress_tells_simulated_time_real_time_factor_and_believed_error():
+def test_progress_shows_simulated_time_real_time_factor_and_position_error():
     now = types.SimpleNamespace(simulated_s=30.0, wall_s=20.0, share=0.5, sigma_m=0.013, stage="survey")
-    assert console.note(now) == "30.0 s simulated, 1.50 x real time, position ± 1.3 cm"
+    assert console.progress_note(now) == "30.0 s simulated, 1.50 x real time, position ± 1.3 cm"
 
 
-def test_a_terminal_gets_a_bar_and_a_pipe_gets_none(capsys):
+def test_a_pipe_gets_no_progress_bar(capsys):
     with console.progress_bar() as progress:
         progress(types.SimpleNamespace(simulated_s=1.0, wall_s=1.0, share=0.5, sigma_m=0.0, stage="survey"))
     assert capsys.readouterr() == ("", "")
@@ -179,33 +186,33 @@ def probe(**environment):
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, cwd=ROOT, check=False)
 
 
-def test_the_doctor_draws_a_frame():
+def test_the_doctor_renders_an_image():
     done = probe()
     assert done.returncode == 0 and done.stdout.strip()
 
 
-def test_the_doctor_survives_a_machine_without_a_driver(monkeypatch):
+def test_the_doctor_reports_a_machine_without_an_opengl_driver(monkeypatch):
     done = probe(MUJOCO_GL="egl", __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
     assert done.returncode == 1 and "no OpenGL on this machine" in done.stderr
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
-    finding = doctor.graphics()
-    assert not finding.ok and INSTALL_LINE in str(finding)
+    check = doctor.check_rendering()
+    assert not check.ok and INSTALL_LINE in str(check)
 
 
-def test_a_crash_of_the_driver_is_a_finding(monkeypatch):
+def test_a_crash_of_the_driver_is_a_failed_check(monkeypatch):
     killed = subprocess.CompletedProcess([], -11, "", "")
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: killed)
-    assert doctor.graphics().found == "drawing ended with status -11"
+    assert doctor.check_rendering().found == "rendering failed with exit status -11"
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_a_survey_that_can_be_read(tmp_path):
+def test_an_interrupted_survey_leaves_a_readable_run_folder(tmp_path):
     out = tmp_path / "run"
     survey = subprocess.Popen(
         [sys.executable, "-m", "twin", "run", "quickstart", "--out", str(out), "--json"],
         stdout=subprocess.PIPE,
         cwd=ROOT,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also where this one ignores it
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # also where the parent ignores it
     )
     deadline = time.monotonic() + 120
     while len(list(out.glob("keyframes/*"))) < 5 and time.monotonic() < deadline:
@@ -219,11 +226,11 @@ def test_ctrl_c_ends_a_survey_that_can_be_read(tmp_path):
     assert metrics["trajectory"]["final"]["path_m"] > 0 and (out / "report.html").is_file()
 
 
-def test_set_up_installs_what_the_doctor_asks_for():
+def test_set_up_installs_the_packages_that_the_doctor_names():
     packages = INSTALL_LINE.split("install -y ")[1].split()
     assert set(packages) <= set((ROOT / ".ci" / "system-packages").read_text().replace('"', " ").split())
 
 
-def test_constraints_name_versions_and_nothing_else():
+def test_constraints_contain_only_exact_versions():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert lines and all(len(line.split("==")) == 2 and not set(line) & set(" @/:") for line in lines)

@@ -1,4 +1,4 @@
-"""What the loops that numba compiles owe to the promise of one seed, one path."""
+"""Compiled functions give bit-identical results, whether compiled in this process or loaded from the cache."""
 
 import importlib
 import os
@@ -16,6 +16,7 @@ import twin
 
 
 def compiled_functions():
+    """Returns all numba-compiled functions of the project."""
     found = {}
     for package in (twin, scenes, controllers, terrains):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
@@ -29,8 +30,8 @@ def name_of(function):
     return f"{function.py_func.__module__}.{function.py_func.__name__}"
 
 
-def free_sums(functions):
-    """Those whose sums may take any order: for each, whether it is part of who calls it, and who does."""
+def fastmath_functions(functions):
+    """Yields name, whether it is always inlined, and the callers of each function compiled with fastmath."""
     for function in functions:
         options, name = function.targetoptions, function.py_func.__name__
         if options.get("fastmath"):
@@ -39,22 +40,22 @@ def free_sums(functions):
             yield name_of(function), inlined, [name_of(other) for other in others]
 
 
-def test_sums_in_free_order_are_part_of_who_calls_them():
-    """Where fastmath leaves the order of a sum open, each copy of a function may take another.
+def test_fastmath_functions_that_others_call_are_inlined():
+    """With fastmath, the compiler may reorder a sum, differently in each compiled copy of a function.
 
-    A function that others call is compiled by itself and again into each of them. Which copy a call reaches is whose
-    code was loaded first: in the process that compiles another than in those that read the cache, and images differed
-    in the last bit, paths by 0.6 mm. Put into its callers it has no copy to be mistaken for.
+    A function that others call is compiled once by itself and once into each caller. Which copy a call reaches depends
+    on which code was loaded first, so a process that compiles and one that loads from the cache could differ: in the
+    last bit of an image and, by its effect on control, by 0.6 mm in a path. An inlined function has no separate copy.
     """
-    found = {name: (inlined, callers) for name, inlined, callers in free_sums(compiled_functions())}
-    assert found["twin.imaging.shading._shine"] == (True, ["twin.imaging.shading.shade"])
+    found = {name: (inlined, callers) for name, inlined, callers in fastmath_functions(compiled_functions())}
+    assert found["twin.imaging.shading._illuminate"] == (True, ["twin.imaging.shading.shade"])
     assert found["twin.imaging.shading.shade"] == (False, [])
     wrong = [name for name, (inlined, callers) in found.items() if callers and not inlined]
-    assert not wrong, f"want forceinline=True, as others call them: {', '.join(wrong)}"
+    assert not wrong, f"called by others, so forceinline=True is required: {', '.join(wrong)}"
 
 
 @pytest.mark.slow
-def test_the_run_that_compiles_flies_the_same_path(tmp_path):
+def test_a_run_that_compiles_and_one_that_loads_the_cache_write_identical_files(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "MUJOCO_GL": "egl"}
     small = ["--set", "plan.tracks=1", "--set", "plan.area_m=[2.4, 1.2]"]
     for name in ("compiles", "reads"):

@@ -1,4 +1,4 @@
-"""Aiding sensors against closed forms, dense Kalman updates and finite differences."""
+"""Navigation sensors against closed forms, dense Kalman updates and finite differences."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from twin.core.links import Link
 from twin.core.records import Displacement, Readings, SensorNoise, Sighting, StereoRig
 from twin.estimate.alignment import align
 from twin.estimate.navigation import aiding
-from twin.estimate.navigation.dvl import VelocityLog, body_displacement, fuse, logged
+from twin.estimate.navigation.dvl import DvlIntegrator, body_displacement, fuse_displacement, fuse_dvl
 from twin.estimate.navigation.pose_filter import PoseFilter
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
@@ -25,10 +25,10 @@ def numeric(function, at, step=1e-6):
     return np.column_stack([(function(at + d) - function(at - d)) / (2 * step) for d in np.eye(len(at)) * step])
 
 
-def keyframes(poses, readings=None, walked=None):
+def keyframes(poses, readings=None, displacements=None):
     n = len(poses)
-    rows = zip(poses, readings or [Readings()] * n, walked or [None] * n, strict=True)
-    return [Keyframe(k, k, 1, pose.copy(), None, r, w) for k, (pose, r, w) in enumerate(rows)]
+    rows = zip(poses, readings or [Readings()] * n, displacements or [None] * n, strict=True)
+    return [Keyframe(k, k, 1, pose.copy(), None, r, d) for k, (pose, r, d) in enumerate(rows)]
 
 
 def pixels_of(pose):
@@ -40,7 +40,7 @@ def sightings_of(pixels):
 
 
 def dense_update(cov, jacobian, noise_cov, residual):
-    """Kalman's update in information form: no gain that the filter's own code could share."""
+    """Returns mean and covariance of a Kalman update in information form, which shares no formula with the filter."""
     information = np.linalg.inv(noise_cov)
     after = np.linalg.inv(np.linalg.inv(cov) + jacobian.T @ information @ jacobian)
     return after @ jacobian.T @ information @ residual, after
@@ -51,177 +51,182 @@ def some_cov(rng, size=1e-3):
     return root @ root.T + np.eye(6) * (0.3 * size) ** 2
 
 
-def test_an_acoustic_fix_updates_the_online_position_as_kalman_does():
-    believed, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(0), 0.1)
-    believed.cov = cov
+def test_fusion_of_an_acoustic_fix_is_a_kalman_update():
+    pose_filter, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(0), 0.1)
+    pose_filter.cov = cov
     fix = POSE[:3, 3] + [0.2, -0.1, 0.3]
     jacobian = numeric(lambda m: (POSE @ geometry.exp(m))[:3, 3], np.zeros(6))
     moved, after = dense_update(cov, jacobian, np.eye(3) * 0.3**2, fix - POSE[:3, 3])
-    believed.fix(Readings(usbl_m=fix))
-    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ believed.world_from_camera), moved, atol=1e-8)
-    np.testing.assert_allclose(believed.cov, after, atol=1e-8)
+    pose_filter.fuse_position_fixes(Readings(usbl_m=fix))
+    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ pose_filter.world_from_camera), moved, atol=1e-8)
+    np.testing.assert_allclose(pose_filter.cov, after, atol=1e-8)
 
 
-def test_a_beacon_updates_the_online_position_as_kalman_does():
-    believed, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(1))
-    believed.cov = cov
+def test_fusion_of_a_beacon_is_a_kalman_update():
+    pose_filter, cov = PoseFilter(POSE, RIG, NOISE), some_cov(np.random.default_rng(1))
+    pose_filter.cov = cov
     pixel = pixels_of(POSE)[2] + [0.4, -0.3]
     jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m))[2], np.zeros(6))
     moved, after = dense_update(cov, jacobian, np.eye(2) * 0.2**2, pixel - pixels_of(POSE)[2])
-    believed.fix(Readings(beacons=(Sighting(2, tuple(pixel)),)))
-    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ believed.world_from_camera), moved, atol=1e-9)
-    np.testing.assert_allclose(believed.cov, after, rtol=1e-5, atol=1e-12)
+    pose_filter.fuse_position_fixes(Readings(beacons=(Sighting(2, tuple(pixel)),)))
+    np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ pose_filter.world_from_camera), moved, atol=1e-9)
+    np.testing.assert_allclose(pose_filter.cov, after, rtol=1e-5, atol=1e-12)
 
 
-def test_a_beacon_behind_the_camera_says_nothing():
+def test_a_beacon_behind_the_camera_is_ignored():
     above = geometry.pose(MOUNT[:3, :3], np.array([0.3, 0.2, -1.0]))
-    believed = PoseFilter(above, RIG, NOISE)
-    believed.fix(Readings(beacons=(Sighting(0, (100.0, 100.0)),)))
-    np.testing.assert_array_equal(believed.world_from_camera, above)
+    pose_filter = PoseFilter(above, RIG, NOISE)
+    pose_filter.fuse_position_fixes(Readings(beacons=(Sighting(0, (100.0, 100.0)),)))
+    np.testing.assert_array_equal(pose_filter.world_from_camera, above)
 
 
-def test_the_way_of_the_body_and_its_derivative_agree_with_finite_differences():
+def test_the_jacobian_of_the_body_displacement_agrees_with_finite_differences():
     motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
-    way, by_motion = body_displacement(motion, MOUNT)
+    displacement, by_motion = body_displacement(motion, MOUNT)
     body = MOUNT @ motion @ geometry.inverse(MOUNT)
-    np.testing.assert_allclose(way, body[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(displacement, body[:3, 3], atol=1e-12)
     expected = numeric(lambda m: body_displacement(motion @ geometry.exp(m), MOUNT)[0], np.zeros(6))
     np.testing.assert_allclose(by_motion, expected, atol=1e-8)
 
 
-def test_a_frame_motion_and_a_displacement_are_fused_as_kalman_does():
+def test_fusion_of_a_frame_motion_with_a_displacement_is_a_kalman_update():
     rng = np.random.default_rng(2)
     motion = Motion(geometry.exp(np.array([0.01, 0, 0.02, 0.01, -0.02, 0])), some_cov(rng), 100, 1.0)
     step_cov = np.diag([1e-6, 2e-6, 3e-6])
-    way = body_displacement(motion.a_from_b, MOUNT)[0]
-    step = way + [1e-3, -2e-3, 5e-4]
+    expected = body_displacement(motion.a_from_b, MOUNT)[0]
+    step = expected + [1e-3, -2e-3, 5e-4]
     jacobian = numeric(lambda m: body_displacement(motion.a_from_b @ geometry.exp(m), MOUNT)[0], np.zeros(6))
-    moved, after = dense_update(motion.cov, jacobian, step_cov, step - way)
-    fused, cov = fuse(motion.a_from_b, motion.cov, step, step_cov, MOUNT)
+    moved, after = dense_update(motion.cov, jacobian, step_cov, step - expected)
+    fused, cov = fuse_displacement(motion.a_from_b, motion.cov, step, step_cov, MOUNT)
     np.testing.assert_allclose(geometry.log(geometry.inverse(motion.a_from_b) @ fused), moved, atol=1e-9)
     np.testing.assert_allclose(cov, after, atol=1e-11)
 
 
-def aid(log, motion, velocity):
-    """The motion with what the log says of it."""
+def fuse(dvl, motion, velocity):
+    """Returns the motion of a frame fused with a velocity (None: no reading)."""
     reading = np.full(3, np.nan) if velocity is None else velocity
-    fused, cov = logged(log.way, log.beams, motion.a_from_b, motion.cov, reading)
+    fused, cov = fuse_dvl(dvl.state, dvl.model(1 / RIG.frame_rate_hz), motion.a_from_b, motion.cov, reading)
     return motion._replace(a_from_b=fused, cov=cov)
 
 
 def sea_path(n):
-    """Poses of a body that surges, sways and turns, (n, 4, 4), and its exact velocities in the body (n, 3)."""
+    """Returns poses (n, 4, 4) of a body that surges, sways and turns, and its exact velocities (n, 3) in the body."""
     t = np.arange(n) / RIG.frame_rate_hz
     yaw, speed = 0.3 * np.sin(1.5 * t), 0.4 + 0.1 * np.sin(2 * t)
     velocity = np.column_stack([speed, 0.1 * np.cos(t), 0.05 * np.sin(t)])
-    fine = np.arange((n - 1) * 100 + 1) / RIG.frame_rate_hz / 100  # the position by a hundred times finer steps
+    # positions are integrated in steps a hundred times finer
+    fine = np.arange((n - 1) * 100 + 1) / RIG.frame_rate_hz / 100
     turns = np.array([geometry.rotation_from_rpy(0, 0, a) for a in 0.3 * np.sin(1.5 * fine)])
     world = np.einsum(
         "nij,nj->ni", turns, np.column_stack([0.4 + 0.1 * np.sin(2 * fine), 0.1 * np.cos(fine), 0.05 * np.sin(fine)])
     )
-    way = np.concatenate([np.zeros((1, 3)), np.cumsum((world[1:] + world[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
-    poses = [geometry.pose(geometry.rotation_from_rpy(0, 0, a), p) for a, p in zip(yaw, way[::100], strict=True)]
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum((world[1:] + world[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
+    poses = [geometry.pose(geometry.rotation_from_rpy(0, 0, a), p) for a, p in zip(yaw, path[::100], strict=True)]
     return np.array(poses), velocity
 
 
-def walk(poses, velocity, noise, motion_cov, rng=None):
-    """The displacement that the log tells over a path whose attitude vision sees with this covariance."""
-    log = VelocityLog(RIG, noise)
-    aid(log, Motion(np.eye(4), np.eye(6) * 1e-12, 100, 0.0), velocity[0])
-    log.at_node(0)
+def integrate(poses, velocity, noise, motion_cov, rng=None):
+    """Returns the displacement by the DVL over a path, with visual motion of this covariance."""
+    dvl = DvlIntegrator(RIG, noise)
+    fuse(dvl, Motion(np.eye(4), np.eye(6) * 1e-12, 100, 0.0), velocity[0])
+    dvl.displacement_at_node(0)
     root = np.linalg.cholesky(motion_cov)
     for a, b, v in zip(poses, poses[1:], velocity[1:], strict=False):
         true = geometry.inverse(a @ MOUNT) @ b @ MOUNT
-        seen = true if rng is None else true @ geometry.exp(root @ rng.normal(size=6))
-        aid(log, Motion(seen, motion_cov, 100, 0.0), v)
-    return log.at_node(1)
+        measured = true if rng is None else true @ geometry.exp(root @ rng.normal(size=6))
+        fuse(dvl, Motion(measured, motion_cov, 100, 0.0), v)
+    return dvl.displacement_at_node(1)
 
 
-def test_velocities_sum_to_the_way_along_a_bent_path():
+def test_velocities_integrate_to_the_displacement_along_a_curved_path():
     poses, velocity = sea_path(61)
-    walked = walk(poses, velocity, NOISE, np.diag([1e-12] * 3 + [1.0] * 3))
-    # the trapezoidal rule errs by dt^2 / 12 of the change of acceleration, here below 1 m/s^2: 2e-4 m
-    np.testing.assert_allclose(walked.metres, (geometry.inverse(poses[0]) @ poses[-1])[:3, 3], atol=2e-4)
-    assert np.linalg.norm(walked.metres) > 0.7
+    displacement = integrate(poses, velocity, NOISE, np.diag([1e-12] * 3 + [1.0] * 3))
+    # error of the trapezoidal rule: dt^2 / 12 times the change of acceleration, here below 1 m/s^2: 2e-4 m
+    true_m = (geometry.inverse(poses[0]) @ poses[-1])[:3, 3]
+    np.testing.assert_allclose(displacement.displacement_m, true_m, atol=2e-4)
+    assert np.linalg.norm(displacement.displacement_m) > 0.7
 
 
-def test_the_displacement_of_a_node_errs_as_its_covariance_says():
+def test_the_covariance_of_a_displacement_is_consistent_with_its_errors():
     poses, velocity = sea_path(31)
     true, motion_cov, rng = geometry.inverse(poses[0]) @ poses[-1], np.diag([1e-4**2] * 3 + [1e-2**2] * 3), None
     nees, n = [], 600
     for seed in range(n):
         rng = np.random.default_rng(seed)
         noisy = velocity + rng.normal(size=velocity.shape) * NOISE.dvl_mps
-        walked = walk(poses, noisy, NOISE, motion_cov, rng)
-        error = walked.metres - true[:3, 3]
-        nees.append(error @ np.linalg.solve(walked.cov, error))
+        displacement = integrate(poses, noisy, NOISE, motion_cov, rng)
+        error = displacement.displacement_m - true[:3, 3]
+        nees.append(error @ np.linalg.solve(displacement.cov, error))
     low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * n) / n
-    # the covariance counts the attitude's whole error for all the way (a third of its variance is true: here 2 %) and
-    # the first and last reading in full (half of their noise is: 1 of 31 frames)
+    # The covariance is conservative: it applies the final attitude error to the whole path (three times its true share
+    # of the variance, here 2 %), and the noise of the first and last reading in full instead of half (1 of 31 frames).
     assert 0.94 * low < np.mean(nees) < high
 
 
-def test_the_scale_error_of_a_straight_way_adds_up_frame_by_frame():
+def test_the_scale_error_accumulates_along_a_straight_path():
     velocity = np.tile([0.3, 0.0, 0.0], (31, 1))
     scale_only = SensorNoise(0.01, 0.003, 0.01, dvl_mps=1e-9, dvl_scale=0.01)
-    log, blind = VelocityLog(RIG, scale_only), np.eye(6)
+    dvl, blind = DvlIntegrator(RIG, scale_only), np.eye(6)
     blind[:3, :3] *= 1e-16
-    aid(log, Motion(np.eye(4), blind, 0, 0.0), velocity[0])
-    log.at_node(0)
+    fuse(dvl, Motion(np.eye(4), blind, 0, 0.0), velocity[0])
+    dvl.displacement_at_node(0)
     variance = 0.0
     for v in velocity[1:]:
-        fused = aid(log, Motion(np.eye(4), blind, 0, 0.0), v)
+        fused = fuse(dvl, Motion(np.eye(4), blind, 0, 0.0), v)
         variance += (MOUNT[:3, :3] @ fused.cov[3:, 3:] @ MOUNT[:3, :3].T)[0, 0]
     assert np.sqrt(variance) == pytest.approx(0.01 * 0.3, rel=1e-4)  # a second at 0.3 m/s
 
 
-def test_without_readings_the_motion_stays_and_no_displacement_is_told():
-    log, motion = VelocityLog(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.01)), np.eye(6) * 1e-6, 100, 1.0)
-    log.at_node(0)
-    unaided = aid(log, motion, None)
+def test_without_velocity_readings_the_motion_is_unchanged_and_there_is_no_displacement():
+    dvl, motion = DvlIntegrator(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.01)), np.eye(6) * 1e-6, 100, 1.0)
+    dvl.displacement_at_node(0)
+    unaided = fuse(dvl, motion, None)
     np.testing.assert_array_equal(unaided.a_from_b, motion.a_from_b)
     np.testing.assert_array_equal(unaided.cov, motion.cov)
-    assert log.at_node(1) is None
-    aid(log, motion, np.zeros(3))
-    log.at_node(2)
-    aid(log, motion, np.zeros(3))
-    assert log.at_node(3) is not None
-    aid(log, motion, None)
-    assert log.at_node(4) is None  # one reading lacks
+    assert dvl.displacement_at_node(1) is None
+    fuse(dvl, motion, np.zeros(3))
+    dvl.displacement_at_node(2)
+    fuse(dvl, motion, np.zeros(3))
+    assert dvl.displacement_at_node(3) is not None
+    fuse(dvl, motion, None)
+    assert dvl.displacement_at_node(4) is None  # one reading is missing
 
 
-def test_vision_that_fails_leaves_the_motion_to_the_log():
+def test_where_vision_fails_the_dvl_determines_the_motion():
     velocity = np.array([0.3, -0.1, 0.05])
-    log, blind = VelocityLog(RIG, NOISE), Motion(np.eye(4), np.diag([1e-10] * 3 + [1e-2] * 3), 0, np.inf)
-    aid(log, blind, velocity)
-    fused = aid(log, blind, velocity)
+    dvl, blind = DvlIntegrator(RIG, NOISE), Motion(np.eye(4), np.diag([1e-10] * 3 + [1e-2] * 3), 0, np.inf)
+    fuse(dvl, blind, velocity)
+    fused = fuse(dvl, blind, velocity)
     np.testing.assert_allclose(body_displacement(fused.a_from_b, MOUNT)[0], velocity / 30, atol=1e-5)
 
 
-RIGID = 1e-12  # variance of what a graph of the tests shall not move
+FIXED = 1e-12  # variance of quantities that are fixed in a graph
 
 
-def level(x):
+def camera_at(x):
     return geometry.pose(MOUNT[:3, :3], np.array([x, 0.0, 2.0]))
 
 
-def test_displacements_and_links_agree_with_the_dense_adjustment_and_share_one_scale_error():
-    """On a line: links of 1 mm, displacements of 1 mm with a common scale: generalised least squares in x."""
-    n, step, link_m, log_m = 30, 0.3, 1e-3, 1e-3
+def test_alignment_with_displacements_of_one_scale_error_agrees_with_dense_least_squares():
+    """On a line, with link noise of 1 mm and displacement noise of 1 mm: generalised least squares in x."""
+    n, step, link_m, dvl_m = 30, 0.3, 1e-3, 1e-3
     noise = SensorNoise(0.01, 0.003, 0.01, dvl_scale=0.01)
     rng = np.random.default_rng(0)
-    linked, logged = step + rng.normal(size=n) * link_m, 1.008 * step + rng.normal(size=n) * log_m
-    cov = np.diag([RIGID] * 3 + [link_m**2] * 3)
-    links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(d), cov, 1.0, 100) for k, d in enumerate(linked)]
-    walked = [None] + [Displacement(k, np.array([d, 0, 0]), np.eye(3) * log_m**2) for k, d in enumerate(logged)]
-    start = [level(x) for x in np.concatenate([[0], np.cumsum(linked)])]
-    aligned = align(keyframes(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, noise)
+    by_link, by_dvl = step + rng.normal(size=n) * link_m, 1.008 * step + rng.normal(size=n) * dvl_m
+    cov = np.diag([FIXED] * 3 + [link_m**2] * 3)
+    links = [
+        Link(k, k + 1, geometry.inverse(camera_at(0)) @ camera_at(d), cov, 1.0, 100) for k, d in enumerate(by_link)
+    ]
+    displacements = [None]
+    displacements += [Displacement(k, np.array([d, 0, 0]), np.eye(3) * dvl_m**2) for k, d in enumerate(by_dvl)]
+    start = [camera_at(x) for x in np.concatenate([[0], np.cumsum(by_link)])]
+    aligned = align(keyframes(start, displacements=displacements), links, {0: np.eye(6) * FIXED}, RIG, noise)
 
-    # unknown: steps (n,) and scale; (1 + s) d = logged is linearised at the links' mean, second order 1e-5 of a step
+    # unknowns: steps (n,) and scale; (1 + s) d = by_dvl is linearised at the mean step, second order 1e-5 of a step
     rows = np.vstack([np.eye(n, n + 1), np.eye(n, n + 1), np.eye(1, n + 1, n)])
     rows[n : 2 * n, n] = step
-    weight = np.diag(np.concatenate([np.full(n, link_m), np.full(n, log_m), [noise.dvl_scale]]) ** -2.0)
-    observed = np.concatenate([linked, logged, [0.0]])
+    weight = np.diag(np.concatenate([np.full(n, link_m), np.full(n, dvl_m), [noise.dvl_scale]]) ** -2.0)
+    observed = np.concatenate([by_link, by_dvl, [0.0]])
     after = np.linalg.inv(rows.T @ weight @ rows)
     steps = (after @ rows.T @ weight @ observed)[:n]
     np.testing.assert_allclose(aligned.poses[1:, 0, 3], np.cumsum(steps), atol=5e-4)
@@ -229,74 +234,81 @@ def test_displacements_and_links_agree_with_the_dense_adjustment_and_share_one_s
     variance = np.diag(summed @ after[:n, :n] @ summed.T)
     world = np.array([p[:3, :3] @ c[3:, 3:] @ p[:3, :3].T for p, c in zip(aligned.poses, aligned.covs, strict=True)])
     np.testing.assert_allclose(world[1:, 0, 0], variance, rtol=0.03)
-    assert abs(aligned.poses[-1, 0, 3] - n * step) < 4 * np.sqrt(variance[-1])  # 0.8 % of 9 m would be 72 mm
+    # without the scale parameter the error would be 0.8 % of 9 m, 72 mm
+    assert abs(aligned.poses[-1, 0, 3] - n * step) < 4 * np.sqrt(variance[-1])
 
 
-def test_true_displacements_return_the_true_poses_of_a_turning_vehicle():
+def test_exact_displacements_give_the_true_poses_of_a_turning_vehicle():
     rng = np.random.default_rng(4)
-    poses = [level(0) @ geometry.exp(np.array([0.02 * k, -0.05 * k, 0.1 * k, 0.1 * k, -0.3 * k, 0])) for k in range(6)]
+    poses = [
+        camera_at(0) @ geometry.exp(np.array([0.02 * k, -0.05 * k, 0.1 * k, 0.1 * k, -0.3 * k, 0])) for k in range(6)
+    ]
     motions = [geometry.inverse(a) @ b for a, b in zip(poses, poses[1:], strict=False)]
-    walked = [None] + [Displacement(k, body_displacement(m, MOUNT)[0], np.eye(3) * 1e-8) for k, m in enumerate(motions)]
-    cov = np.diag([1e-10] * 3 + [1.0] * 3)  # the links tell the attitude alone
+    displacements = [None]
+    displacements += [Displacement(k, body_displacement(m, MOUNT)[0], np.eye(3) * 1e-8) for k, m in enumerate(motions)]
+    cov = np.diag([1e-10] * 3 + [1.0] * 3)  # the links constrain the attitude only
     links = [
         Link(k, k + 1, m @ geometry.exp(np.array([0, 0, 0, 0.1, 0.1, 0.1])), cov, 1.0, 100)
         for k, m in enumerate(motions)
     ]
     start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 1e-3) for p in poses[1:]]
     exact_scale = SensorNoise(0.01, 0.003, 0.01, dvl_scale=1e-9)
-    aligned = align(keyframes(start, walked=walked), links, {0: np.eye(6) * RIGID}, RIG, exact_scale)
-    # corrections of 1 mrad and 1 mm leave out 0.3 m * (1e-3)^2 / 2 a link
+    aligned = align(keyframes(start, displacements=displacements), links, {0: np.eye(6) * FIXED}, RIG, exact_scale)
+    # second-order error of corrections of 1 mrad and 1 mm: 0.3 m * (1e-3)^2 / 2 per link
     np.testing.assert_allclose(aligned.poses, poses, atol=5e-6)
 
 
-def test_a_common_move_of_two_nodes_leaves_their_displacement_as_it_was():
-    poses = [level(0), level(0.3) @ geometry.exp(np.array([0.02, -0.05, 0.1, 0, 0, 0]))]
-    walked = [None, Displacement(0, np.array([0.301, 0.002, -0.001]), np.eye(3) * 1e-6)]
-    away = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
-    told = aiding.displacements(keyframes(poses, walked=walked), RIG)
+def test_displacement_residuals_are_invariant_to_a_common_motion_of_both_nodes():
+    poses = [camera_at(0), camera_at(0.3) @ geometry.exp(np.array([0.02, -0.05, 0.1, 0, 0, 0]))]
+    displacements = [None, Displacement(0, np.array([0.301, 0.002, -0.001]), np.eye(3) * 1e-6)]
+    common = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
+    factors = aiding.displacement_factors(keyframes(poses, displacements=displacements), RIG)
     start, moved = (
-        told.observe((geometry.inverse(a) @ b)[None], 0.0) for a, b in (poses, [away @ pose for pose in poses])
+        factors.residuals((geometry.inverse(a) @ b)[None], 0.0) for a, b in (poses, [common @ pose for pose in poses])
     )
     assert np.linalg.norm(start) > 1e-3
     np.testing.assert_allclose(moved, start, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.05])
-def test_what_displacements_change_by_agrees_with_finite_differences(scale):
+def test_jacobians_of_displacement_factors_agree_with_finite_differences(scale):
     motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
-    walked = [None, Displacement(0, np.array([0.3, 0.0, 0.0]), np.eye(3) * 1e-6)]
-    told = aiding.displacements(keyframes([POSE, POSE @ motion], walked=walked), RIG)
-    by_j, by_scale = told.derive(motion[None], scale, told.observe(motion[None], scale))
-    by_motion = numeric(lambda m: told.observe((motion @ geometry.exp(m))[None], scale)[0], np.zeros(6))
+    displacements = [None, Displacement(0, np.array([0.3, 0.0, 0.0]), np.eye(3) * 1e-6)]
+    factors = aiding.displacement_factors(keyframes([POSE, POSE @ motion], displacements=displacements), RIG)
+    by_j, by_scale = factors.jacobians(motion[None], scale, factors.residuals(motion[None], scale))
+    by_motion = numeric(lambda m: factors.residuals((motion @ geometry.exp(m))[None], scale)[0], np.zeros(6))
     np.testing.assert_allclose(by_j[0], by_motion, atol=1e-8)
     np.testing.assert_allclose(
-        by_scale[0], numeric(lambda s: told.observe(motion[None], scale + s[0])[0], np.zeros(1))[:, 0], atol=1e-8
+        by_scale[0], numeric(lambda s: factors.residuals(motion[None], scale + s[0])[0], np.zeros(1))[:, 0], atol=1e-8
     )
 
 
-@pytest.mark.parametrize("kind", ["heights", "attitudes", "fixes", "beacons"])
-def test_what_readings_change_by_agrees_with_finite_differences(kind):
+@pytest.mark.parametrize("kind", ["height", "attitude", "position", "beacon"])
+def test_jacobians_of_unary_factors_agree_with_finite_differences(kind):
     readings = Readings(2.3, np.array([0.05, -0.02, 0.45]), usbl_m=np.array([0.2, 0.0, 2.0]),
                         beacons=sightings_of(pixels_of(POSE))[:1])  # fmt: skip
-    order = ["heights", "attitudes", "fixes", "beacons"]
-    told = aiding.singles(keyframes([POSE], [readings]), RIG, NOISE)[order.index(kind)]
-    found = told.derive(POSE[None], told.observe(POSE[None]))
-    expected = numeric(lambda m: told.observe((POSE @ geometry.exp(m))[None])[0], np.zeros(6))
-    np.testing.assert_allclose(found[0], expected, rtol=1e-6, atol=1e-7)
+    order = ["height", "attitude", "position", "beacon"]
+    factors = aiding.unary_factors(keyframes([POSE], [readings]), RIG, NOISE)[order.index(kind)]
+    jacobians = factors.jacobians(POSE[None], factors.residuals(POSE[None]))
+    expected = numeric(lambda m: factors.residuals((POSE @ geometry.exp(m))[None])[0], np.zeros(6))
+    np.testing.assert_allclose(jacobians[0], expected, rtol=1e-6, atol=1e-7)
 
 
-def test_a_displacement_from_a_node_outside_the_window_is_left_out():
-    walked = [None, Displacement(7, np.full(3, 9.0), np.eye(3) * 1e-6)]
-    link = Link(0, 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-6, 1.0, 100)
-    aligned = align(keyframes([level(0), level(0.3)], walked=walked), [link], {0: np.eye(6) * RIGID}, RIG, NOISE)
-    np.testing.assert_allclose(aligned.poses[1], level(0.3), atol=1e-9)
+def test_a_displacement_from_a_node_outside_the_window_is_ignored():
+    displacements = [None, Displacement(7, np.full(3, 9.0), np.eye(3) * 1e-6)]
+    link = Link(0, 1, geometry.inverse(camera_at(0)) @ camera_at(0.3), np.eye(6) * 1e-6, 1.0, 100)
+    nodes = keyframes([camera_at(0), camera_at(0.3)], displacements=displacements)
+    aligned = align(nodes, [link], {0: np.eye(6) * FIXED}, RIG, NOISE)
+    np.testing.assert_allclose(aligned.poses[1], camera_at(0.3), atol=1e-9)
 
 
-def test_acoustic_fixes_of_a_rigid_chain_have_the_weighted_mean():
-    """A free start and rigid links: the chain goes where prior and fixes have their mean, with its variance."""
+def test_acoustic_fixes_of_a_rigid_chain_shift_it_to_the_weighted_mean():
+    """With a weak prior and nearly exact links, the shift is the weighted mean of prior and fixes."""
     fixes = np.array([[0.3, 0.1, 2.2], [0.6, -0.2, 1.9], [0.5, 0.3, 2.3]])
-    poses = [level(x) for x in (0.0, 0.3, 0.6)]
-    links = [Link(k, k + 1, geometry.inverse(level(0)) @ level(0.3), np.eye(6) * 1e-8, 1.0, 100) for k in range(2)]
+    poses = [camera_at(x) for x in (0.0, 0.3, 0.6)]
+    links = [
+        Link(k, k + 1, geometry.inverse(camera_at(0)) @ camera_at(0.3), np.eye(6) * 1e-8, 1.0, 100) for k in range(2)
+    ]
     prior = np.diag([1e-8] * 3 + [0.2**2] * 3)
     readings = [Readings(usbl_m=fix) for fix in fixes]
     aligned = align(keyframes(poses, readings), links, {0: prior}, RIG, NOISE)
@@ -306,7 +318,7 @@ def test_acoustic_fixes_of_a_rigid_chain_have_the_weighted_mean():
     np.testing.assert_allclose(aligned.covs[0][3:, 3:], np.eye(3) * variance, rtol=1e-3, atol=1e-6)
 
 
-def test_four_beacons_resect_the_camera_with_the_covariance_of_their_pixels():
+def test_four_beacons_resect_the_camera_with_the_covariance_of_a_resection():
     wide = {0: np.eye(6) * 1e2}
     readings = Readings(beacons=sightings_of(pixels_of(POSE)))
     key = keyframes([POSE @ geometry.exp(np.array([0.03, -0.02, 0.05, 0.1, -0.1, 0.15]))], [readings])
@@ -314,18 +326,18 @@ def test_four_beacons_resect_the_camera_with_the_covariance_of_their_pixels():
     jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m)).ravel(), np.zeros(6))
     expected = np.linalg.inv(jacobian.T @ jacobian) * NOISE.beacon_px**2
     np.testing.assert_allclose(aligned.poses[0], POSE, atol=1e-5)
-    # beacons are held to 0.1 mm, of 1.6 mm that 0.2 px are at this depth: 0.4 % of variance
+    # the information of the prior is small but not zero
     np.testing.assert_allclose(aligned.covs[0], expected, atol=0.02 * np.abs(expected).max())
 
 
-def test_online_and_alignment_hold_the_same_of_the_same_beacons():
+def test_filter_and_alignment_agree_on_the_same_beacons():
     rng = np.random.default_rng(3)
     cov = some_cov(rng)
     readings = Readings(beacons=sightings_of(pixels_of(POSE) + rng.normal(size=(4, 2)) * 0.2))
-    believed = PoseFilter(POSE, RIG, NOISE)
-    believed.cov = cov
-    believed.fix(readings)
+    pose_filter = PoseFilter(POSE, RIG, NOISE)
+    pose_filter.cov = cov
+    pose_filter.fuse_position_fixes(readings)
     aligned = align(keyframes([POSE], [readings]), [], {0: cov}, RIG, NOISE)
-    # corrections of 1 mm and 1 mrad: their product is left out by both in ways of their own
-    np.testing.assert_allclose(believed.world_from_camera, aligned.poses[0], atol=2e-5)
-    np.testing.assert_allclose(believed.cov, aligned.covs[0], atol=0.02 * np.abs(believed.cov).max())
+    # corrections of 1 mm and 1 mrad: the two linearisations differ by second-order terms
+    np.testing.assert_allclose(pose_filter.world_from_camera, aligned.poses[0], atol=2e-5)
+    np.testing.assert_allclose(pose_filter.cov, aligned.covs[0], atol=0.02 * np.abs(pose_filter.cov).max())

@@ -1,4 +1,4 @@
-"""Global alignment against eq. (7) solved directly with Lagrange multipliers, and what it does with wrong links."""
+"""Global alignment against eq. (7) solved directly with Lagrange multipliers, and removal of outlier links."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ ANCHOR = {0: np.eye(6) * 1e-16}
 
 
 def small_network(rng, n=6, share_of_sigma=0.3):
-    """A loop of nodes with chords; residuals small enough that no robust weight departs from 1."""
+    """Returns poses of a loop and links along and across it; no residual is large enough for a Huber weight below 1."""
     poses = [geometry.exp(np.array([0.05 * k, -0.1 * k, 0.2 * k, 0.5 * k, 0.1 * k * k, 0.02 * k])) for k in range(n)]
     pairs = [(k, k + 1) for k in range(n - 1)] + [(0, 3), (1, 4), (2, 5), (0, 5)]
     links = []
@@ -36,7 +36,11 @@ def numeric(function, at, step=1e-6):
 
 
 def mixed_adjustment(start, links, iterations=6):
-    """Minimises eq. (7) by its bordered system, first pose held: poses and the covariance of nodes 1 to n - 1."""
+    """Minimises eq. (7) by its bordered system with the first pose fixed.
+
+    Returns:
+        Poses (n, 4, 4), and the covariance of poses 1 to n - 1.
+    """
     poses, motions = [p.copy() for p in start], [link.i_from_j.copy() for link in links]
     n, m = 6 * (len(poses) - 1), 6 * len(links)
     c_inverse = np.zeros((m, m))
@@ -78,14 +82,14 @@ def test_alignment_agrees_with_eq_7_solved_with_lagrange_multipliers():
     start = [poses[0]] + [p @ geometry.exp(rng.normal(size=6) * 0.02) for p in poses[1:]]
     direct, cov = mixed_adjustment(start, links)
     aligned = align(keyframes(start), links, ANCHOR, RIG, NOISE)
-    # the bordered system adds residuals as vectors: of 1e-3 rad they err by 5e-4 of themselves, 3e-6 at 5 m
+    # the bordered system adds residuals as vectors, a relative error of 5e-4 at 1e-3 rad: 3e-6 m at 5 m
     np.testing.assert_allclose(aligned.poses, direct, atol=5e-6)
     for k in range(1, len(poses)):
         block = cov[6 * k - 6 : 6 * k, 6 * k - 6 : 6 * k]
         np.testing.assert_allclose(aligned.covs[k], block, atol=0.02 * np.abs(block).max())
 
 
-def test_exact_links_return_the_true_poses():
+def test_exact_links_give_the_true_poses():
     poses, links = small_network(np.random.default_rng(1), share_of_sigma=0.0)
     start = [poses[0]] + [p @ geometry.exp(np.full(6, 0.05)) for p in poses[1:]]
     aligned = align(keyframes(start), links, ANCHOR, RIG, NOISE)
@@ -93,18 +97,18 @@ def test_exact_links_return_the_true_poses():
     assert not aligned.dropped
 
 
-def test_a_wrong_link_is_dropped_and_told():
+def test_an_outlier_link_is_removed_and_reported():
     poses, links = small_network(np.random.default_rng(2))
-    wrong = links[6]._replace(i_from_j=links[6].i_from_j @ geometry.exp(np.array([0, 0, 0.2, 0.5, 0, 0])))
-    aligned = align(keyframes(poses), links[:6] + [wrong] + links[7:], ANCHOR, RIG, NOISE)
-    assert [(link.i, link.j) for link in aligned.dropped] == [(wrong.i, wrong.j)]
+    outlier = links[6]._replace(i_from_j=links[6].i_from_j @ geometry.exp(np.array([0, 0, 0.2, 0.5, 0, 0])))
+    aligned = align(keyframes(poses), links[:6] + [outlier] + links[7:], ANCHOR, RIG, NOISE)
+    assert [(link.i, link.j) for link in aligned.dropped] == [(outlier.i, outlier.j)]
     np.testing.assert_allclose(
         aligned.poses, align(keyframes(poses), links[:6] + links[7:], ANCHOR, RIG, NOISE).poses, atol=1e-5
     )
 
 
-def test_pressure_and_attitude_bound_what_links_alone_cannot():
-    """A chain of 40 links whose bias bends it by 2 mrad a step; the readings hold height and attitude."""
+def test_pressure_and_attitude_bound_the_drift_of_a_chain():
+    """A chain of 40 links with a rotation bias of 2 mrad per link."""
     n = 40
     step = geometry.exp(np.array([0, 0, 0, 0, -0.3, 0.0]))
     start_pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
@@ -114,23 +118,23 @@ def test_pressure_and_attitude_bound_what_links_alone_cannot():
     bias = geometry.exp(np.array([0.002, 0, 0, 0, 0, 0]))
     cov = np.diag([0.002**2] * 3 + [0.001**2] * 3)
     links = [Link(k, k + 1, step @ bias, cov, 1.0, 100) for k in range(n - 1)]
-    free = align(keyframes(true), links, ANCHOR, RIG, NOISE).poses[-1]
+    unaided = align(keyframes(true), links, ANCHOR, RIG, NOISE).poses[-1]
     level = Readings(2.0, np.zeros(3))
-    held = align(keyframes(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
-    assert abs(free[2, 3] - 2.0) > 0.3
-    assert abs(held[2, 3] - 2.0) < 0.01
+    aided = align(keyframes(true, [level] * n), links, ANCHOR, RIG, NOISE).poses[-1]
+    assert abs(unaided[2, 3] - 2.0) > 0.3
+    assert abs(aided[2, 3] - 2.0) < 0.01
 
 
-def test_a_link_of_the_path_itself_always_stands():
-    """A wrong one contradicts its neighbours, but without it the path may fall apart."""
+def test_links_between_consecutive_nodes_are_never_removed():
+    """An outlier among them contradicts its neighbours, but without it the network may be disconnected."""
     poses, links = small_network(np.random.default_rng(3))
     links[2] = links[2]._replace(i_from_j=links[2].i_from_j @ geometry.exp(np.array([0, 0, 0, 0.3, 0, 0])))
     aligned = align(keyframes(poses), links, ANCHOR, RIG, NOISE)
     assert all(link.j - link.i > 1 for link in aligned.dropped)
 
 
-def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_noise():
-    """The attitude's covariance by finite differences of the angles; east and north stay free."""
+def test_the_covariance_of_a_node_with_height_and_attitude_readings_is_that_of_their_noise():
+    """The attitude covariance is compared with finite differences of the angles; east and north are unconstrained."""
     body = np.array([0.1, -0.2, 0.7])
 
     def camera(rpy):
@@ -139,31 +143,31 @@ def test_readings_of_height_and_attitude_leave_a_node_as_uncertain_as_their_nois
     pose, wide = geometry.pose(camera(body), np.array([1.0, 2.0, 3.0])), {0: np.eye(6) * 1e2}
     cov = align(keyframes([pose], [Readings(3.0, body)]), [], wide, RIG, NOISE).covs[0]
     np.testing.assert_allclose(pose[2, :3] @ cov[3:, 3:] @ pose[2, :3], NOISE.pressure_m**2, rtol=1e-3)
-    turned = [geometry.so3_exp(step) for step in np.eye(3) * 1e-6]  # about the body's axes, as the data sheet has it
+    rotations = [geometry.so3_exp(step) for step in np.eye(3) * 1e-6]  # about the axes of the body, as in data sheets
     in_camera = [geometry.so3_log(camera(body).T @ geometry.rotation_from_rpy(*body) @ r @ RIG.body_from_camera[:3, :3])
-                 / 1e-6 for r in turned]  # fmt: skip
+                 / 1e-6 for r in rotations]  # fmt: skip
     by_body = np.column_stack(in_camera)
-    sigma = np.diag([NOISE.attitude_rad, NOISE.attitude_rad, NOISE.heading_rad])
+    sigma = np.diag(NOISE.attitude_sigmas_rad)
     np.testing.assert_allclose(cov[:3, :3], by_body @ sigma**2 @ by_body.T, rtol=1e-3, atol=1e-9)
 
 
-def test_of_many_gross_links_every_one_is_dropped_and_next_to_none_of_the_good_ones():
-    """A raster of legs, a link in four gross."""
+def test_gross_outliers_are_removed_and_at_most_1_percent_of_the_inliers():
+    """Parallel legs where one link in four is an outlier."""
     rng, rows, cols = np.random.default_rng(4), 8, 30
     poses = [geometry.pose(np.eye(3), np.array([0.25 * c, 0.6 * r, 0.0])) for r in range(rows) for c in range(cols)]
-    near = [1, 2, 6, cols, cols + 1, 2 * cols]
-    pairs = [(k, k + step) for step in near for k in range(len(poses) - step)]
-    cov, links, gross = np.diag([1e-8] * 3 + [1e-7] * 3), [], set()
+    steps = [1, 2, 6, cols, cols + 1, 2 * cols]
+    pairs = [(k, k + step) for step in steps for k in range(len(poses) - step)]
+    cov, links, outliers = np.diag([1e-8] * 3 + [1e-7] * 3), [], set()
     for i, j in pairs:
         error = np.sqrt(np.diag(cov)) * rng.standard_normal(6)
         if j - i > 1 and rng.random() < 0.3:
             error += 0.3 * rng.standard_normal(6)
-            gross.add((i, j))
+            outliers.add((i, j))
         links.append(Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error), cov, 1.0, 100))
     start = [pose @ geometry.exp(2e-3 * rng.standard_normal(6)) for pose in poses]
     aligned = align(keyframes([poses[0], *start[1:]]), links, ANCHOR, RIG, NOISE)
     dropped = {(link.i, link.j) for link in aligned.dropped}
-    assert gross <= dropped
-    assert len(dropped - gross) <= 0.01 * len(links)
-    off = np.linalg.norm([a[:3, 3] - b[:3, 3] for a, b in zip(aligned.poses, poses, strict=True)], axis=1)
-    assert off.max() < 3e-3
+    assert outliers <= dropped
+    assert len(dropped - outliers) <= 0.01 * len(links)
+    errors_m = np.linalg.norm([a[:3, 3] - b[:3, 3] for a, b in zip(aligned.poses, poses, strict=True)], axis=1)
+    assert errors_m.max() < 3e-3

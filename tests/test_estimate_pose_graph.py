@@ -1,4 +1,4 @@
-"""The alignment's core on public pose graphs against gtsam's optimum, and its parts against closed forms."""
+"""Pose graph optimisation against gtsam on public and generated graphs, and its parts against closed forms."""
 
 import os
 from pathlib import Path
@@ -17,20 +17,27 @@ from twin.exchange import posegraph
 DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 
 
-def public(name):
+def public_graph(name):
     if not (DATA / name).is_file():
-        pytest.skip(f"no ../shared/data (or TWIN_DATA): {name} is not shipped")
+        pytest.skip(f"{name} is not shipped with the project: not found in ../shared/data or $TWIN_DATA")
     return posegraph.read(DATA / name).links
 
 
-def per_quaternion(link):
-    """The same link with its information on rotation read as that on the vector part of a quaternion, half an angle."""
+def with_quaternion_information(link):
+    """Returns the link with its rotation information read as that of a quaternion's vector part (half the angle)."""
     scale = np.diag([0.5] * 3 + [1.0] * 3)
     return link._replace(cov=scale @ link.cov @ scale)
 
 
+def noisy_link(rng, poses, ends, cov):
+    """Returns a link between two of the poses with Gaussian noise of this covariance."""
+    i, j = ends
+    error = np.linalg.cholesky(cov) @ rng.normal(size=6)
+    return Link(i, j, geometry.inverse(poses[i]) @ poses[j] @ geometry.exp(error), cov, 1.0, 9)
+
+
 def ring(rng, n=12, sigma=0.02, share_of_sigma=1.0):
-    """Poses around a ring and links with that noise; all they have in common is the loop."""
+    """Returns poses on a ring, and links along it with three links across."""
     poses = [geometry.exp(np.array([0, 0, 2 * np.pi * k / n, 0, 0, 0.0])) for k in range(n)]
     for k, pose in enumerate(poses):
         pose[:3, 3] = [np.cos(2 * np.pi * k / n), np.sin(2 * np.pi * k / n), 0.1 * k]
@@ -43,202 +50,273 @@ def ring(rng, n=12, sigma=0.02, share_of_sigma=1.0):
     return poses, links
 
 
-def gtsam_on_its_own(links):
-    """gtsam's optimum of the same graph, built here and run to the last digit."""
+def lawnmower(rng, n_legs=20, nodes_per_leg=25):
+    """Returns poses of a survey in parallel legs, and links along the path and between neighbouring legs."""
+    n, poses, at = n_legs * nodes_per_leg, [], {}
+    for leg in range(n_legs):
+        for step in range(nodes_per_leg):
+            column = step if leg % 2 == 0 else nodes_per_leg - 1 - step
+            heading, tilt = np.pi * (leg % 2), 0.05 * rng.normal(size=2)
+            rotation = geometry.rotation_from_rpy(tilt[0], tilt[1], heading) @ geometry.BODY_FROM_DOWN_CAMERA
+            at[leg, column] = len(poses)
+            poses.append(geometry.pose(rotation, np.array([0.3 * column, 0.5 * leg, 2.0 + 0.05 * rng.normal()])))
+    pairs = [(k, k + step) for step in (1, 2) for k in range(n - step)]
+    for (leg, column), k in at.items():
+        pairs += [(k, at[leg + 1, c]) for c in (column - 1, column, column + 1) if (leg + 1, c) in at]
+    root = np.tril(0.2 * rng.normal(size=(6, 6)), -1) + np.eye(6)
+    scaled = np.diag([1e-3] * 3 + [2e-3] * 3) @ root
+    return poses, [noisy_link(rng, poses, ends, scaled @ scaled.T) for ends in sorted(set(pairs))]
+
+
+def odometry(links, first):
+    """Returns poses by number: the motions between consecutive nodes, integrated from the first pose."""
+    poses = {0: first}
+    for link in sorted(links):
+        if link.j == link.i + 1:
+            poses[link.j] = poses[link.i] @ link.i_from_j
+    return poses
+
+
+def gtsam_graph(links, first=None, sigma=1e-3):
+    """Returns gtsam's graph of the links with a prior on pose 0 (the identity by default)."""
     graph = gtsam.NonlinearFactorGraph()
     for link in links:
-        noise = gtsam.noiseModel.Gaussian.Information(np.linalg.inv(link.cov))
+        noise = gtsam.noiseModel.Gaussian.Covariance(link.cov)
         graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), noise))
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    prior = gtsam.Pose3() if first is None else gtsam.Pose3(first)
+    graph.add(gtsam.PriorFactorPose3(0, prior, gtsam.noiseModel.Isotropic.Sigma(6, sigma)))
+    return graph
+
+
+def gtsam_values(poses):
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(k, gtsam.Pose3(pose))
+    return values
+
+
+def gtsam_optimum(graph, start):
+    """Returns gtsam's optimum, iterated until the cost no longer decreases."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-12)
-    start = gtsam.InitializePose3.initialize(graph)
-    return graph.error(gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize())
+    parameters.setRelativeErrorTol(1e-15)
+    parameters.setAbsoluteErrorTol(1e-15)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, parameters).optimize()
 
 
-def test_the_small_grid_reaches_gtsams_optimum():
-    links = public("smallGrid3D.g2o")
-    assert chordal.solve(links).cost == pytest.approx(517.93, rel=1e-4)
+def graph_of(poses, links, huber=None, sigma=1e-3):
+    """Returns the factor graph of links between poses 0 to n - 1, with a prior on the first pose."""
+    anchor = pose_graph.prior_factors([0], np.array(poses[:1]), np.eye(6)[None] * sigma**2)
+    motions = pose_graph.motion_factors(links, {k: k for k in range(len(poses))}, huber)
+    return pose_graph.FactorGraph(len(poses), [anchor], [motions])
 
 
-def test_the_sphere_reaches_gtsams_optimum_and_the_truth():
-    links = public("sphere2500.txt")
-    solved = chordal.solve(links)
-    assert solved.cost == pytest.approx(gtsam_on_its_own(links), rel=1e-5)
+def test_the_small_grid_reaches_the_optimum_of_gtsam():
+    links = public_graph("smallGrid3D.g2o")
+    assert chordal.solve_pose_graph(links).cost == pytest.approx(517.93, rel=1e-4)
+
+
+def test_the_sphere_reaches_the_optimum_of_gtsam_and_the_truth():
+    links = public_graph("sphere2500.txt")
+    graph = gtsam_graph(links)
+    solved = chordal.solve_pose_graph(links)
+    optimum = gtsam_optimum(graph, gtsam.InitializePose3.initialize(graph))
+    assert solved.cost == pytest.approx(graph.error(optimum), rel=1e-5)
     assert truth_error_m(solved.poses) <= 0.21
 
 
-def test_the_sphere_read_per_quaternion_component_costs_what_is_asked():
-    solved = chordal.solve([per_quaternion(link) for link in public("sphere2500.txt")])
-    assert solved.cost == pytest.approx(675.70, rel=1e-3)  # it is 676.26, 0.08 % above
+def test_the_sphere_with_quaternion_information_has_the_published_cost():
+    solved = chordal.solve_pose_graph([with_quaternion_information(link) for link in public_graph("sphere2500.txt")])
+    assert solved.cost == pytest.approx(675.70, rel=1e-3)  # 676.26 is reached, 0.08 % more
     assert truth_error_m(solved.poses) <= 0.21
 
 
 def truth_error_m(poses):
-    """RMSE of the positions after a rigid alignment, by evo."""
+    """Returns the RMSE of the positions after rigid alignment, by evo."""
     true = [np.eye(4)]
-    for link in public("sphere2500_groundtruth.txt"):
+    for link in public_graph("sphere2500_groundtruth.txt"):
         if link.j == link.i + 1:
             true.append(true[-1] @ link.i_from_j)
-    reference, found = (
+    reference, estimated = (
         PosePath3D(poses_se3=true),
-        PosePath3D(poses_se3=[geometry.rigid(poses[k]) for k in sorted(poses)]),
+        PosePath3D(poses_se3=[geometry.nearest_rigid(poses[k]) for k in sorted(poses)]),
     )
-    found.align(reference)
+    estimated.align(reference)
     error = APE(PoseRelation.translation_part)
-    error.process_data((reference, found))
+    error.process_data((reference, estimated))
     return error.get_all_statistics()["rmse"]
 
 
-def test_the_chordal_start_needs_no_poses():
-    """Without noise it is the answer; with noise it leads to the same minimum as the true poses."""
+@pytest.mark.parametrize("initial", ["odometry", "chordal"])
+def test_a_lawnmower_survey_of_500_nodes_has_the_optimum_and_marginals_of_gtsam(initial):
+    """Both start values lead to the minimum that gtsam finds from the true poses."""
+    poses, links = lawnmower(np.random.default_rng(0))
+    n = len(poses)
+    assert n == 500 and len(links) > 2000
+    by_number = odometry(links, poses[0]) if initial == "odometry" else chordal.chordal_start(links)
+    start = np.array([poses[0] @ geometry.inverse(by_number[0]) @ by_number[k] for k in range(n)])
+    assert np.linalg.norm(start[:, :3, 3] - np.array(poses)[:, :3, 3], axis=1).max() > 5e-3  # not already the optimum
+    graph = graph_of(poses, links)
+    first = pose_graph.optimise(graph, pose_graph.GraphState(start))
+    assert first.converged
+    solution = pose_graph.optimise(graph, first.state)  # the first run stops 5e-4 above the minimum of the cost
+
+    oracle = gtsam_graph(links, poses[0])
+    optimum = gtsam_optimum(oracle, gtsam_values(poses))
+    expected = np.array([optimum.atPose3(k).matrix() for k in range(n)])
+    assert solution.cost == pytest.approx(oracle.error(optimum), rel=1e-6)
+    np.testing.assert_allclose(solution.state.poses, expected, rtol=0, atol=1e-6)
+    marginals, nodes = gtsam.Marginals(oracle, optimum), (0, 1, 137, 250, 499)
+    one_by_one = [solution.marginal(k) for k in nodes]
+    for k, single, one_of_all in zip(nodes, one_by_one, solution.marginals_in_place()[list(nodes)], strict=True):
+        cov = marginals.marginalCovariance(k)
+        sigmas = np.sqrt(np.diag(cov))
+        for computed in (single, one_of_all):  # relative to the product of both standard deviations
+            np.testing.assert_allclose(computed / np.outer(sigmas, sigmas), cov / np.outer(sigmas, sigmas), atol=1e-6)
+
+
+def test_chordal_initialisation_needs_no_poses():
+    """Without noise it is exact; with noise it leads to the same minimum as the true poses."""
     poses, exact = ring(np.random.default_rng(0), share_of_sigma=0.0)
     start = chordal.chordal_start(exact)
-    zero = geometry.inverse(poses[0])
+    first_from_world = geometry.inverse(poses[0])
     for k, pose in enumerate(poses):
-        np.testing.assert_allclose(start[k], zero @ pose, atol=1e-9)
+        np.testing.assert_allclose(start[k], first_from_world @ pose, atol=1e-9)
     poses, links = ring(np.random.default_rng(1))
-    by_chords, by_truth = (chordal.solve(links, start) for start in (None, dict(enumerate(poses))))
-    assert by_chords.cost == pytest.approx(by_truth.cost, abs=1e-3)
+    from_chordal, from_truth = (chordal.solve_pose_graph(links, start) for start in (None, dict(enumerate(poses))))
+    assert from_chordal.cost == pytest.approx(from_truth.cost, abs=1e-3)
 
 
-def test_the_chordal_start_is_not_led_astray_by_odometry():
-    """Each step of the ring turns 0.3 rad wrong, other links are exact: poses put end to end lose their way."""
+def test_chordal_initialisation_is_robust_to_odometry_errors():
+    """Each step of the ring has a rotation error of 0.3 rad; all other links are exact."""
     rng = np.random.default_rng(6)
     poses, exact = ring(rng, n=24, share_of_sigma=0.0)
-    jumps = [(i, (i + d) % 24) for d in (5, 7, 11) for i in range(24)]
+    across = [(i, (i + d) % 24) for d in (5, 7, 11) for i in range(24)]
     cov = np.eye(6) * 1e-4
-    links = [Link(i, j, geometry.inverse(poses[i]) @ poses[j], cov, 1.0, 9) for i, j in map(sorted, jumps)]
-    turned = geometry.exp(np.array([0, 0, 0.3, 0, 0, 0]))
-    links += [link._replace(i_from_j=link.i_from_j @ turned, cov=np.eye(6)) for link in exact if link.j == link.i + 1]
-    start, zero = chordal.chordal_start(links), geometry.inverse(poses[0])
-    off = [np.linalg.norm(start[k] - zero @ pose) for k, pose in enumerate(poses)]
-    assert max(off) < 0.05
+    links = [Link(i, j, geometry.inverse(poses[i]) @ poses[j], cov, 1.0, 9) for i, j in map(sorted, across)]
+    error = geometry.exp(np.array([0, 0, 0.3, 0, 0, 0]))
+    links += [link._replace(i_from_j=link.i_from_j @ error, cov=np.eye(6)) for link in exact if link.j == link.i + 1]
+    start, first_from_world = chordal.chordal_start(links), geometry.inverse(poses[0])
+    errors = [np.linalg.norm(start[k] - first_from_world @ pose) for k, pose in enumerate(poses)]
+    assert max(errors) < 0.05
 
 
-def test_the_chordal_start_is_a_rotation_where_links_average_to_a_reflection():
-    """Half turns about three axes have the mean -I / 3."""
+def test_chordal_initialisation_returns_rotations_where_the_mean_of_the_links_is_a_reflection():
+    """Half turns about the three axes have the mean -I / 3."""
     turns = [geometry.exp(np.append(np.pi * axis, np.zeros(3))) for axis in np.eye(3)]
-    found = chordal.chordal_start([Link(0, 1, turn, np.eye(6), 1.0, 9) for turn in turns])[1][:3, :3]
-    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(found) == pytest.approx(1.0)
+    rotation = chordal.chordal_start([Link(0, 1, turn, np.eye(6), 1.0, 9) for turn in turns])[1][:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
 
 
-def test_the_lowest_number_stays_where_it_starts():
+def test_the_lowest_number_is_fixed_at_its_initial_pose():
     poses, links = ring(np.random.default_rng(2))
     moved = geometry.exp(np.array([0.3, -0.2, 1.0, 4.0, 5.0, 6.0]))
-    solved = chordal.solve(links, {k: moved @ pose for k, pose in enumerate(poses)})
+    solved = chordal.solve_pose_graph(links, {k: moved @ pose for k, pose in enumerate(poses)})
     np.testing.assert_allclose(solved.poses[0], moved @ poses[0], atol=1e-9)
-    still = chordal.solve(links, dict(enumerate(poses)))
-    assert solved.cost == pytest.approx(still.cost, abs=1e-3)
-    np.testing.assert_allclose(solved.poses[7], moved @ still.poses[7], atol=2e-4)  # 0.01 of its standard deviation
+    reference = chordal.solve_pose_graph(links, dict(enumerate(poses)))
+    assert solved.cost == pytest.approx(reference.cost, abs=1e-3)
+    # 0.01 of the standard deviation
+    np.testing.assert_allclose(solved.poses[7], moved @ reference.poses[7], atol=2e-4)
 
 
-def test_a_robust_kernel_bends_less_to_a_wrong_link():
+def test_huber_loss_reduces_the_influence_of_an_outlier():
     poses, links = ring(np.random.default_rng(3))
     links[-1] = links[-1]._replace(i_from_j=links[-1].i_from_j @ geometry.exp(np.array([0, 0, 0, 1.0, 0, 0])))
-    plain, robust = (chordal.solve(links, huber=huber).poses for huber in (None, 1.0))
-    zero = geometry.inverse(poses[0])
-    off = [max(np.linalg.norm((zero @ poses[k] - found[k])[:3, 3]) for k in found) for found in (plain, robust)]
-    assert off[1] < 0.5 * off[0]
-
-
-def graph_of(poses, links, huber=None):
-    """The graph of links between poses 0 to n - 1, the first one held."""
-    held = pose_graph.given([0], np.array(poses[:1]), np.eye(6)[None] * 1e-6)
-    return pose_graph.Graph(len(poses), [held], [pose_graph.motions(links, {k: k for k in range(len(poses))}, huber)])
+    plain, robust = (chordal.solve_pose_graph(links, huber=huber).poses for huber in (None, 1.0))
+    first_from_world = geometry.inverse(poses[0])
+    errors_m = [
+        max(np.linalg.norm((first_from_world @ poses[k] - solved[k])[:3, 3]) for k in solved)
+        for solved in (plain, robust)
+    ]
+    assert errors_m[1] < 0.5 * errors_m[0]
 
 
 @pytest.mark.parametrize("huber", [None, 2.5])
-def test_chi2_is_the_squared_residual_in_units_of_the_covariance(huber):
-    """And F their half, but for those beyond Huber's limit, which count linearly."""
+def test_chi2_is_the_squared_whitened_residual(huber):
+    """The cost is half their sum, except for residuals above Huber's limit, which count linearly."""
     poses, links = ring(np.random.default_rng(4), share_of_sigma=2.5)
-    found = pose_graph.optimise(graph_of(poses, links, huber), pose_graph.State(np.array(poses)))
+    solution = pose_graph.optimise(graph_of(poses, links, huber), pose_graph.GraphState(np.array(poses)))
     expected, losses = [], []
     for link in links:
-        between = geometry.inverse(found.state.poses[link.i]) @ found.state.poses[link.j]
-        error = geometry.log(geometry.inverse(link.i_from_j) @ between)
+        i_from_j = geometry.inverse(solution.state.poses[link.i]) @ solution.state.poses[link.j]
+        error = geometry.log(geometry.inverse(link.i_from_j) @ i_from_j)
         expected.append(error @ np.linalg.inv(link.cov) @ error)
         size = np.sqrt(expected[-1])
         losses.append(size**2 / 2 if huber is None or size <= huber else huber * (size - huber / 2))
     assert min(expected) < 2.5**2 < max(expected)
-    np.testing.assert_allclose(found.chi2[0], expected, rtol=1e-9)
-    assert found.cost == pytest.approx(sum(losses), abs=1e-6)
+    np.testing.assert_allclose(solution.chi2[0], expected, rtol=1e-9)
+    assert solution.cost == pytest.approx(sum(losses), abs=1e-6)
 
 
-def test_marginals_are_gtsams():
+def test_marginals_of_all_nodes_are_those_of_gtsam():
     _, links = ring(np.random.default_rng(5))
-    start = chordal.solve(links).poses
-    found = pose_graph.optimise(
-        graph_of([start[k] for k in range(12)], links), pose_graph.State(np.array(list(start.values())))
+    start = chordal.solve_pose_graph(links).poses
+    solution = pose_graph.optimise(
+        graph_of([start[k] for k in range(12)], links), pose_graph.GraphState(np.array(list(start.values())))
     )
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for link in links:
-        noise = gtsam.noiseModel.Gaussian.Covariance(link.cov)
-        graph.add(gtsam.BetweenFactorPose3(link.i, link.j, gtsam.Pose3(link.i_from_j), noise))
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(start[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
-    for k, pose in enumerate(found.state.poses):
-        values.insert(k, gtsam.Pose3(pose))
-    oracle, single = gtsam.Marginals(graph, values), [found.marginal(k) for k in range(12)]
-    covs = found.into_marginals()
+    oracle = gtsam.Marginals(gtsam_graph(links, start[0]), gtsam_values(solution.state.poses))
+    one_by_one = [solution.marginal(k) for k in range(12)]
+    covs = solution.marginals_in_place()
     for k in range(12):
         expected = oracle.marginalCovariance(k)
         np.testing.assert_allclose(covs[k], expected, atol=1e-5 * np.diag(expected).max())
-        np.testing.assert_allclose(single[k], covs[k], rtol=1e-9, atol=1e-9 * np.diag(expected).max())
+        np.testing.assert_allclose(one_by_one[k], covs[k], rtol=1e-9, atol=1e-9 * np.diag(expected).max())
 
 
-def along_x(measured_m, reading=lambda way_m: way_m):
-    """Two poses on the x axis, the first held, and readings of the way between them."""
-    held = pose_graph.given([0], np.eye(4)[None], np.eye(6)[None] * 1e-12)
-    on_axis = pose_graph.given([1], np.eye(4)[None], np.diag([1e-6] * 3 + [1e6, 1e-6, 1e-6])[None])
+def along_x(measured_m, reading=lambda x_m: x_m):
+    """Returns a graph of two poses on the x axis, the first one fixed, with readings of the distance between them."""
+    fixed = pose_graph.prior_factors([0], np.eye(4)[None], np.eye(6)[None] * 1e-12)
+    on_axis = pose_graph.prior_factors([1], np.eye(4)[None], np.diag([1e-6] * 3 + [1e6, 1e-6, 1e-6])[None])
 
-    def derive(i_from_j, shared, residuals):
-        way_m, step = i_from_j[:, 0, 3], 1e-6
-        by_j = np.zeros((len(way_m), 1, 6))
-        by_j[:, 0, 3] = (reading(way_m + step) - reading(way_m - step)) / (2 * step)
+    def jacobians(i_from_j, shared, residuals):
+        x_m, step = i_from_j[:, 0, 3], 1e-6
+        by_j = np.zeros((len(x_m), 1, 6))
+        by_j[:, 0, 3] = (reading(x_m + step) - reading(x_m - step)) / (2 * step)
         return by_j, None
 
     n = len(measured_m)
-    ways = pose_graph.Pairs(
+    distances = pose_graph.BinaryFactors(
         np.zeros(n, int), np.ones(n, int), np.ones((n, 1, 1)),
-        lambda i_from_j, shared: (reading(i_from_j[:, 0, 3]) - measured_m)[:, None], derive,
+        lambda i_from_j, shared: (reading(i_from_j[:, 0, 3]) - measured_m)[:, None], jacobians,
     )  # fmt: skip
-    return pose_graph.Graph(2, [held, on_axis], [ways])
+    return pose_graph.FactorGraph(2, [fixed, on_axis], [distances])
 
 
 def start_at(x):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = x
-    return pose_graph.State(poses)
+    return pose_graph.GraphState(poses)
 
 
-def test_what_is_linear_is_eliminated_once(monkeypatch):
-    factorise, times = block_cholesky.Matrix.factorise, []
-    monkeypatch.setattr(block_cholesky.Matrix, "factorise", lambda *a: times.append(1) or factorise(*a))
-    found = pose_graph.optimise(along_x(np.array([1.0, 3.0])), start_at(100.0))
-    assert found.state.poses[1, 0, 3] == pytest.approx(2.0, abs=1e-5)
-    assert found.reached and len(times) == 1
+def test_a_linear_problem_is_factorised_once(monkeypatch):
+    factorise, calls = block_cholesky.BlockMatrix.factorise, []
+    monkeypatch.setattr(block_cholesky.BlockMatrix, "factorise", lambda *a: calls.append(1) or factorise(*a))
+    solution = pose_graph.optimise(along_x(np.array([1.0, 3.0])), start_at(100.0))
+    assert solution.state.poses[1, 0, 3] == pytest.approx(2.0, abs=1e-5)
+    assert solution.converged and len(calls) == 1
 
 
-def test_a_start_that_leads_gauss_newton_up_ends_at_the_minimum_all_the_same(monkeypatch):
-    """Of arctan(x)^2 each step of Gauss-Newton from beyond 1.39 leads farther off, to the other side."""
-    factorise, rooms = block_cholesky.Matrix.factorise, []
-    monkeypatch.setattr(block_cholesky.Matrix, "factorise", lambda *a: rooms.append(id(a[0].panels)) or factorise(*a))
-    found = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0))
-    assert found.reached
-    assert found.state.poses[1, 0, 3] == pytest.approx(0.0, abs=1e-3)
-    assert len(rooms) > 3 and len(set(rooms)) == 1  # no two factors at a time
+def test_damping_reaches_the_minimum_where_gauss_newton_diverges(monkeypatch):
+    """For the cost arctan(x)^2, Gauss-Newton steps from beyond 1.39 increase |x|."""
+    factorise, buffers = block_cholesky.BlockMatrix.factorise, []
+    monkeypatch.setattr(
+        block_cholesky.BlockMatrix, "factorise", lambda *a: buffers.append(id(a[0].panels)) or factorise(*a)
+    )
+    solution = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0))
+    assert solution.converged
+    assert solution.state.poses[1, 0, 3] == pytest.approx(0.0, abs=1e-3)
+    assert len(buffers) > 3 and len(set(buffers)) == 1  # all factors share one buffer
 
 
-def test_a_search_that_ends_damped_tells_the_covariance_of_the_equations_as_they_are():
-    """At 3 m arctan has the slope 1/10; six steps lead up or go nowhere."""
-    found = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0), iterations=6)
-    assert not found.reached and found.state.poses[1, 0, 3] == 3.0
-    assert found.marginal(1)[3, 3] == pytest.approx(1 / (0.1**2 + 1e-6), rel=1e-4)
+def test_marginals_after_a_damped_step_are_those_of_the_undamped_equations():
+    """At 3 m arctan has the slope 1/10; all six steps are rejected."""
+    solution = pose_graph.optimise(along_x(np.zeros(1), np.arctan), start_at(3.0), max_iterations=6)
+    assert not solution.converged and solution.state.poses[1, 0, 3] == 3.0
+    assert solution.marginal(1)[3, 3] == pytest.approx(1 / (0.1**2 + 1e-6), rel=1e-4)
 
 
-def test_an_unknown_that_all_pairs_share_is_solved_with_the_poses():
-    """Ways of a chain, some also measured with one common scale: the border against the dense equations."""
+def test_a_shared_parameter_is_solved_together_with_the_poses():
+    """Steps of a chain, some also measured with a common scale: the solution is a minimum of the dense cost."""
     n, sigma = 6, 0.3
     rng = np.random.default_rng(8)
     poses = np.tile(np.eye(4), (n, 1, 1))
@@ -248,51 +326,50 @@ def test_an_unknown_that_all_pairs_share_is_solved_with_the_poses():
     i, measured = np.arange(n - 1), 1.1 + 0.01 * rng.normal(size=n - 1)
     information = np.full((n - 1, 1, 1), 0.02**-2)
 
-    def derive(i_from_j, shared, residuals):
+    def jacobians(i_from_j, shared, residuals):
         by_j = np.zeros((n - 1, 1, 6))
         by_j[:, 0, 3:] = (1 + shared) * i_from_j[:, 0, :3]
         return by_j, i_from_j[:, :1, 3]
 
-    scaled = pose_graph.Pairs(
+    scaled = pose_graph.BinaryFactors(
         i, i + 1, information,
-        lambda i_from_j, shared: ((1 + shared) * i_from_j[:, 0, 3] - measured)[:, None], derive,
+        lambda i_from_j, shared: ((1 + shared) * i_from_j[:, 0, 3] - measured)[:, None], jacobians,
     )  # fmt: skip
-    alone = graph_of(poses, links)
-    found = pose_graph.optimise(
-        alone._replace(pairs=[*alone.pairs, scaled], shared_sigma=sigma), pose_graph.State(poses)
-    )
+    unscaled = graph_of(poses, links)
+    graph = unscaled._replace(binary=[*unscaled.binary, scaled], shared_sigma=sigma)
+    solution = pose_graph.optimise(graph, pose_graph.GraphState(poses))
 
-    def cost(unknown):
+    def cost(unknowns):
         moved = np.array(
-            [pose @ geometry.exp(step) for pose, step in zip(poses, unknown[:-1].reshape(n, 6), strict=True)]
+            [pose @ geometry.exp(step) for pose, step in zip(poses, unknowns[:-1].reshape(n, 6), strict=True)]
         )
-        total = np.sum(unknown[:6] ** 2) / 1e-6 + (unknown[-1] / sigma) ** 2
+        total = np.sum(unknowns[:6] ** 2) / 1e-6 + (unknowns[-1] / sigma) ** 2
         for link in links:
             error = geometry.log(geometry.inverse(link.i_from_j) @ geometry.inverse(moved[link.i]) @ moved[link.j])
             total += error @ np.linalg.inv(cov) @ error
-        between = [geometry.inverse(a) @ b for a, b in zip(moved, moved[1:], strict=False)]
-        off = (1 + unknown[-1]) * np.array([motion[0, 3] for motion in between]) - measured
-        return (total + np.sum(off**2) / 0.02**2) / 2
+        motions = [geometry.inverse(a) @ b for a, b in zip(moved, moved[1:], strict=False)]
+        residuals = (1 + unknowns[-1]) * np.array([motion[0, 3] for motion in motions]) - measured
+        return (total + np.sum(residuals**2) / 0.02**2) / 2
 
-    steps = [geometry.log(geometry.inverse(a) @ b) for a, b in zip(poses, found.state.poses, strict=True)]
-    at = np.append(np.concatenate(steps), found.state.shared)
-    assert cost(at) == pytest.approx(found.cost, rel=1e-6)
-    assert 0.05 < found.state.shared < 0.15
-    for k in range(len(at)):
-        nudge = np.zeros(len(at))
-        nudge[k] = 1e-3
-        assert min(cost(at + nudge), cost(at - nudge)) > found.cost
+    steps = [geometry.log(geometry.inverse(a) @ b) for a, b in zip(poses, solution.state.poses, strict=True)]
+    minimum = np.append(np.concatenate(steps), solution.state.shared)
+    assert cost(minimum) == pytest.approx(solution.cost, rel=1e-6)
+    assert 0.05 < solution.state.shared < 0.15
+    for k in range(len(minimum)):
+        change = np.zeros(len(minimum))
+        change[k] = 1e-3
+        assert min(cost(minimum + change), cost(minimum - change)) > solution.cost
 
 
-def test_a_graph_that_holds_not_every_pose_is_told():
-    """A pose without a link; a ring that may move as a whole along an axis: only rounding is left to divide by."""
+def test_an_unconstrained_pose_is_reported():
+    """A pose without a link; a ring that is free to translate along one axis, where only rounding is left as pivot."""
     poses, links = ring(np.random.default_rng(9))
-    loose = graph_of([*poses, np.eye(4)], links)
-    with pytest.raises(np.linalg.LinAlgError, match="not every pose is held"):
-        pose_graph.optimise(loose, pose_graph.State(np.array([*poses, np.eye(4)])))
+    unconnected = graph_of([*poses, np.eye(4)], links)
+    with pytest.raises(np.linalg.LinAlgError, match="the factors do not constrain every pose"):
+        pose_graph.optimise(unconnected, pose_graph.GraphState(np.array([*poses, np.eye(4)])))
     for seed in range(10):
         poses, links = ring(np.random.default_rng(seed))
-        held = pose_graph.given([0], np.array(poses[:1]), np.diag([1e-6] * 5 + [1e30])[None])
-        adrift = graph_of(poses, links)._replace(singles=[held])
+        weak = pose_graph.prior_factors([0], np.array(poses[:1]), np.diag([1e-6] * 5 + [1e30])[None])
+        floating = graph_of(poses, links)._replace(unary=[weak])
         with pytest.raises(np.linalg.LinAlgError):
-            pose_graph.optimise(adrift, pose_graph.State(np.array(poses)))
+            pose_graph.optimise(floating, pose_graph.GraphState(np.array(poses)))

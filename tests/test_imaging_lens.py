@@ -1,4 +1,4 @@
-"""The lens: OpenCV's model, undone to a hundredth of a pixel, before the sensor; without one nothing is done."""
+"""Lens distortion: OpenCV's model, rectified to 0.01 px, applied before the sensor; no change without distortion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from scipy.ndimage import map_coordinates
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.imaging.camera import StereoCamera
+from twin.imaging.illumination import illumination_of
+from twin.imaging.image_formation import ImageFormation
 from twin.imaging.lens import Distortion, distort, fold, undistort
-from twin.imaging.light import Light
-from twin.imaging.resample import gather, interpolate
-from twin.imaging.true_cameras import make_view
+from twin.imaging.resample import interpolate, sample
+from twin.imaging.true_cameras import make_true_cameras
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 from twin.world.mission import prepare
@@ -34,21 +35,21 @@ def tangents_of_image() -> np.ndarray:
 
 
 def pattern(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Light (..., 3) of waves of 9 px and more."""
+    """Returns radiance (..., 3): a sum of waves with wavelengths of 9 px and more."""
     waves = [(0.61, 0.23, 0.4), (-0.2, 0.55, 1.9), (0.31, -0.44, 0.7), (0.09, 0.12, 2.2)]
     value = 10 + sum(np.sin(a * u + b * v + c) for a, b, c in waves)
     return np.repeat(value[..., None], 3, axis=-1).astype(np.float32)
 
 
 def shift_px(image: np.ndarray, ideal: np.ndarray) -> np.ndarray:
-    """(2,) by how much an image is shifted against another that looks the same, by least squares."""
+    """Returns the least-squares shift (2,) of an image relative to another of the same content [px]."""
     rows, columns = np.gradient(ideal.astype(float), axis=(0, 1))
-    slopes = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    return -np.linalg.lstsq(slopes, (image.astype(float) - ideal).ravel(), rcond=None)[0]
+    gradient = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    return -np.linalg.lstsq(gradient, (image.astype(float) - ideal).ravel(), rcond=None)[0]
 
 
 @pytest.mark.parametrize("lens", STRONG)
-def test_distortion_is_that_of_opencv(lens):
+def test_distortion_agrees_with_opencv(lens):
     points = tangents_of_image().reshape(-1, 2)
     rays = np.column_stack([points, np.ones(len(points))])
     order = np.array([lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3")])
@@ -61,72 +62,72 @@ def test_distortion_is_that_of_opencv(lens):
     k=st.tuples(st.floats(-0.2, 0.3), st.floats(-0.05, 0.1), st.floats(-0.02, 0.05)),
     p=st.tuples(st.floats(-0.01, 0.01), st.floats(-0.01, 0.01)),
 )
-def test_what_is_distorted_is_undistorted_again(k, p):
+def test_undistort_inverts_distort(k, p):
     lens = Distortion(*k, *p)
     tangents = tangents_of_image()
-    if fold(lens) > 1.1:  # the corner lies at 0.75: tangential distortion folds a little earlier
+    if fold(lens) > 1.1:  # the corner is at 0.75; tangential distortion folds slightly earlier
         np.testing.assert_allclose(undistort(distort(tangents, lens), lens), tangents, atol=1e-9)
 
 
-def test_what_no_ray_is_seen_at_is_not_told():
-    """With k1 = -0.4 nothing is seen beyond r (1 + k1 r^2) at r^2 = -1 / (3 k1), and no inverse leads past it."""
+def test_coordinates_beyond_the_fold_are_nan():
+    """With k1 = -0.4 no ray is imaged beyond r (1 + k1 r^2) at r^2 = -1 / (3 k1)."""
     lens = Distortion(k1=-0.4)
     edge = np.sqrt(1 / 1.2)
     assert fold(lens) == pytest.approx(edge)
     most = edge * (1 - 0.4 * edge**2)
-    seen = np.array([[0.99 * most, 0.0], [1.01 * most, 0.0], [3.0, 0.0]])
-    assert np.isfinite(undistort(seen, lens)).all(axis=1).tolist() == [True, False, False]
+    distorted = np.array([[0.99 * most, 0.0], [1.01 * most, 0.0], [3.0, 0.0]])
+    assert np.isfinite(undistort(distorted, lens)).all(axis=1).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("lens", STRONG)
 def test_a_known_lens_is_rectified_to_a_hundredth_of_a_pixel(lens):
-    """Through both maps in turn each pixel of the frame comes back to its own place."""
-    view = make_view(scenario(lens=lens))
-    at = view.rectification.astype(float)
-    back = [map_coordinates(view.eyes[0].places[..., k], [at[..., 1], at[..., 0]], order=1) for k in (0, 1)]
+    """Sampling and rectification in sequence map each pixel of the frame to itself."""
+    cameras = make_true_cameras(scenario(lens=lens))
+    at = cameras.rectification.astype(float)
+    back = [map_coordinates(cameras.sampling[0].positions[..., k], [at[..., 1], at[..., 0]], order=1) for k in (0, 1)]
     u, v = np.meshgrid(np.arange(320.0), np.arange(240.0))
-    assert (
-        np.abs(np.array(back) - [u + view.margin_px[0], v + view.margin_px[1]]).max() < 0.01
-    )  # straight between places that bend: 1/8 of their curvature
+    # error of linear interpolation: 1/8 of the curvature
+    assert np.abs(np.array(back) - [u + cameras.margin_px[0], v + cameras.margin_px[1]]).max() < 0.01
 
 
 @pytest.mark.parametrize("lens", STRONG)
-def test_a_frame_through_a_known_lens_looks_like_a_pinhole_s(lens):
-    view = make_view(scenario(lens=lens))
-    u, v = np.meshgrid(np.arange(view.rig.width_px), np.arange(view.rig.height_px))
-    raw = view.raw(pattern(u - view.margin_px[0], v - view.margin_px[1]), np.ones(u.shape, np.float32), 0)
-    frame = view.frame(np.rint(raw * 15).astype(np.uint8))
+def test_a_frame_of_a_known_lens_equals_that_of_a_pinhole(lens):
+    cameras = make_true_cameras(scenario(lens=lens))
+    u, v = np.meshgrid(np.arange(cameras.rendered_rig.width_px), np.arange(cameras.rendered_rig.height_px))
+    raw = cameras.sample(pattern(u - cameras.margin_px[0], v - cameras.margin_px[1]), np.ones(u.shape, np.float32), 0)
+    frame = cameras.rectify(np.rint(raw * 15).astype(np.uint8))
     u, v = np.meshgrid(np.arange(320), np.arange(240))
     ideal = 15 * pattern(u, v)
     assert frame.shape == ideal.shape
-    # Waves of 9 px lose 8 % in the pixels' response, of which shifts know nothing; 8 bits cost 0.3 levels each time.
+    # Waves of 9 px lose 8 % by the pixel response, which causes no shift; each quantization to 8 bits adds 0.3 levels.
     assert np.abs(shift_px(frame, ideal)).max() < 0.001
     assert np.abs(frame - ideal).mean() < 1.5
 
 
-def test_a_lens_that_is_not_known_as_it_is_shifts_the_frame_by_the_known_amount():
-    """k1 off by e: what lies at tangent r is seen f e r^3 (1 + k1 ...) farther out."""
-    view = make_view(scenario(lens={"k1": -0.1}, calibration_error={"k1_error": 0.01}))
+def test_an_error_of_k1_shifts_the_frame_by_the_expected_amount():
+    """With an error e of k1 a point at tangent r is imaged f e r^3 (1 + k1 ...) farther out."""
+    cameras = make_true_cameras(scenario(lens={"k1": -0.1}, calibration_error={"k1_error": 0.01}))
     rig = scenario().believed_rig()
     points = np.array([[0.5, 0.0, 1.0], [0.3, 0.4, 1.0], [0.0, 0.0, 1.0]])
-    off = view.project(points) - rig.project(points)
+    off = cameras.project(points) - rig.project(points)
     r2 = np.array([0.25, 0.25, 0.0])
-    # seen at x + d; the believed lens gives that back as x + d / (slope of r - 0.11 r^3)
+    # distorted to x + d; the believed lens undistorts that to x + d / (slope of r - 0.11 r^3)
     expected = rig.focal_px * points[:, :2] * (0.01 * r2 / (1 - 0.33 * r2))[:, None]
     np.testing.assert_allclose(off, expected, atol=0.02)  # second order: 3 k r d^2 f < 0.01 px
     assert np.abs(off[:2]).max() > 0.3
 
 
-def test_without_distortion_nothing_is_done():
-    view = make_view(scenario(calibration_error={"baseline_error": 0.1}))
+def test_without_distortion_images_are_passed_through():
+    cameras = make_true_cameras(scenario(calibration_error={"baseline_error": 0.1}))
     light, image = np.ones((240, 320, 3), np.float32), np.ones((240, 320, 3), np.uint8)
-    assert view.raw(light, light[..., 0], 1) is light and view.frame(image) is image and view.crop(image) is image
-    rig, believed = make_view(scenario()).rig, scenario().believed_rig()
+    assert cameras.sample(light, light[..., 0], 1) is light
+    assert cameras.rectify(image) is image and cameras.crop(image) is image
+    rig, believed = make_true_cameras(scenario()).rendered_rig, scenario().believed_rig()
     assert (rig.width_px, rig.focal_px, rig.baseline_m) == (believed.width_px, believed.focal_px, believed.baseline_m)
 
 
 class GreyFloor:
-    """A renderer of an even plane two metres away."""
+    """Renderer of a uniform plane at a depth of 2 m."""
 
     def __init__(self, rig):
         self.shape = rig.height_px, rig.width_px
@@ -135,16 +136,17 @@ class GreyFloor:
         return np.full((*self.shape, 3), 120, np.uint8), np.full(self.shape, 2.0, np.float32)
 
 
-def test_noise_is_the_sensor_s_which_is_behind_the_lens():
-    """Rectified between pixels noise is weaker: in the middle of four its variance is (sum of w^2)^2 = 0.6 of it."""
+def test_noise_is_added_before_the_rectification():
+    """Interpolation between pixels reduces noise: at the centre of four its variance is (sum of w^2)^2 = 0.6."""
     sections = {"lens": {"k1": 0.1}, "sun": {"illuminance_lx": 500.0}, "imaging": {"noise_sd": 0.03, "shot_noise": 0.0}}
     here = scenario(**sections)
-    view = make_view(here)
+    cameras = make_true_cameras(here)
     left, right = np.random.default_rng(1).spawn(2)
-    camera = StereoCamera(GreyFloor(view.rig), Light(here, None, left, view.rig), here, left, right, Stopwatch())
-    frame = camera.shoot(np.eye(4), stereo=False).left[..., 1].astype(float)
+    light = ImageFormation(here, illumination_of(here), None, left, cameras.rendered_rig)
+    camera = StereoCamera(GreyFloor(cameras.rendered_rig), light, here, left, right, Stopwatch())
+    frame = camera.capture(np.eye(4), stereo=False).left[..., 1].astype(float)
     assert frame.shape == (240, 320)
-    part = view.rectification - np.floor(view.rectification)
+    part = cameras.rectification - np.floor(cameras.rectification)
     between = (np.abs(part - 0.5) < 0.15).all(axis=-1)
     on_pixel = (np.minimum(part, 1 - part) < 0.15).all(axis=-1)
     assert between.sum() > 3000 and on_pixel.sum() > 3000
@@ -152,15 +154,15 @@ def test_noise_is_the_sensor_s_which_is_behind_the_lens():
     assert frame[between].std() < 0.82 * 0.03 * 255
 
 
-def test_gathering_keeps_even_light_and_slopes():
+def test_sampling_preserves_uniform_light_and_linear_gradients():
     u, v = np.meshgrid(np.arange(30.0), np.arange(20.0))
     light = np.stack([np.full(u.shape, 7.0), 3 * u + v, 100 - u], axis=-1).astype(np.float32)
-    places = np.random.default_rng(0).uniform((2, 2), (27, 17), (12, 9, 2)).astype(np.float32)
-    got, (x, y) = gather(light, places), np.moveaxis(places, -1, 0)
-    np.testing.assert_allclose(got, np.stack([np.full(x.shape, 7.0), 3 * x + y, 100 - x], axis=-1), rtol=1e-5)
+    positions = np.random.default_rng(0).uniform((2, 2), (27, 17), (12, 9, 2)).astype(np.float32)
+    sampled, (x, y) = sample(light, positions), np.moveaxis(positions, -1, 0)
+    np.testing.assert_allclose(sampled, np.stack([np.full(x.shape, 7.0), 3 * x + y, 100 - x], axis=-1), rtol=1e-5)
 
 
-def test_an_image_is_interpolated_through_its_pixels_and_as_scipy_does():
+def test_interpolation_is_exact_at_pixels_and_agrees_with_scipy():
     image = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
     u, v = np.meshgrid(np.arange(50), np.arange(40))
     again = interpolate(image, np.stack([u, v], -1).astype(np.float32))
@@ -179,10 +181,10 @@ BAD_LENSES = [
 ]
 
 
-@pytest.mark.parametrize(("line", "fault"), BAD_LENSES)
-def test_a_lens_that_cannot_be_is_told_by_line(tmp_path, line, fault):
+@pytest.mark.parametrize(("line", "message"), BAD_LENSES)
+def test_an_invalid_lens_is_rejected_with_file_and_line(tmp_path, line, message):
     file = tmp_path / "bad.toml"
     file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n[lens]\n{line}\n')
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as error:
         prepare(load_scenario(file))
-    assert told.value.lines == [f"{file}:3: {fault}"]
+    assert error.value.lines == [f"{file}:3: {message}"]

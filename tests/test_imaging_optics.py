@@ -1,4 +1,4 @@
-"""Light: the limits in which it has a closed form, and the veil against quadrature."""
+"""Radiance in water: closed forms in limiting cases, and backscatter against quadrature."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,24 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from twin.errors import TwinError
-from twin.imaging.lamps import LED_BEAM, Daylight, beam_share, colour, daylight_at, lights_of_eye
-from twin.imaging.optics import Optics, Overhead, scattered_per_m
-from twin.imaging.water import FORWARDNESS, JERLOV_PER_M, downwelling_per_m, medium, phase_function, read_spectrum
+from twin.imaging.illumination import Illumination, daylight_at
+from twin.imaging.lamps import LED_BEAM, beam_share, colour, light_sources_in_camera
+from twin.imaging.optics import Optics, WaterSurface, backscatter_per_m
+from twin.imaging.water import (
+    JERLOV_PER_M,
+    SEA_WATER_MEAN_COSINE,
+    downwelling_per_m,
+    medium,
+    phase_function,
+    read_spectrum,
+)
 from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 
 RIG = Scenario.model_validate({"rig": {"image_width_px": 96, "image_height_px": 64}}).believed_rig()
-CLEAR, DARK, NIGHT = WaterConfig(jerlov="clear"), SunConfig(illuminance_lx=0), Daylight(np.zeros(3), np.zeros(3))
-#: A lamp at the very place of the left camera, looking along its axis.
-AT_EYE = LampConfig(position_m=tuple(RIG.body_from_camera[:3, 3]), intensity_cd=1000.0)
+CLEAR, DARK = WaterConfig(jerlov="clear"), SunConfig(illuminance_lx=0)
+NO_DAYLIGHT = daylight_at(DARK, medium(CLEAR), 0.0)
+#: A lamp at the position of the left camera, with its beam along the optical axis.
+AT_CAMERA = LampConfig(position_m=tuple(RIG.body_from_camera[:3, 3]), intensity_cd=1000.0)
 TWO_LAMPS = (
     LampConfig(position_m=(0.25, 0.35, -0.05), pan_deg=-8.0, intensity_cd=1500.0),
     LampConfig(position_m=(0.25, -0.35, -0.05), tilt_deg=10.0, intensity_cd=900.0),
@@ -28,44 +37,52 @@ def floor(depth_m, albedo=255):
     return np.full((*shape, 3), albedo, np.uint8), np.full(shape, depth_m, np.float32)
 
 
+def optics_with(water, lamps, sun, altitude_m=0.0):
+    properties = medium(water)
+    return Optics(RIG, Illumination(properties, daylight_at(sun, properties, altitude_m)), lamps)
+
+
 def rays():
+    """Returns the unit viewing directions (H, W, 3) of the pixels."""
     v, u = np.mgrid[: RIG.height_px, : RIG.width_px]
     ray = np.stack([(u - RIG.cx_px) / RIG.focal_px, (v - RIG.cy_px) / RIG.focal_px, np.ones_like(u, float)], -1)
     return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
 
-def test_daylight_in_clear_water_shows_albedo_over_pi():
+def test_radiance_under_daylight_in_clear_water_is_albedo_over_pi():
     rng = np.random.default_rng(0)
     albedo = rng.integers(0, 256, (RIG.height_px, RIG.width_px, 3), dtype=np.uint8)
-    light = Optics(RIG, CLEAR, (), SunConfig(illuminance_lx=1000)).radiance(albedo, floor(3.0)[1], 0)
+    light = optics_with(CLEAR, (), SunConfig(illuminance_lx=1000)).radiance(albedo, floor(3.0)[1], 0)
     np.testing.assert_allclose(light, 1000 / np.pi * albedo / 255, rtol=1e-5)
 
 
 def test_a_lamp_in_clear_water_obeys_the_inverse_square_law_and_lamberts_cosine():
-    optics = Optics(RIG, CLEAR, (AT_EYE,), DARK)
+    optics = optics_with(CLEAR, (AT_CAMERA,), DARK)
     light = optics.radiance(*floor(2.0), 0)
     cos = rays()[..., 2]
-    # The angle of the beam and of incidence is that of view; the beam falls to 0.96 at 10 deg, straight between.
+    # The angles of emission, incidence and view are equal; the beam is interpolated linearly between table angles.
     share = np.interp(np.rad2deg(np.arccos(cos)), [0, 10, 20, 30, 35, 40], [1, 0.96, 0.87, 0.75, 0.63, 0.5])
     expected = 1000 / np.pi * share * cos * (cos / 2.0) ** 2
-    np.testing.assert_allclose(light[..., 1], expected, rtol=2e-3)  # the beam's table is coarse on its axis
+    np.testing.assert_allclose(light[..., 1], expected, rtol=2e-3)  # the beam table is coarse near the axis
     np.testing.assert_allclose(optics.radiance(*floor(4.0), 0), light / 4, rtol=1e-4)
 
 
-def test_doubling_the_way_squares_the_transmission():
+def test_doubling_the_path_squares_the_transmission():
     water = medium(WaterConfig(jerlov="II"))
     ratio = []
     for depth_m in (1.5, 3.0):
-        veil = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m, 0), 0)[CENTRE]
-        wet = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).radiance(*floor(depth_m), 0)[CENTRE] - veil
-        ratio.append(wet / Optics(RIG, CLEAR, (AT_EYE,), DARK).radiance(*floor(depth_m), 0)[CENTRE])
+        backscatter = optics_with(WaterConfig(jerlov="II"), (AT_CAMERA,), DARK).radiance(*floor(depth_m, 0), 0)[CENTRE]
+        wet = (
+            optics_with(WaterConfig(jerlov="II"), (AT_CAMERA,), DARK).radiance(*floor(depth_m), 0)[CENTRE] - backscatter
+        )
+        ratio.append(wet / optics_with(CLEAR, (AT_CAMERA,), DARK).radiance(*floor(depth_m), 0)[CENTRE])
     np.testing.assert_allclose(ratio[1], ratio[0] ** 2, rtol=1e-3)
-    # to the floor and back; half a pixel off the axis
+    # to the floor and back, half a pixel off the axis
     np.testing.assert_allclose(ratio[0], np.exp(-water.attenuation_per_m * 3.0), rtol=1e-3)
 
 
-def test_without_floor_there_is_the_veil_alone_and_it_grows_with_range():
-    optics = Optics(RIG, WaterConfig(jerlov="1C"), TWO_LAMPS, DARK)
+def test_backscatter_grows_with_range_to_that_of_open_water():
+    optics = optics_with(WaterConfig(jerlov="1C"), TWO_LAMPS, DARK)
     near, far, open_water = (optics.radiance(*floor(d, 0), 0) for d in (1.0, 3.0, np.inf))
     assert (near < far).all() and (far <= open_water).all()
     np.testing.assert_array_equal(open_water, optics.radiance(*floor(np.inf, 255), 0))
@@ -73,96 +90,96 @@ def test_without_floor_there_is_the_veil_alone_and_it_grows_with_range():
 
 
 @pytest.mark.parametrize("lamps", [(), (TWO_LAMPS[0].model_copy(update={"intensity_cd": 0.0}),)])
-def test_a_lamp_that_is_off_makes_no_light_and_no_veil(lamps):
-    assert not Optics(RIG, WaterConfig(jerlov="9C"), lamps, DARK).radiance(*floor(2.0), 0).any()
+def test_without_lamps_or_intensity_there_is_no_light(lamps):
+    assert not optics_with(WaterConfig(jerlov="9C"), lamps, DARK).radiance(*floor(2.0), 0).any()
 
 
 WORLDS = pytest.mark.parametrize("jerlov", ["IB", "II", "3C"])
 ABOVE = SunConfig(illuminance_lx=40.0, depth_m=12.0)
-SAMPLES = 3000  # of a ray: where the table of the beam bends, the sum is off by the square of a step
+SAMPLES = 3000  # per ray: at the kinks of the beam table the sum has an error of second order in the step
 
 
-def summed_veil(lights, water, depth_m, pixels):
-    """(n, 3) veil before a floor, as a sum over the middles of many short pieces of each ray."""
+def summed_backscatter(sources, water, depth_m, pixels):
+    """Returns the backscatter (n, 3) in front of a level floor by the midpoint rule along each ray."""
     ray = rays()[tuple(np.transpose(pixels))]
     step = depth_m / ray[:, 2] / SAMPLES
     range_m = (np.arange(SAMPLES) + 0.5) * step[:, None]
-    return scattered_per_m(lights, water, ray, range_m).sum(1) * step[:, None]
+    return backscatter_per_m(sources, water, ray, range_m).sum(1) * step[:, None]
 
 
-def lit_water(jerlov, eye, sun=ABOVE):
+def optics_and_sources(jerlov, camera, sun=ABOVE):
     water = WaterConfig(jerlov=jerlov)
-    optics = Optics(RIG, water, TWO_LAMPS, sun, altitude_m=2.0)
-    return optics, lights_of_eye(RIG, TWO_LAMPS, daylight_at(sun, medium(water), 2.0), eye), medium(water)
+    optics = optics_with(water, TWO_LAMPS, sun, altitude_m=2.0)
+    return optics, optics.light_sources[camera], medium(water)
 
 
 @WORLDS
-@pytest.mark.parametrize("eye", [0, 1])
-def test_the_veil_is_the_integral_of_scattered_light_all_over_the_image(jerlov, eye):
-    """Within 1 %, by a sum that quadrature agrees with (below)."""
-    optics, lights, water = lit_water(jerlov, eye)
+@pytest.mark.parametrize("camera", [0, 1])
+def test_backscatter_is_the_integral_over_the_ray(jerlov, camera):
+    """Within 1 % of the midpoint rule, which agrees with quadrature (below)."""
+    optics, sources, water = optics_and_sources(jerlov, camera)
     pixels = [(v, u) for v in range(0, 64, 9) for u in range(0, 96, 9)]
     for depth_m in (0.7, 2.0, 6.0):
-        veil = optics.radiance(*floor(depth_m, 0), eye)[tuple(np.transpose(pixels))]
-        np.testing.assert_allclose(veil, summed_veil(lights, water, depth_m, pixels), rtol=0.01)
+        backscatter = optics.radiance(*floor(depth_m, 0), camera)[tuple(np.transpose(pixels))]
+        np.testing.assert_allclose(backscatter, summed_backscatter(sources, water, depth_m, pixels), rtol=0.01)
 
 
-def quadrature_of_the_veil(jerlov, pixel, depth_m):
-    """Green light of the veil by scipy's quad to 1e-6, and from the table."""
-    optics, lights, water = lit_water(jerlov, 0)
+def backscatter_by_quadrature(jerlov, pixel, depth_m):
+    """Returns green backscatter from the table, by scipy's quad to 1e-6, and by the midpoint rule."""
+    optics, sources, water = optics_and_sources(jerlov, 0)
     ray = rays()[pixel]
-    veil = optics.radiance(*floor(depth_m, 0), 0)[pixel][1]
-    green = lambda r: scattered_per_m(lights, water, ray, np.array([r]))[0, 1]  # noqa: E731
+    backscatter = optics.radiance(*floor(depth_m, 0), 0)[pixel][1]
+    green = lambda r: backscatter_per_m(sources, water, ray, np.array([r]))[0, 1]  # noqa: E731
     exact = quad(green, 0, depth_m / ray[2], epsrel=1e-6, limit=300)[0]
-    return veil, exact, summed_veil(lights, water, depth_m, [pixel])[0, 1]
+    return backscatter, exact, summed_backscatter(sources, water, depth_m, [pixel])[0, 1]
 
 
 @pytest.mark.parametrize(("jerlov", "pixel"), [("IB", (20, 70)), ("3C", (63, 3))])
-def test_quadrature_agrees_with_the_sum_and_the_table(jerlov, pixel):
-    veil, exact, summed = quadrature_of_the_veil(jerlov, pixel, 2.0)
-    assert summed == pytest.approx(exact, rel=1e-4) and veil == pytest.approx(exact, rel=0.01)
+def test_quadrature_agrees_with_the_midpoint_rule_and_the_table(jerlov, pixel):
+    backscatter, exact, summed = backscatter_by_quadrature(jerlov, pixel, 2.0)
+    assert summed == pytest.approx(exact, rel=1e-4) and backscatter == pytest.approx(exact, rel=0.01)
 
 
 @pytest.mark.slow
 @WORLDS
-def test_the_veil_agrees_with_quadrature_all_over_the_image(jerlov):
+def test_backscatter_agrees_with_quadrature_over_the_image(jerlov):
     pixels = [(v, u) for v in range(0, 64, 21) for u in range(0, 96, 19)]
-    told = [quadrature_of_the_veil(jerlov, pixel, 2.0) for pixel in pixels]
-    worst = max(abs(veil / exact - 1) for veil, exact, _ in told)
-    print(f"\n{jerlov}: veil within {100 * worst:.2f} % of quadrature at {len(pixels)} pixels")
+    results = [backscatter_by_quadrature(jerlov, pixel, 2.0) for pixel in pixels]
+    worst = max(abs(backscatter / exact - 1) for backscatter, exact, _ in results)
+    print(f"\n{jerlov}: backscatter within {100 * worst:.2f} % of quadrature at {len(pixels)} pixels")
     assert worst < 0.01
 
 
 @pytest.mark.parametrize("jerlov", ["IB", "II", "3C"])
-def test_the_direct_signal_is_the_formula_within_a_thousandth(jerlov):
-    """Two lamps over a level floor, each written out with numpy."""
+def test_the_direct_signal_agrees_with_the_formula(jerlov):
+    """Two lamps and daylight over a level floor, computed with numpy; within 0.1 %."""
     water, sun = medium(WaterConfig(jerlov=jerlov)), SunConfig(illuminance_lx=300.0, depth_m=9.0)
-    optics = Optics(RIG, WaterConfig(jerlov=jerlov), TWO_LAMPS, sun, altitude_m=2.0)
-    lights = lights_of_eye(RIG, TWO_LAMPS, NIGHT, 0)
+    optics = optics_with(WaterConfig(jerlov=jerlov), TWO_LAMPS, sun, altitude_m=2.0)
+    sources = light_sources_in_camera(RIG, TWO_LAMPS, NO_DAYLIGHT, 0)
     for depth_m in (0.8, 2.0, 4.0):
         direct, _ = optics.split(*floor(depth_m), 0)
         points = rays() * (depth_m / rays()[..., 2:])
-        to_eye = np.linalg.norm(points, axis=-1)[..., None]
+        range_m = np.linalg.norm(points, axis=-1)[..., None]
         lux = 300.0 * np.exp(-downwelling_per_m(water) * (9.0 - 2.0 + depth_m))
-        for position, axis, lamp in zip(lights.position_m, lights.axis, TWO_LAMPS, strict=True):
-            way = points - position
-            d = np.linalg.norm(way, axis=-1)[..., None]
-            strength = lamp.intensity_cd * beam_share((way / d) @ axis, np.array(LED_BEAM))[..., None]
-            lux = lux + strength / d**2 * (way[..., 2:] / d) * np.exp(-water.attenuation_per_m * d)
-        expected = lux / np.pi * np.exp(-water.attenuation_per_m * to_eye)
+        for position, axis, lamp in zip(sources.position_m, sources.axis, TWO_LAMPS, strict=True):
+            from_lamp = points - position
+            d = np.linalg.norm(from_lamp, axis=-1)[..., None]
+            strength = lamp.intensity_cd * beam_share((from_lamp / d) @ axis, np.array(LED_BEAM))[..., None]
+            lux = lux + strength / d**2 * (from_lamp[..., 2:] / d) * np.exp(-water.attenuation_per_m * d)
+        expected = lux / np.pi * np.exp(-water.attenuation_per_m * range_m)
         np.testing.assert_allclose(direct, expected, rtol=1e-3)
 
 
-def test_daylight_falls_by_kd_from_the_surface_to_each_point_of_the_floor():
-    """Floors at two heights under a turned camera: the depth below the surface counts, not that along the axis."""
+def test_daylight_is_attenuated_by_kd_and_depth_below_the_surface():
+    """With a tilted camera the depth below the surface counts, not the depth along the optical axis."""
     water, sun = WaterConfig(jerlov="1C", turbidity=0.0), SunConfig(illuminance_lx=1e4, depth_m=6.0)
-    optics, per_m = Optics(RIG, water, (), sun, altitude_m=2.0), downwelling_per_m(medium(water))
-    np.testing.assert_allclose(per_m, medium(water).absorption_per_m)  # nothing is scattered, the sun is in the zenith
+    optics, per_m = optics_with(water, (), sun, altitude_m=2.0), downwelling_per_m(medium(water))
+    np.testing.assert_allclose(per_m, medium(water).absorption_per_m)  # no scattering, sun in the zenith
     np.testing.assert_allclose(optics.floor_lx(floor(2.0)[1], 0)[CENTRE], 1e4 * np.exp(-6 * per_m), rtol=1e-3)
     tilted = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, np.sin(0.3), np.cos(0.3), 4.0]])
-    seen = optics.floor_lx(floor(2.0)[1], 0, None, Overhead(None, tilted))
+    illuminance_lx = optics.floor_lx(floor(2.0)[1], 0, None, WaterSurface(None, tilted))
     below = 4.0 + 2.0 * (np.cos(0.3) + np.sin(0.3) * (rays()[..., 1] / rays()[..., 2]))
-    np.testing.assert_allclose(seen, 1e4 * np.exp(-below[..., None] * per_m), rtol=1e-3)
+    np.testing.assert_allclose(illuminance_lx, 1e4 * np.exp(-below[..., None] * per_m), rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -173,24 +190,24 @@ def test_daylight_falls_by_kd_from_the_surface_to_each_point_of_the_floor():
         ("7C", (0.63, 0.46, 0.89)), ("9C", (0.76, 0.63, 1.6)),
     ],
 )  # fmt: skip
-def test_kd_is_about_what_jerlov_measured(jerlov, table):
-    """The table's absorption and scattering were decoded from measured Kd by other hands: within a third."""
+def test_kd_is_close_to_jerlovs_measurements(jerlov, table):
+    """Within a third: the absorption and scattering of the water types were derived from measured Kd by others."""
     water = medium(WaterConfig(jerlov=jerlov))
     per_m = downwelling_per_m(water)
     np.testing.assert_allclose(per_m, table, rtol=0.34)
     assert (per_m >= water.absorption_per_m).all() and (per_m <= water.attenuation_per_m).all()
 
 
-def test_kept_scatter_turns_the_beams_attenuation_into_that_of_diffuse_light():
-    beam, forward, all_of_it = (medium(WaterConfig(jerlov="II", kept_share=k)) for k in (0.0, 0.74, 1.0))
+def test_kept_share_reduces_the_effective_attenuation():
+    beam, forward, all_kept = (medium(WaterConfig(jerlov="II", kept_share=k)) for k in (0.0, 0.74, 1.0))
     np.testing.assert_allclose(beam.attenuation_per_m, [0.712, 0.4202, 0.5483])  # a + b
     np.testing.assert_allclose(forward.attenuation_per_m, [0.52715, 0.15528, 0.16084], rtol=1e-3)  # a + 0.26 b
-    np.testing.assert_array_equal(all_of_it.attenuation_per_m, all_of_it.absorption_per_m)
+    np.testing.assert_array_equal(all_kept.attenuation_per_m, all_kept.absorption_per_m)
 
 
-def test_a_table_of_the_beam_shapes_the_light_and_is_dark_beyond_its_end():
-    spot = AT_EYE.model_copy(update={"beam": ((0.0, 1.0), (10.0, 0.5), (20.0, 0.5))})
-    light = Optics(RIG, CLEAR, (spot,), DARK).radiance(*floor(2.0), 0)[..., 1]
+def test_a_beam_table_shapes_the_light_and_is_dark_beyond_its_last_angle():
+    spot = AT_CAMERA.model_copy(update={"beam": ((0.0, 1.0), (10.0, 0.5), (20.0, 0.5))})
+    light = optics_with(CLEAR, (spot,), DARK).radiance(*floor(2.0), 0)[..., 1]
     cos = rays()[..., 2]
     off_deg = np.rad2deg(np.arccos(cos))
     share = light / (1000 / np.pi * cos**3 / 4)
@@ -199,12 +216,12 @@ def test_a_table_of_the_beam_shapes_the_light_and_is_dark_beyond_its_end():
     near = off_deg < 9.5
     np.testing.assert_allclose(share[near], 1 - 0.05 * off_deg[near], atol=0.01)
     assert not light[off_deg > 20.5].any()
-    # the veil of a beam that is dark where the eye looks is dark, too
-    aside = spot.model_copy(update={"tilt_deg": 90.0})
-    assert not Optics(RIG, WaterConfig(jerlov="II"), (aside,), DARK).radiance(*floor(2.0), 0)[40:].any()
+    # a beam that does not reach the field of view adds no backscatter
+    sideways = spot.model_copy(update={"tilt_deg": 90.0})
+    assert not optics_with(WaterConfig(jerlov="II"), (sideways,), DARK).radiance(*floor(2.0), 0)[40:].any()
 
 
-def test_the_colour_of_a_lamp_is_plancks_and_keeps_its_luminous_intensity():
+def test_the_colour_of_a_lamp_follows_planck_at_equal_luminance():
     np.testing.assert_array_equal(colour(6500.0), 1.0)
     warm = colour(3000.0)
 
@@ -215,118 +232,119 @@ def test_the_colour_of_a_lamp_is_plancks_and_keeps_its_luminous_intensity():
     ratio = [planck(nm, 3000) / planck(nm, 6500) for nm in (650, 550, 450)]
     np.testing.assert_allclose(warm / warm[1], np.array(ratio) / ratio[1], rtol=1e-6)
     assert warm @ [0.2126, 0.7152, 0.0722] == pytest.approx(1.0, abs=1e-12)
-    lamp = AT_EYE.model_copy(update={"colour_temperature_k": 3000.0})
-    white = Optics(RIG, WaterConfig(jerlov="II"), (AT_EYE,), DARK).split(*floor(2.0), 0)
-    coloured = Optics(RIG, WaterConfig(jerlov="II"), (lamp,), DARK).split(*floor(2.0), 0)
-    for was, now in zip(white, coloured, strict=True):  # direct and veil alike
+    lamp = AT_CAMERA.model_copy(update={"colour_temperature_k": 3000.0})
+    white = optics_with(WaterConfig(jerlov="II"), (AT_CAMERA,), DARK).split(*floor(2.0), 0)
+    coloured = optics_with(WaterConfig(jerlov="II"), (lamp,), DARK).split(*floor(2.0), 0)
+    for was, now in zip(white, coloured, strict=True):  # direct signal and backscatter
         np.testing.assert_allclose(now, was * warm, rtol=1e-5)
 
 
-def test_the_veil_of_one_lamp_agrees_with_the_formula_written_out():
-    lights, water = lights_of_eye(RIG, (AT_EYE,), NIGHT, 0), medium(WaterConfig(jerlov="II", turbidity=2.0))
+def test_the_backscatter_of_one_lamp_agrees_with_the_formula():
+    sources = light_sources_in_camera(RIG, (AT_CAMERA,), NO_DAYLIGHT, 0)
+    water = medium(WaterConfig(jerlov="II", turbidity=2.0))
     range_m = 1.7
-    got = scattered_per_m(lights, water, np.array([0.0, 0.0, 1.0]), np.array([range_m]))[0]
+    got = backscatter_per_m(sources, water, np.array([0.0, 0.0, 1.0]), np.array([range_m]))[0]
     b = 2.0 * np.array([0.2498, 0.3580, 0.5236])
     c = b + [0.4622, 0.0622, 0.0247]
-    straight_back = (1 - FORWARDNESS**2) / (4 * np.pi * (1 + FORWARDNESS) ** 3)
+    straight_back = (1 - SEA_WATER_MEAN_COSINE**2) / (4 * np.pi * (1 + SEA_WATER_MEAN_COSINE) ** 3)
     np.testing.assert_allclose(got, b * straight_back * 1000 / range_m**2 * np.exp(-2 * c * range_m), rtol=1e-12)
 
 
-@pytest.mark.parametrize("g", [0.0, 0.5, FORWARDNESS])
-def test_scattered_light_goes_somewhere(g):
+@pytest.mark.parametrize("g", [0.0, 0.5, SEA_WATER_MEAN_COSINE])
+def test_the_phase_function_is_normalized(g):
     total, _ = quad(lambda mu: 2 * np.pi * phase_function(np.array(mu), g), -1, 1)
     mean_cosine, _ = quad(lambda mu: 2 * np.pi * mu * phase_function(np.array(mu), g), -1, 1)
     assert total == pytest.approx(1.0, abs=1e-9) and mean_cosine == pytest.approx(g, abs=1e-9)
-    assert WaterConfig().mean_cosine == FORWARDNESS
+    assert WaterConfig().mean_cosine == SEA_WATER_MEAN_COSINE
 
 
-def test_own_water_takes_the_place_of_the_types_and_turbidity_still_scales_it():
+def test_given_water_properties_replace_the_water_type_and_are_scaled_by_turbidity():
     given = WaterConfig(absorption_per_m=(0.5, 0.1, 0.2), scattering_per_m=(0.1, 0.2, 0.3), turbidity=2.0)
     np.testing.assert_allclose(medium(given).absorption_per_m, [0.5, 0.1, 0.2])
     np.testing.assert_allclose(medium(given).scattering_per_m, [0.2, 0.4, 0.6])
     of_type = WaterConfig(jerlov="III")
     a, b = JERLOV_PER_M["III"]
-    same = Optics(RIG, WaterConfig(absorption_per_m=a, scattering_per_m=b), TWO_LAMPS, DARK).radiance(*floor(2.0), 0)
-    np.testing.assert_array_equal(same, Optics(RIG, of_type, TWO_LAMPS, DARK).radiance(*floor(2.0), 0))
+    same = optics_with(WaterConfig(absorption_per_m=a, scattering_per_m=b), TWO_LAMPS, DARK).radiance(*floor(2.0), 0)
+    np.testing.assert_array_equal(same, optics_with(of_type, TWO_LAMPS, DARK).radiance(*floor(2.0), 0))
 
 
 def test_a_spectrum_is_averaged_over_the_bands(tmp_path):
     file = tmp_path / "lake.csv"
     file.write_text("# nm, a, b\n350, 0.0, 1.0\n400, 0.2, 1.0\n500, 0.0, 1.0\n700, 0.4, 1.0\n")
     absorption, scattering = read_spectrum(file)
-    np.testing.assert_allclose(absorption, [0.3, 0.1, 0.1])  # straight lines: their middles
+    np.testing.assert_allclose(absorption, [0.3, 0.1, 0.1])  # linear: values at the band centres
     np.testing.assert_allclose(scattering, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    ("text", "message"),
     [
         ("", "0 rows"),
         ("400, 1\n700, 1", "2 columns"),
         ("nm, a, b\n400, 1, 1", "cannot be read: .*'nm'"),
-        ("400, 1, 1\n650, 1, 1", "reaches from 400 to 650 nm .*allowed: from 400 to 700"),
-        ("400, 1, 1\n400, 1, 1\n700, 1, 1", "do not rise"),
+        ("400, 1, 1\n650, 1, 1", "covers 400 to 650 nm .*allowed: 400 to 700"),
+        ("400, 1, 1\n400, 1, 1\n700, 1, 1", "do not increase"),
         ("400, 1, 1\n550, -0.1, 1\n700, 1, 1", "negative or not finite at 550 nm"),
         ("400, 1, 1\n550, nan, 1\n700, 1, 1", "negative or not finite at 550 nm"),
         (None, "cannot be read: .*lake.csv not found"),
     ],
 )
-def test_a_bad_spectrum_is_told(tmp_path, text, fault):
+def test_an_invalid_spectrum_is_rejected(tmp_path, text, message):
     file = tmp_path / "lake.csv"
     if text is not None:
         file.write_text(text)
-    with pytest.raises(TwinError, match=r"water\.spectrum_file: .*" + fault):
+    with pytest.raises(TwinError, match=r"water\.spectrum_file: .*" + message):
         medium(WaterConfig(spectrum_file=str(file)))
 
 
 @pytest.mark.parametrize(
-    ("keys", "fault"),
+    ("keys", "message"),
     [
         ({"absorption_per_m": (1, 1, 1)}, r"water\.scattering_per_m: missing"),
         ({"scattering_per_m": (1, 1, 1)}, r"water\.absorption_per_m: missing"),
         ({"scattering_per_m": (1, 1, 1), "spectrum_file": "a.csv"}, r"water\.scattering_per_m: given twice"),
     ],
 )
-def test_half_a_water_is_told(keys, fault):
-    with pytest.raises(TwinError, match=fault):
+def test_incomplete_or_duplicate_water_properties_are_rejected(keys, message):
+    with pytest.raises(TwinError, match=message):
         medium(WaterConfig(**keys))
 
 
 def test_beams_tilt_to_the_bow_and_pan_to_port():
-    straight = lights_of_eye(RIG, (AT_EYE,), NIGHT, 0)
+    straight = light_sources_in_camera(RIG, (AT_CAMERA,), NO_DAYLIGHT, 0)
     np.testing.assert_allclose(straight.axis, [[0, 0, 1]], atol=1e-12)
-    bow = lights_of_eye(RIG, (AT_EYE.model_copy(update={"tilt_deg": 90.0}),), NIGHT, 0)
+    bow = light_sources_in_camera(RIG, (AT_CAMERA.model_copy(update={"tilt_deg": 90.0}),), NO_DAYLIGHT, 0)
     np.testing.assert_allclose(bow.axis, [[0, -1, 0]], atol=1e-12)  # up in the image
-    port = lights_of_eye(RIG, (AT_EYE.model_copy(update={"pan_deg": 90.0}),), NIGHT, 0)
+    port = light_sources_in_camera(RIG, (AT_CAMERA.model_copy(update={"pan_deg": 90.0}),), NO_DAYLIGHT, 0)
     np.testing.assert_allclose(port.axis, [[-1, 0, 0]], atol=1e-12)  # left in the image
-    right = lights_of_eye(RIG, (AT_EYE,), NIGHT, 1)
+    right = light_sources_in_camera(RIG, (AT_CAMERA,), NO_DAYLIGHT, 1)
     np.testing.assert_allclose(right.position_m, [[-RIG.baseline_m, 0, 0]], atol=1e-12)
 
 
 @given(slope_x=st.floats(-0.5, 0.5), slope_y=st.floats(-0.5, 0.5))
 def test_a_slanted_floor_is_lit_by_the_cosine_to_its_normal(slope_x, slope_y):
-    # A plane z = 2 + slope_x x + slope_y y seen along ray (x', y', 1): depth = 2 / (1 - slope_x x' - slope_y y').
+    # A plane z = 2 + slope_x x + slope_y y along ray (x', y', 1): depth = 2 / (1 - slope_x x' - slope_y y').
     ray = rays() / rays()[..., 2:]
     depth = 2.0 / (1 - slope_x * ray[..., 0] - slope_y * ray[..., 1])
     albedo, _ = floor(2.0)
-    light = Optics(RIG, CLEAR, (AT_EYE,), DARK).radiance(albedo, depth.astype(np.float32), 0)
+    light = optics_with(CLEAR, (AT_CAMERA,), DARK).radiance(albedo, depth.astype(np.float32), 0)
     normal = np.array([slope_x, slope_y, -1.0]) / np.sqrt(1 + slope_x**2 + slope_y**2)
     cos = np.maximum(-rays() @ normal, 0)
     expected = 1000 / np.pi * beam_share(rays()[..., 2], np.array(LED_BEAM)) * cos / (depth**2 * (ray**2).sum(-1))
-    # The smaller one-sided slope is off by half a pixel's bend of depth: about slope / focal, under 1 % of the cosine.
+    # The smaller one-sided slope has an error of half a pixel of curvature: about slope / focal, < 1 % of the cosine.
     np.testing.assert_allclose(light[..., 1], expected, rtol=2e-2, atol=0.2)
 
 
-def test_the_floor_beside_an_edge_keeps_its_light():
+def test_a_depth_edge_does_not_change_the_adjacent_floor():
     albedo, depth = floor(2.0)
-    whole = Optics(RIG, CLEAR, TWO_LAMPS, DARK).radiance(albedo, depth, 0)
+    whole = optics_with(CLEAR, TWO_LAMPS, DARK).radiance(albedo, depth, 0)
     depth[:, 50:] = np.inf
-    cut = Optics(RIG, CLEAR, TWO_LAMPS, DARK).radiance(albedo, depth, 0)
+    cut = optics_with(CLEAR, TWO_LAMPS, DARK).radiance(albedo, depth, 0)
     np.testing.assert_array_equal(cut[:, :50], whole[:, :50])
     assert not cut[:, 50:].any()
 
 
-def test_jerlov_types_grow_murkier_in_order():
+def test_jerlov_types_are_ordered_by_turbidity():
     green = [sum(JERLOV_PER_M[name][k][1] for k in (0, 1)) for name in ("clear", "I", "IA", "IB", "II", "III")]
     coast = [sum(JERLOV_PER_M[name][k][1] for k in (0, 1)) for name in ("1C", "3C", "5C", "7C", "9C")]
     assert green == sorted(green) and coast == sorted(coast)

@@ -1,4 +1,4 @@
-"""Powers of two by a polynomial: what they are against numpy's, and that nothing lost is nothing lost."""
+"""Powers of two by a polynomial: agreement with numpy, exactness at integers, and underflow."""
 
 import numpy as np
 from numba import njit
@@ -14,16 +14,16 @@ def powers(exponents):
     return out
 
 
-def test_powers_are_those_of_numpy_to_the_last_digits():
+def test_powers_agree_with_numpy_in_single_precision():
     exponents = np.concatenate([np.linspace(-126, 127, 100_001), np.linspace(-1e-3, 1e-3, 1001)]).astype(np.float32)
     np.testing.assert_allclose(powers(exponents), np.exp2(exponents.astype(np.float64)), rtol=2e-7)
     np.testing.assert_allclose(powers(np.array([LOG2_E], np.float32)), np.e, rtol=2e-7)
 
 
-def test_whole_exponents_are_exact_and_clear_water_takes_nothing():
-    whole = np.arange(-126, 128)
-    np.testing.assert_array_equal(powers(whole.astype(np.float32)), np.ldexp(1.0, whole))
+def test_integer_exponents_are_exact():
+    integers = np.arange(-126, 128)
+    np.testing.assert_array_equal(powers(integers.astype(np.float32)), np.ldexp(1.0, integers))
 
 
-def test_what_is_lost_in_single_precision_stays_next_to_nothing():
+def test_exponents_below_the_normal_range_underflow():
     assert (powers(np.array([-127, -1e4, -1e30, -np.inf], np.float32)) <= 2.0**-126).all()

@@ -1,4 +1,4 @@
-"""The renderer against rays, heights and projected patterns: none of these oracles knows OpenGL."""
+"""Renderer against ray casting, terrain heights and projected patterns, all independent of OpenGL."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import scenes.floor
 import scenes.gl
 import terrains
-from scenes.builder import SceneModel, build
+from scenes.builder import CameraPair, SceneModel, build
 from scenes.gl import mujoco
 from terrains import Terrain
 from twin.core import geometry
@@ -32,7 +32,7 @@ POSES = [
 
 
 def world_of(terrain: Terrain) -> SceneModel:
-    return build(terrain, W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), 0.01)
+    return build(terrain, CameraPair(W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))), 0.01)
 
 
 @pytest.fixture(scope="module")
@@ -42,18 +42,19 @@ def world() -> SceneModel:
 
 @pytest.fixture(scope="module")
 def renderer(world: SceneModel) -> Iterator[Renderer]:
-    with Renderer(world, W, H, VFOV) as made:
-        yield made
+    with Renderer(world, W, H, VFOV) as opened:
+        yield opened
 
 
 def pixel_rays(width_px: int, height_px: int, vfov_deg: float) -> np.ndarray:
-    """(height, width, 3) directions of the pixel centres in the camera, scaled to z = 1: times depth, points."""
+    """Returns the viewing directions (height, width, 3) of the pixel centres in the camera, scaled to z = 1."""
     focal_px = height_px / 2 / float(np.tan(np.deg2rad(vfov_deg) / 2))
     u, v = np.meshgrid(np.arange(width_px) - (width_px - 1) / 2, np.arange(height_px) - (height_px - 1) / 2)
     return np.stack([u / focal_px, v / focal_px, np.ones_like(u)], axis=-1)
 
 
 def ray_depths(world: SceneModel, pose: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Returns the depths (n,) [m] of pixels (n, 2) by ray casting in MuJoCo; inf where there is no floor."""
     data = mujoco.MjData(world.model)
     data.qpos[2] = 100.0
     mujoco.mj_forward(world.model, data)
@@ -67,58 +68,58 @@ def ray_depths(world: SceneModel, pose: np.ndarray, pixels: np.ndarray) -> np.nd
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_depth_is_that_of_rays_through_the_pixel_centres(
+def test_depth_agrees_with_rays_through_the_pixel_centres(
     world: SceneModel, renderer: Renderer, pose: np.ndarray
 ) -> None:
     _, depth = renderer.render(pose)
     pixels = np.random.default_rng(1).integers(0, (W, H), (400, 2))
-    seen, expected = depth[pixels[:, 1], pixels[:, 0]], ray_depths(world, pose, pixels)
+    rendered, expected = depth[pixels[:, 1], pixels[:, 0]], ray_depths(world, pose, pixels)
     inside = np.isfinite(expected)
-    assert np.array_equal(np.isfinite(seen), inside)
-    error = np.abs(seen[inside] - expected[inside])
-    # single precision at some metres from the origin is about 1 um
+    assert np.array_equal(np.isfinite(rendered), inside)
+    error = np.abs(rendered[inside] - expected[inside])
+    # single precision is about 1 um at a few metres from the origin
     assert np.median(error) < 5e-6 and np.percentile(error, 98) < 2e-5
 
 
 @pytest.mark.parametrize("pose", POSES)
-def test_every_drawn_point_lies_on_the_terrain(world: SceneModel, renderer: Renderer, pose: np.ndarray) -> None:
+def test_rendered_points_are_on_the_terrain(world: SceneModel, renderer: Renderer, pose: np.ndarray) -> None:
     _, depth = renderer.render(pose)
-    seen = np.isfinite(depth)
-    points = geometry.transform(pose, pixel_rays(W, H, VFOV)[seen] * depth[seen][:, None].astype(np.float64))
+    valid = np.isfinite(depth)
+    points = geometry.transform(pose, pixel_rays(W, H, VFOV)[valid] * depth[valid][:, None].astype(np.float64))
     error = np.abs(points[:, 2] - world.terrain.height_at(points[:, 0], points[:, 1]))
     assert np.nanmedian(error) < 5e-6 and np.nanpercentile(error, 98) < 2e-5
-    assert np.isnan(error).mean() < 0.002  # pixels on the very edge of the floor
+    assert np.isnan(error).mean() < 0.002  # pixels on the edge of the floor
 
 
-def test_no_border_between_tiles_shows(monkeypatch: pytest.MonkeyPatch, world: SceneModel, renderer: Renderer) -> None:
-    """Drawn whole or cut into 12 pieces the floor looks the same."""
-    cut = [renderer.render(pose) for pose in POSES]
+def test_tile_borders_are_invisible(monkeypatch: pytest.MonkeyPatch, world: SceneModel, renderer: Renderer) -> None:
+    """A floor of 12 tiles is rendered like a floor of one tile."""
+    tiled = [renderer.render(pose) for pose in POSES]
     monkeypatch.setattr(scenes.floor, "TILE_CELLS", 1000)
-    with Renderer(world_of(world.terrain), W, H, VFOV) as uncut:
-        for (albedo, depth), pose in zip(cut, POSES, strict=True):
-            whole_albedo, whole_depth = uncut.render(pose)
-            both = np.isfinite(depth) & np.isfinite(whole_depth)
-            assert (np.isfinite(depth) != np.isfinite(whole_depth)).mean() < 1e-3
-            off = np.abs(depth[both] - whole_depth[both]) > 1e-4
-            assert off.mean() < 1e-3  # silhouettes may fall to the other side of a pixel centre
-            difference = np.abs(albedo.astype(int) - whole_albedo.astype(int))[both].max(axis=-1)
+    with Renderer(world_of(world.terrain), W, H, VFOV) as untiled:
+        for (albedo, depth), pose in zip(tiled, POSES, strict=True):
+            single_albedo, single_depth = untiled.render(pose)
+            both = np.isfinite(depth) & np.isfinite(single_depth)
+            assert (np.isfinite(depth) != np.isfinite(single_depth)).mean() < 1e-3
+            off = np.abs(depth[both] - single_depth[both]) > 1e-4
+            assert off.mean() < 1e-3  # silhouettes may fall on the other side of a pixel centre
+            difference = np.abs(albedo.astype(int) - single_albedo.astype(int))[both].max(axis=-1)
             assert np.percentile(difference, 99) <= 2 and (difference > 8).mean() < 1e-3
 
 
-def test_one_colour_is_drawn_exactly() -> None:
+def test_a_uniform_colour_is_rendered_exactly() -> None:
     terrain = terrains.generate("reef", (5.0, 5.0), 0.4, 0.0, 0.05, 0.02, 0)
     colour = np.array([200, 17, 93], np.uint8)
     painted = Terrain(
         terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m,
         np.broadcast_to(colour, terrain.texture.shape).copy(), terrain.texture_px_m,
     )  # fmt: skip
-    with Renderer(world_of(painted), W, H, VFOV) as drawn:
-        albedo, _ = drawn.render(POSES[0])
+    with Renderer(world_of(painted), W, H, VFOV) as opened:
+        albedo, _ = opened.render(POSES[0])
     assert np.all(albedo == colour)
 
 
 def dotted(terrain: Terrain, dots_m: np.ndarray, sigma_m: float) -> Terrain:
-    """The floor painted black with round white dots at the given places, seen from above."""
+    """Returns the floor in black with round white dots at the given positions (n, 2)."""
     h, w = terrain.texture.shape[:2]
     x = terrain.west_m + (np.arange(w) + 0.5) * terrain.size_m[0] / w
     y = terrain.north_m - (np.arange(h) + 0.5) * terrain.size_m[1] / h
@@ -128,8 +129,8 @@ def dotted(terrain: Terrain, dots_m: np.ndarray, sigma_m: float) -> Terrain:
     return Terrain(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m, texture, terrain.texture_px_m)
 
 
-def test_a_pattern_appears_where_projection_says() -> None:
-    """Dots painted at known places are drawn within 0.1 px of their projection, and on average at it."""
+def test_a_pattern_is_rendered_at_its_projection() -> None:
+    """Dots are within 0.1 px of their projection, 0.03 px on average."""
     tilted = np.add.outer(0.05 * np.arange(61), 0.02 * np.arange(91)).astype(np.float32) * 0.05
     plain = Terrain(tilted, 0.05, -2.25, -1.5, np.zeros((600, 900, 3), np.uint8), 0.005)
     x, y = np.meshgrid(np.linspace(-0.6, 0.7, 5), np.linspace(-0.6, 0.6, 5))
@@ -138,8 +139,8 @@ def test_a_pattern_appears_where_projection_says() -> None:
     pose = geometry.pose(
         geometry.rotation_from_rpy(0.03, 0.02, 0.4) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([0, 0, 2.0])
     )
-    with Renderer(world_of(terrain), 320, 240, VFOV) as drawn:
-        albedo, _ = drawn.render(pose)
+    with Renderer(world_of(terrain), 320, 240, VFOV) as opened:
+        albedo, _ = opened.render(pose)
     points = np.column_stack([dots, terrain.height_at(dots[:, 0], dots[:, 1])])
     camera = geometry.transform(geometry.inverse(pose), points)
     focal_px = 120 / np.tan(np.deg2rad(VFOV) / 2)
@@ -149,29 +150,31 @@ def test_a_pattern_appears_where_projection_says() -> None:
 
 
 def inside(uv: np.ndarray) -> bool:
+    """Returns whether a dot at a pixel is completely within the image."""
     return bool(np.all(uv > 15) and np.all(uv < [304, 224]))
 
 
 def centroid(grey: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Returns the centroid (2,) of a dot near a pixel [px]."""
     c, r = np.rint(around).astype(int)
     v, u = np.mgrid[r - 14 : r + 15, c - 14 : c + 15]
     weight = grey[r - 14 : r + 15, c - 14 : c + 15].astype(float)
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
 
 
-def test_texture_is_drawn_no_softer_than_a_pixel() -> None:
-    """Texels in black and white, a pixel each, off by half a pixel at worst, keep half of their contrast."""
+def test_texture_keeps_detail_of_one_pixel() -> None:
+    """Black and white texels of one pixel, displaced by half a pixel at most, keep half of their contrast."""
     texel_m = 0.01
     noise = np.where(np.random.default_rng(0).random((300, 300, 1)) < 0.5, 0, 255).astype(np.uint8).repeat(3, axis=2)
     terrain = Terrain(np.zeros((61, 61), np.float32), 0.05, -1.5, -1.5, noise, texel_m)
     focal_px = H / 2 / np.tan(np.deg2rad(VFOV) / 2)
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.005, 0.005, texel_m * focal_px]))
-    with Renderer(world_of(terrain), W, H, VFOV) as drawn:
-        albedo, _ = drawn.render(pose)
+    with Renderer(world_of(terrain), W, H, VFOV) as opened:
+        albedo, _ = opened.render(pose)
     assert albedo[..., 0].std() > 0.5 * noise[..., 0].std()
 
 
-def test_hidden_tiles_are_those_that_no_pixel_sees(world: SceneModel, renderer: Renderer) -> None:
+def test_hidden_tiles_do_not_change_the_image(world: SceneModel, renderer: Renderer) -> None:
     tangents = np.tan(np.deg2rad(VFOV) / 2) * np.array([W / H, 1.0])
     for pose in POSES:
         albedo, depth = renderer.render(pose)
@@ -183,13 +186,13 @@ def test_hidden_tiles_are_those_that_no_pixel_sees(world: SceneModel, renderer: 
         assert np.array_equal(depth, linear_depth(renderer._z[::-1], renderer._near, renderer._far))
 
 
-def test_where_no_floor_is_depth_is_infinite(renderer: Renderer) -> None:
+def test_depth_is_infinite_where_there_is_no_floor(renderer: Renderer) -> None:
     up = geometry.pose(np.diag([1.0, 1.0, 1.0]), np.array([0.0, 0.0, 2.0]))
     _, depth = renderer.render(up)
     assert np.all(np.isinf(depth))
 
 
-def test_frames_are_copies_and_the_same_pose_gives_the_same_bytes(renderer: Renderer) -> None:
+def test_images_are_copies_and_rendering_is_reproducible(renderer: Renderer) -> None:
     albedo, depth = renderer.render(POSES[0])
     kept = albedo.copy(), depth.copy()
     renderer.render(POSES[1])
@@ -206,22 +209,25 @@ def test_linear_depth_inverts_the_projection() -> None:
     assert np.isinf(linear_depth(np.zeros(1, np.float32), near, far)[0])
 
 
-def test_a_machine_without_opengl_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch, world: SceneModel) -> None:
-    monkeypatch.setattr(scenes.gl, "_why_missing", "ImportError: no libEGL.so.1")
+def test_missing_opengl_is_reported_with_the_package_to_install(
+    monkeypatch: pytest.MonkeyPatch, world: SceneModel
+) -> None:
+    monkeypatch.setattr(scenes.gl, "_egl_error", "ImportError: no libEGL.so.1")
     with pytest.raises(TwinError, match=r"no libEGL.*apt-get install -y libegl1"):
         Renderer(world, W, H, VFOV)
 
 
-def test_without_egl_physics_still_runs_and_drawing_says_why() -> None:
-    """In a process of its own, where PyOpenGL finds no EGL."""
+def test_without_egl_mujoco_loads_and_rendering_reports_the_reason() -> None:
+    """Runs in a separate process in which PyOpenGL cannot load EGL."""
     code = """
 import sys
 sys.modules["OpenGL.EGL"] = None
-from scenes.gl import GlMissing, mujoco, offscreen_context
+from scenes.gl import mujoco, offscreen_context
+from twin.errors import TwinError
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
 try:
     offscreen_context(64, 48)
-except GlMissing as error:
+except TwinError as error:
     print(error)
 """
     environment = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}

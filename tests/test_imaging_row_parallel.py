@@ -1,4 +1,4 @@
-"""Bands of rows: an image does not depend on how many threads make it."""
+"""Row bands: results do not depend on the number of threads."""
 
 import types
 
@@ -7,7 +7,8 @@ import pytest
 
 from twin.core import geometry
 from twin.imaging import row_parallel
-from twin.imaging.light import Light, Moment
+from twin.imaging.illumination import illumination_of
+from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.scenario.model import Scenario
 
 SCENARIO = Scenario.model_validate(
@@ -27,16 +28,16 @@ SPIKES = types.SimpleNamespace(
 
 
 @pytest.mark.parametrize(("n_rows", "pixels", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
-def test_bands_are_cut_where_there_are_pixels_enough(monkeypatch, n_rows, pixels, n_bands):
-    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
-    seen = []
-    row_parallel.in_row_bands(lambda *band: seen.append(band), n_rows, pixels)
-    assert len(seen) == n_bands
+def test_an_image_is_split_where_it_has_enough_rows(monkeypatch, n_rows, pixels, n_bands):
+    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    bands = []
+    row_parallel.in_row_bands(lambda *band: bands.append(band), n_rows, pixels)
+    assert len(bands) == n_bands
 
 
 @pytest.mark.parametrize("n_rows", [1, 63, 64, 65, 481])
-def test_every_row_is_worked_on_once(monkeypatch, n_rows):
-    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
+def test_every_row_is_processed_once(monkeypatch, n_rows):
+    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
     count = np.zeros(n_rows, int)
 
     def work(first, end):
@@ -46,23 +47,23 @@ def test_every_row_is_worked_on_once(monkeypatch, n_rows):
     assert (count == 1).all()
 
 
-def test_light_is_the_same_with_one_thread_and_with_two(monkeypatch):
-    """To the last bit, with shadows and forward scatter, over a floor as rough as can be."""
+def test_radiance_is_the_same_with_one_and_two_threads(monkeypatch):
+    """To the last bit, with shadows and forward scatter, over a random floor."""
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     albedo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     depth = np.random.default_rng(2).uniform(1.7, 2.0, (120, 160)).astype(np.float32)
-    seen = []
+    images = []
     for processors in (1, 2):
-        monkeypatch.setattr(row_parallel, "_processors", lambda n=processors: n)
-        light = Light(SCENARIO, SPIKES, np.random.default_rng(0))
-        seen += [light.radiance(albedo, depth, eye, Moment(pose, 0.0)) for eye in (0, 1)]
-    np.testing.assert_array_equal(seen[0], seen[2])
-    np.testing.assert_array_equal(seen[1], seen[3])
+        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        light = ImageFormation(SCENARIO, illumination_of(SCENARIO), SPIKES, np.random.default_rng(0))
+        images += [light.radiance(albedo, depth, camera, StampedPose(pose, 0.0)) for camera in (0, 1)]
+    np.testing.assert_array_equal(images[0], images[2])
+    np.testing.assert_array_equal(images[1], images[3])
 
 
 @pytest.mark.parametrize("bad_row", [0, 499])
-def test_a_fault_in_any_band_is_told(monkeypatch, bad_row):
-    monkeypatch.setattr(row_parallel, "_processors", lambda: row_parallel.THREADS)
+def test_an_exception_in_any_band_is_raised(monkeypatch, bad_row):
+    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
 
     def work(first, end):
         if first <= bad_row < end:

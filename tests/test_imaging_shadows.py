@@ -1,4 +1,4 @@
-"""Shadows: MuJoCo's rays, a wall's closed form, every pixel against the lattice."""
+"""Shadows against MuJoCo rays, the closed form of a wall, and dense sampling."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import terrains
-from scenes.builder import SceneModel, build
+from scenes.builder import CameraPair, SceneModel, build
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import mujoco
 from twin.core import geometry
 from twin.imaging import shadows
-from twin.imaging.light import Light, Moment
+from twin.imaging.illumination import illumination_of
+from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.renderer import Renderer
 from twin.imaging.shadows import BLOCK_CELLS, Shadows
 from twin.scenario.model import LampConfig, Scenario
@@ -36,20 +37,21 @@ POSES = [
 ]
 
 
-def lamps_in(eye: int) -> np.ndarray:
-    left_from_body = geometry.inverse(RIG.body_from_camera @ (RIG.left_from_right if eye else np.eye(4)))
-    return geometry.transform(left_from_body, np.array([lamp["position_m"] for lamp in LAMPS]))
+def lamps_in(camera: int) -> np.ndarray:
+    """Returns the lamp positions (lamps, 3) in the axes of a camera (0 left, 1 right)."""
+    camera_from_body = geometry.inverse(RIG.body_from_camera @ (RIG.left_from_right if camera else np.eye(4)))
+    return geometry.transform(camera_from_body, np.array([lamp["position_m"] for lamp in LAMPS]))
 
 
-def points_of(depth: np.ndarray, world_from_eye: np.ndarray) -> np.ndarray:
-    """(H, W, 3) floor of the pixels in the world."""
+def points_of(depth: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
+    """Returns the floor points (H, W, 3) of the pixels in the world."""
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
     ray = np.stack([(u - RIG.cx_px) / RIG.focal_px, (v - RIG.cy_px) / RIG.focal_px, np.ones(u.shape)], -1)
-    return geometry.transform(world_from_eye, (ray * depth[..., None]).reshape(-1, 3)).reshape(ray.shape)
+    return geometry.transform(world_from_camera, (ray * depth[..., None]).reshape(-1, 3)).reshape(ray.shape)
 
 
 def cliffs() -> terrains.Terrain:
-    """A reef whose slopes are made steep: plateaus 0.7 m above their surroundings, rough all over."""
+    """Returns a rough reef with steep slopes: plateaus 0.7 m above their surroundings."""
     reef = terrains.generate("reef", (8.0, 6.0), 1.0, 0.0, 0.025, 0.02, 5)
     plateau = np.clip((reef.height_m - np.median(reef.height_m)) / 0.04, 0, 1)
     rough = np.random.default_rng(1).normal(scale=0.004, size=plateau.shape)
@@ -57,13 +59,13 @@ def cliffs() -> terrains.Terrain:
 
 
 def world_of(terrain: terrains.Terrain) -> SceneModel:
-    return build(terrain, RIG.width_px, RIG.height_px, VFOV, RIG.baseline_m, RIG.body_from_camera, 0.01)
+    return build(terrain, CameraPair(RIG.width_px, RIG.height_px, VFOV, RIG.baseline_m, RIG.body_from_camera), 0.01)
 
 
-def sees(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether MuJoCo's ray from a lamp reaches points (n, 3)."""
+def ray_reaches(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns whether the MuJoCo ray from a lamp reaches each of the points (n, 3)."""
     data = mujoco.MjData(world.model)
-    data.qpos[2] = 100.0  # the vehicle out of the way
+    data.qpos[2] = 100.0  # moves the vehicle out of the rays
     mujoco.mj_forward(world.model, data)
     geom, group, result = np.zeros(1, np.int32), np.zeros(6, np.uint8), []
     group[FLOOR_GROUP] = 1
@@ -74,51 +76,51 @@ def sees(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.array(result)
 
 
-def test_a_pixel_is_lit_where_mujocos_ray_from_the_lamp_arrives() -> None:
-    """At 99.5 % of the pixels at least, on a reef so steep that shadows fall; in both cameras."""
+def test_shadows_agree_with_mujoco_rays() -> None:
+    """At 99.5 % or more of the pixels of both cameras, on a reef that is steep enough for shadows."""
     terrain = cliffs()
     world, rng = world_of(terrain), np.random.default_rng(0)
     casting = Shadows(terrain, RIG, [lamps_in(0), lamps_in(1)])
     agree, dark = [], []
     with Renderer(world, RIG.width_px, RIG.height_px, VFOV) as renderer:
         for pose in POSES:
-            for eye in (0, 1):
-                world_from_eye = pose @ RIG.left_from_right if eye else pose
-                _, depth = renderer.render(world_from_eye)
-                lit = casting.lit(depth, world_from_eye, eye)
+            for camera in (0, 1):
+                world_from_camera = pose @ RIG.left_from_right if camera else pose
+                _, depth = renderer.render(world_from_camera)
+                lit = casting.lit(depth, world_from_camera, camera)
                 v, u = rng.integers(0, RIG.height_px, 3000), rng.integers(0, RIG.width_px, 3000)
-                points = points_of(depth, world_from_eye)[v, u]
-                for k, lamp in enumerate(geometry.transform(world_from_eye, lamps_in(eye))):
-                    expected = sees(world, lamp, points)
+                points = points_of(depth, world_from_camera)[v, u]
+                for k, lamp in enumerate(geometry.transform(world_from_camera, lamps_in(camera))):
+                    expected = ray_reaches(world, lamp, points)
                     agree.append(np.mean(lit[k, v, u] == expected))
                     dark.append(1 - expected.mean())
     assert np.min(agree) >= 0.995
-    assert np.mean(dark) > 0.03, "a floor without shadows says nothing"
+    assert np.mean(dark) > 0.03, "the test floor has too few shadows"
 
 
 def wall(height_m: float, spacing_m: float = 0.05) -> types.SimpleNamespace:
-    """A flat floor, 10 m by 10 m, with a wall along y at x = 0, one cell to its foot on both sides."""
+    """Returns a flat floor, 10 m by 10 m, with a wall along y at x = 0 that falls to the floor within one cell."""
     n = round(10 / spacing_m) + 1
     height = np.zeros((n, n), np.float32)
     height[:, n // 2] = height_m
     return types.SimpleNamespace(height_m=height, spacing_m=spacing_m, west_m=-5.0, south_m=-5.0)
 
 
-def test_behind_a_wall_the_shadow_is_as_long_as_similar_triangles_say() -> None:
-    """Lamp 2 m high and 1 m before a wall of 0.5 m: dark up to 0.5 / (2 - 0.5) * 1 m behind it."""
+def test_the_shadow_of_a_wall_has_the_length_of_similar_triangles() -> None:
+    """Lamp at 2 m height, 1 m in front of a wall of 0.5 m: the shadow is 0.5 / (2 - 0.5) * 1 m long."""
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     lamp = geometry.transform(geometry.inverse(pose), np.array([[-1.0, 0.0, 2.0]]))
-    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)  # as if the eye saw through the wall
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)  # depth without the wall
     lit = Shadows(wall(0.5), RIG, [lamp, lamp]).lit(depth, pose, 0)[0]
     x = points_of(depth, pose)[..., 0]
     end_m, pixel_m = 0.5 / 1.5, 2.0 / RIG.focal_px
-    dark = (x > 0.06) & (x < end_m - pixel_m)  # beside the wall's own foot
+    dark = (x > 0.06) & (x < end_m - pixel_m)  # without the foot of the wall
     assert not lit[dark].any() and lit[(x > end_m + pixel_m) | (x < -0.06)].all()
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> None:
-    """Spikes in every cell, lamps at all heights and beyond the grid: no block is skipped that should not be."""
+    """Spikes in every cell, lamps at all heights and outside of the grid: no occluding block is skipped."""
     rng = np.random.default_rng(seed)
     floor = terrains.Terrain(
         rng.normal(scale=0.2, size=(3 * BLOCK_CELLS + 2, 2 * BLOCK_CELLS + 1)).astype(np.float32), 0.1, -0.8, -1.2,
@@ -131,40 +133,40 @@ def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> Non
         x, y = rng.uniform(-0.79, 0.79), rng.uniform(-1.19, 1.19)
         start = np.array([x, y, float(floor.height_at(x, y))])
         lamp = rng.uniform([-1.5, -1.5, 0.3], [1.5, 1.5, 2.0])
-        way = start + share[:, None] * (lamp - start)
-        over = floor.height_at(way[:, 0], way[:, 1]) - way[:, 2]
+        ray = start + share[:, None] * (lamp - start)
+        over = floor.height_at(ray[:, 0], ray[:, 1]) - ray[:, 2]
         margin = np.nanmax(over)
-        if abs(margin - shadows.BIAS_M) < 2e-3:  # grazing: what the samples miss between them decides
+        if abs(margin - shadows.BIAS_M) < 2e-3:  # grazing ray: the samples are not dense enough
             continue
         col, row = (x + 0.8) / 0.1, (y + 1.2) / 0.1
         to = (lamp[0] - x) / 0.1, (lamp[1] - y) / 0.1, lamp[2] - start[2]
-        wrong += shadows._blocked(floor.height_m, tops, rises, col, row, start[2], *to) != (margin > 0)
+        wrong += shadows._occluded(floor.height_m, tops, rises, col, row, start[2], *to) != (margin > 0)
         total += 1
     assert total > 60 and wrong == 0
 
 
-def test_the_lattice_fills_in_what_looking_at_every_pixel_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_lattice_agrees_with_testing_every_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     lamp = geometry.transform(geometry.inverse(pose), np.array([[-1.0, 0.3, 2.0]]))
     depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
     casting = Shadows(wall(0.5), RIG, [lamp, lamp])
-    got = casting.lit(depth, pose, 0)
-    view = *casting._grid, depth, RIG.focal_px, pose, geometry.transform(pose, lamp)
-    whole = np.empty_like(got)
-    shadows._look_between(*view, np.indices((1, 61, 81)).sum(0).astype(np.uint8) % 2, whole, 0, 60)
-    # a wedge of shadow thinner than the lattice may slip through at its tip: none here
-    assert np.mean(got != whole) < 1e-3
+    lit = casting.lit(depth, pose, 0)
+    scene = *casting._grid, depth, RIG.focal_px, pose, geometry.transform(pose, lamp)
+    dense = np.empty_like(lit)
+    shadows._fill_between(*scene, np.indices((1, 61, 81)).sum(0).astype(np.uint8) % 2, dense, 0, 60)
+    # the tip of a shadow thinner than the lattice may be missed; not in this geometry
+    assert np.mean(lit != dense) < 1e-3
 
 
-def test_no_floor_in_view_is_no_shadow() -> None:
+def test_without_floor_there_is_no_shadow() -> None:
     depth = np.full((RIG.height_px, RIG.width_px), np.inf, np.float32)
     assert Shadows(wall(1.0), RIG, [lamps_in(0), lamps_in(1)]).lit(depth, POSES[0], 0).all()
 
 
-def test_the_shadow_of_a_lamp_takes_its_light_and_leaves_the_others() -> None:
+def test_a_shadow_removes_the_light_of_its_lamp_only() -> None:
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
-    white, moment = np.full((*depth.shape, 3), 255, np.uint8), Moment(pose, 0.0)
+    white, stamped_pose = np.full((*depth.shape, 3), 255, np.uint8), StampedPose(pose, 0.0)
     high = types.SimpleNamespace(height_m=wall(1.0).height_m.T.copy(), spacing_m=0.05, west_m=-5.0, south_m=-5.0)
 
     def light_of(lamps: list[dict], casts: bool) -> np.ndarray:
@@ -172,9 +174,9 @@ def test_the_shadow_of_a_lamp_takes_its_light_and_leaves_the_others() -> None:
             "lamps": tuple(LampConfig(**lamp) for lamp in lamps),
             "imaging": SCENARIO.imaging.model_copy(update={"shadows": casts}),
         }
-        return Light(SCENARIO.model_copy(update=changes), high, np.random.default_rng(0)).radiance(
-            white, depth, 0, moment
-        )
+        here = SCENARIO.model_copy(update=changes)
+        light = ImageFormation(here, illumination_of(here), high, np.random.default_rng(0))
+        return light.radiance(white, depth, 0, stamped_pose)
 
     both, port, starboard = (light_of(lamps, True) for lamps in (LAMPS, LAMPS[:1], LAMPS[1:]))
     np.testing.assert_allclose(both, port + starboard, rtol=1e-5)

@@ -1,29 +1,16 @@
-"""Who may import whom: the rooms of the design, read from the source of every module."""
+"""The architecture: who imports whom, read from the source of every module and compared with docs/architecture.md."""
 
 import ast
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-BASICS = {
-    "twin.scenario.model", "twin.scenario.file", "twin.core.records", "twin.core.links", "twin.core.growing_array", "twin.core.geometry", "twin.errors",
-    "twin.core.timing",
-}  # fmt: skip
-#: What each room may import of ours beside itself. The rest of twin/ (survey, cli, ...) may import everything.
-ROOMS = {
-    "terrains": set(),
-    "scenes": {"terrains"},
-    "controllers": set(),
-    "twin.simulate": BASICS | {"scenes", "controllers"},
-    "twin.imaging": BASICS | {"scenes"},
-    "twin.estimate": BASICS,
-    "twin.judge": BASICS,
-    "twin.exchange": BASICS,
-} | {basic: BASICS for basic in BASICS}
-#: A name in scenes/ is found by where the package lies: the one look of the basics at a room.
-ROOMS["twin.scenario.file"] = BASICS | {"scenes"}
 OURS = ("terrains", "scenes", "controllers", "twin")
+DOCUMENT = (ROOT / "docs" / "architecture.md").read_text()
 
 
 def modules():
@@ -35,17 +22,34 @@ def dotted(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+NAMES = {dotted(path) for path in modules()}
+
+
+def table():
+    """Returns the rooms of the table, in its order, each with the short names of those that it may import."""
+    rows = re.findall(r"^\| `([\w.]+)` \|[^|]*\|([^|]*)\|$", DOCUMENT, re.MULTILINE)
+    return {room: {name.strip() for name in allowed.split(",") if name.strip()} for room, allowed in rows}
+
+
+ROOMS = table()
+
+
+def short(room):
+    return room.rpartition(".")[2]
+
+
 def within(module, package):
     return module == package or module.startswith(package + ".")
 
 
-def is_module(name):
-    path = ROOT.joinpath(*name.split("."))
-    return path.is_dir() or path.with_suffix(".py").is_file()
+def room_of(module):
+    """Returns the innermost room of a module; the package `twin` itself holds only its public API."""
+    found = [room for room in ROOMS if within(module, room) and (room != "twin" or module == "twin")]
+    return max(found, key=len, default=None)
 
 
 def imports(tree, module=""):
-    """Dotted names of all that a module imports, anywhere in it; `from a import b` is a.b where that is a module."""
+    """Yields the modules that a module imports, anywhere in it; `from a import b` is a.b where that is a module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -53,54 +57,125 @@ def imports(tree, module=""):
             assert node.level == 0, f"{module}: relative imports hide where they point"
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
-                yield name if is_module(name) else node.module
+                yield name if name in NAMES else node.module
 
 
-def forbidden(module, imported):
-    """Whether this arrow is one that the design does not have."""
-    room = next((room for room in ROOMS if within(module, room)), None)
-    if room is None or not any(within(imported, package) for package in OURS):
+def is_forbidden(module, imported):
+    """Returns whether the table does not allow this import."""
+    if not any(within(imported, package) for package in OURS):
         return False
-    return not any(within(imported, allowed) for allowed in ROOMS[room] | {room})
+    room, target = room_of(module), room_of(imported)
+    return room != target and (target is None or short(target) not in ROOMS[room])
+
+
+def arrows():
+    """Returns the imports between modules of the project: {module: {imported}}."""
+    return {
+        module: {name for name in imports(ast.parse(path.read_text()), module) if name in NAMES and name != module}
+        for path, module in ((path, dotted(path)) for path in modules())
+    }
+
+
+def room_arrows():
+    """Returns the imports between rooms, by short names."""
+    found = {short(room): set() for room in ROOMS}
+    for module, targets in arrows().items():
+        found[short(room_of(module))] |= {short(room_of(t)) for t in targets} - {short(room_of(module))}
+    return found
+
+
+def circle(graph):
+    """Returns the nodes of one circle of a graph {node: {node}}; empty where there is none."""
+    done, path = set(), []
+
+    def visit(node):
+        if node in path:
+            return path[path.index(node) :]
+        if node in done:
+            return []
+        path.append(node)
+        for target in sorted(graph.get(node, ())):
+            if found := visit(target):
+                return found
+        path.pop()
+        done.add(node)
+        return []
+
+    return next((found for node in sorted(graph) if (found := visit(node))), [])
 
 
 @pytest.mark.parametrize("path", modules(), ids=dotted)
-def test_every_import_is_an_arrow_of_the_design(path):
+def test_every_import_is_in_the_table(path):
     module = dotted(path)
-    wrong = [name for name in imports(ast.parse(path.read_text()), module) if forbidden(module, name)]
+    assert room_of(module) is not None, f"{module} is in no room of docs/architecture.md"
+    wrong = [name for name in imports(ast.parse(path.read_text()), module) if is_forbidden(module, name)]
     assert not wrong, f"{module} may not import {', '.join(wrong)}"
 
 
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("terrains.reef", "from twin.errors import TwinError"),
-        ("controllers.pilot", "import scenes"),
-        ("scenes.builder", "from twin import geometry"),
+        ("terrains.generate", "from twin.core import geometry"),
+        ("controllers.tracking", "import scenes"),
+        ("scenes.builder", "from twin.scenario import model"),
+        ("twin.core.links", "from twin.estimate import network"),
         ("twin.estimate.vision.f2f", "from twin.world import world"),
         ("twin.estimate.vision.f2f", "import twin.imaging.optics"),
-        ("twin.estimate.vision.f2f", "def f():\n    from scenes.gl import mujoco"),
-        ("twin.report.survey_page", "from twin.estimate import network"),
-        ("twin.imaging.optics", "from twin.simulate import vehicle"),
-        ("twin.simulate.vehicle", "from twin import imaging"),
-        ("twin.scenario.model", "import scenes"),
+        ("twin.estimate.vision.f2f", "from twin.estimate import network"),
+        ("twin.estimate.pipeline", "def f():\n    from scenes.gl import mujoco"),
+        ("twin.estimate.pipeline", "from twin.scenario.model import Scenario"),
+        ("twin.judge.metrics", "from twin.estimate import network"),
+        ("twin.judge.metrics", "from twin.report import wording"),
+        ("twin.imaging.optics", "from twin.simulate import mujoco_vehicle"),
+        ("twin.surrogate.vision", "from twin.study import search"),
+        ("twin.surrogate.vision", "from twin.surrogate_fit import fit"),
+        ("twin.study.search", "from twin.app import console"),
         ("twin.scenario.file", "from twin import survey"),
     ],
 )
-def test_an_arrow_that_the_design_does_not_have_is_found(module, line):
-    assert any(forbidden(module, name) for name in imports(ast.parse(line)))
+def test_an_import_that_the_table_does_not_allow_is_found(module, line):
+    assert any(is_forbidden(module, name) for name in imports(ast.parse(line)))
 
 
-def test_estimators_do_not_know_of_the_truth():
+def test_there_are_no_circles_between_modules_nor_between_rooms():
+    assert circle(arrows()) == []
+    assert circle(room_arrows()) == []
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
+
+
+def test_the_diagram_is_that_of_the_imports():
+    """Every arrow of the diagram is an import, and every import between rooms follows arrows of the diagram."""
+    drawn = {}
+    for start, end in re.findall(r"^    (\w+) --> (\w+)$", DOCUMENT, re.MULTILINE):
+        drawn.setdefault(start, set()).add(end)
+    real = {room: targets for room, targets in room_arrows().items() if room not in ("twin", "__main__")}
+    invented = {(a, b) for a, ends in drawn.items() for b in ends if b not in real[a]}
+    assert not invented, f"arrows without an import: {invented}"
+
+    def reached(room):
+        return {room}.union(*(reached(target) for target in drawn.get(room, ())))
+
+    missing = {(room, target) for room, targets in real.items() for target in targets - reached(room)}
+    assert not missing, f"imports without an arrow: {missing}"
+
+
+def test_estimators_do_not_use_the_truth():
     for path in (ROOT / "twin" / "estimate").rglob("*.py"):
         names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
-        assert not names & {"Truth", "Shot"}, f"{dotted(path)} uses the truth"
+        assert not names & {"Truth", "Mission", "World"}, f"{dotted(path)} uses the truth"
 
 
-def test_rerun_has_one_door():
+def test_the_estimators_load_neither_simulator_nor_scenario():
+    code = "import sys, twin.estimate; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    forbidden = ("mujoco", "OpenGL", "pydantic", "scenes", "terrains", "controllers", "twin.world", "twin.scenario")
+    assert [name for name in loaded if any(within(name, package) for package in forbidden)] == []
+
+
+def test_rerun_is_imported_by_one_module():
     importers = {
         dotted(path)
         for path in modules()
         if any(within(name, "rerun") for name in imports(ast.parse(path.read_text())))
     }
-    assert importers <= {"twin.report.recording"}
+    assert importers == {"twin.report.recording"}

@@ -1,4 +1,4 @@
-"""Map, consistency, control, overlap, requirements: closed forms, statistics, and surveys that broke off."""
+"""Map, consistency, control, overlap, requirements: closed forms, statistics, aborted surveys."""
 
 import copy
 import dataclasses
@@ -15,7 +15,7 @@ from twin.errors import TwinError
 from twin.judge.consistency import consistency_metrics, nees
 from twin.judge.control import control_metrics
 from twin.judge.map_error import map_metrics
-from twin.judge.metrics import check_require, evaluate, unflown
+from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
 from twin.judge.overlap import overlap_metrics
 from twin.judge.require import more_is_better, number_paths
 from twin.judge.swaths import leg_numbers, travel_direction
@@ -24,7 +24,7 @@ RESULT, ELEVATION, TRUTH, RIG = survey()
 
 
 def map_of(error: np.ndarray, sigma: float = 1.0) -> tuple[ElevationMap, Truth]:
-    """A map with the given errors over a flat truth that is seen everywhere."""
+    """Returns a map with the given errors, and a flat true floor that is observed everywhere."""
     grid = MapGrid(0, 0, 0.1, *error.shape)
     flat = np.full(error.shape, 2.0, np.float32)
     height = (flat + error).astype(np.float32)
@@ -35,13 +35,13 @@ def map_of(error: np.ndarray, sigma: float = 1.0) -> tuple[ElevationMap, Truth]:
 
 def test_percentiles_of_uniform_errors_have_their_closed_form():
     error = np.linspace(-1, 1, 100_001).reshape(1, -1)  # |e| is uniform on 0 to 1
-    figures = map_metrics(*map_of(error))
+    metrics = map_metrics(*map_of(error))
     expected = dict(p85_m=0.85, le90_m=0.90, le95_m=0.95, max_m=1, rmse_m=1 / np.sqrt(3), nmad_m=1.4826 / 2, bias_m=0)
     for key, value in expected.items():
-        assert figures[key] == pytest.approx(value, abs=2e-5), key
+        assert metrics[key] == pytest.approx(value, abs=2e-5), key
 
 
-def test_nmad_forgives_a_bias_and_rmse_does_not():
+def test_nmad_is_not_affected_by_a_bias_but_rmse_is():
     error = np.random.default_rng(0).normal(0, 0.02, (300, 300))
     plain, shifted = map_metrics(*map_of(error)), map_metrics(*map_of(error + 0.5))
     assert shifted["nmad_m"] == pytest.approx(plain["nmad_m"], rel=1e-4)
@@ -50,21 +50,21 @@ def test_nmad_forgives_a_bias_and_rmse_does_not():
     assert shifted["bias_m"] == pytest.approx(0.5, abs=1e-3)
 
 
-def test_sigma_ratio_is_one_where_sigma_tells_the_truth_and_scales_with_it():
+def test_sigma_ratio_is_one_for_the_right_sigma_and_inversely_proportional_to_it():
     error = np.random.default_rng(1).normal(0, 0.02, (300, 300))
     assert map_metrics(*map_of(error, sigma=0.02))["sigma_ratio"] == pytest.approx(1, rel=0.02)
     assert map_metrics(*map_of(error, sigma=0.01))["sigma_ratio"] == pytest.approx(2, rel=0.02)
 
 
-def test_completeness_counts_seen_cells_with_an_estimate_and_nothing_else():
+def test_completeness_is_the_share_of_seen_cells_with_an_estimate():
     error = np.zeros((10, 10))
     error[0, :7] = np.nan
     elevation, truth = map_of(error)
     truth.seen[5:] = False
-    elevation.height_m[9] = 99.0  # an estimate where nothing was seen: not judged
-    figures = map_metrics(elevation, truth)
-    assert figures["completeness"] == pytest.approx((50 - 7) / 50)
-    assert figures["max_m"] == 0
+    elevation.height_m[9] = 99.0  # an estimate in a cell that was not seen is not evaluated
+    metrics = map_metrics(elevation, truth)
+    assert metrics["completeness"] == pytest.approx((50 - 7) / 50)
+    assert metrics["max_m"] == 0
 
 
 def test_nees_of_errors_drawn_from_their_covariance_is_three():
@@ -75,27 +75,27 @@ def test_nees_of_errors_drawn_from_their_covariance_is_three():
     assert values.mean() == pytest.approx(3, abs=5 * np.sqrt(6 / 20_000))  # chi2 with 3 degrees: variance 6
 
 
-def gaussian_final(seed: int, spread: np.ndarray):
-    """The survey with final keyframes displaced in camera axes by normal errors, and the covariance that says so."""
+def gaussian_final(seed: int, sigma_m: np.ndarray):
+    """Returns the survey with normal errors of the final keyframes in camera axes and their true covariance."""
     rng = np.random.default_rng(seed)
     poses = TRUTH.trajectory.world_from_camera.copy()
     for frame in RESULT.keyframe_rows[1:]:
-        poses[frame] = poses[frame] @ geometry.pose(np.eye(3), rng.normal(0, spread))
+        poses[frame] = poses[frame] @ geometry.pose(np.eye(3), rng.normal(0, sigma_m))
     result = copy.copy(RESULT)
     result.final = Trajectory(TRUTH.trajectory.times_s, poses)
-    cov = np.diag(np.concatenate([[1e-6] * 3, spread**2]))
+    cov = np.diag(np.concatenate([[1e-6] * 3, sigma_m**2]))
     result.node_cov = np.tile(cov, (len(RESULT.keyframe_rows), 1, 1))
     return result
 
 
-def test_keyframe_consistency_is_judged_in_camera_axes_without_the_anchored_one():
-    spread = np.array([0.001, 0.03, 0.2])  # so unequal that wrong axes would show
-    figures = [consistency_metrics(gaussian_final(k, spread), None, TRUTH) for k in range(8)]
+def test_keyframe_consistency_uses_camera_axes_and_leaves_out_the_anchored_keyframe():
+    sigma_m = np.array([0.001, 0.03, 0.2])  # unequal, to detect wrong axes
+    metrics = [consistency_metrics(gaussian_final(k, sigma_m), None, TRUTH) for k in range(8)]
     n = 8 * (len(RESULT.keyframe_rows) - 1)
-    assert np.mean([f["nees_position_mean"] for f in figures]) == pytest.approx(3, abs=4 * np.sqrt(6 / n))
-    share = np.mean([f["within_2sigma_position"] for f in figures])
+    assert np.mean([f["nees_position_mean"] for f in metrics]) == pytest.approx(3, abs=4 * np.sqrt(6 / n))
+    share = np.mean([f["within_2sigma_position"] for f in metrics])
     assert share == pytest.approx(0.9545, abs=4 * np.sqrt(0.9545 * 0.0455 / (3 * n)))
-    assert figures[0]["within_2sigma_map"] is None
+    assert metrics[0]["within_2sigma_map"] is None
 
 
 def test_keyframes_without_a_covariance_are_left_out_of_consistency():
@@ -107,7 +107,7 @@ def test_keyframes_without_a_covariance_are_left_out_of_consistency():
     assert consistency_metrics(result, None, TRUTH)["nees_position_mean"] is None
 
 
-def test_control_errors_are_taken_across_the_direction_of_travel():
+def test_cross_track_error_is_perpendicular_to_the_direction_of_travel():
     diagonal = np.array([1.0, 1.0]) / np.sqrt(2)
     n = 100
     reference = np.column_stack([np.outer(np.arange(n) * 0.1, diagonal), np.full(n, 2.0)])
@@ -120,13 +120,13 @@ def test_control_errors_are_taken_across_the_direction_of_travel():
     truth = dataclasses.replace(
         TRUTH, trajectory=Trajectory(np.arange(n) * 1.0, poses), reference=reference, holding=holding
     )
-    figures = control_metrics(truth)
-    assert figures["cross_track_rmse_m"] == pytest.approx(0.03)
-    assert figures["station_keeping_rmse_m"] == pytest.approx(0.5)
-    assert figures["altitude_rmse_m"] == pytest.approx(np.sqrt((80 * 0.04**2 + 20 * 0.4**2) / 100))
+    metrics = control_metrics(truth)
+    assert metrics["cross_track_rmse_m"] == pytest.approx(0.03)
+    assert metrics["station_keeping_rmse_m"] == pytest.approx(0.5)
+    assert metrics["altitude_rmse_m"] == pytest.approx(np.sqrt((80 * 0.04**2 + 20 * 0.4**2) / 100))
 
 
-def test_legs_are_told_from_short_segments_and_holds():
+def test_leg_numbers_exclude_short_segments_and_station_keeping():
     legs = leg_numbers(TRUTH.reference)
     assert legs.max() == 3
     on_leg = TRUTH.reference[legs == 1]
@@ -134,32 +134,32 @@ def test_legs_are_told_from_short_segments_and_holds():
     np.testing.assert_allclose(np.linalg.norm(travel_direction(TRUTH.reference), axis=1), 1)
 
 
-def test_overlap_over_a_flat_floor_is_the_planned_geometry():
+def test_overlap_over_a_flat_floor_follows_from_the_planned_geometry():
     times, reference = TRUTH.trajectory.times_s, TRUTH.reference
     poses = np.tile(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), (len(times), 1, 1))
     poses[:, :3, 3] = reference
     flat = dataclasses.replace(TRUTH, trajectory=Trajectory(times, poses), height_m=np.full_like(TRUTH.height_m, 0.2))
-    figures = overlap_metrics(RESULT, flat, RIG, ELEVATION.grid, {"overlap_along": 0.9, "overlap_across": 0.8})
+    metrics = overlap_metrics(RESULT, flat, RIG, ELEVATION.grid, {"overlap_along": 0.9, "overlap_across": 0.8})
     depth = 2.0
     step = np.median(np.linalg.norm(np.diff(reference[RESULT.keyframe_rows], axis=0), axis=1))
-    assert figures["along_median"] == pytest.approx(1 - step / (RIG.height_px * depth / RIG.focal_px), abs=1e-6)
-    # the reference reaches the next leg's line to within one step (2.5 cm)
-    assert figures["across_median"] == pytest.approx(1 - 0.5 / (RIG.width_px * depth / RIG.focal_px), abs=0.012)
-    assert (figures["along_planned"], figures["across_planned"]) == (0.9, 0.8)
+    assert metrics["along_median"] == pytest.approx(1 - step / (RIG.height_px * depth / RIG.focal_px), abs=1e-6)
+    # the reference reaches the line of the next leg with an accuracy of one step (2.5 cm)
+    assert metrics["across_median"] == pytest.approx(1 - 0.5 / (RIG.width_px * depth / RIG.focal_px), abs=0.012)
+    assert (metrics["along_planned"], metrics["across_planned"]) == (0.9, 0.8)
 
 
-def test_overlap_is_lost_where_the_floor_rises():
+def test_overlap_decreases_where_the_floor_rises():
     high = dataclasses.replace(TRUTH, height_m=TRUTH.height_m + 1.0)
     low, raised = (overlap_metrics(RESULT, t, RIG, ELEVATION.grid, {}) for t in (TRUTH, high))
     assert raised["across_median"] < low["across_median"] - 0.1
     assert raised["along_median"] < low["along_median"] - 0.05
 
 
-def diagonal_swaths(apart_m):
-    """A survey of two straight swaths to the north-east over a flat floor, beside each other; its truth and result."""
-    n, ahead, abeam = 21, np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([-1.0, 1.0, 0.0]) / np.sqrt(2)
+def diagonal_swaths(spacing_m):
+    """Returns truth and result of a survey of two parallel straight swaths to the north-east over a flat floor."""
+    n, ahead, port = 21, np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([-1.0, 1.0, 0.0]) / np.sqrt(2)
     first = np.outer(np.arange(n) * 0.1, ahead) + [0, 0, 2.2]
-    reference = np.concatenate([first, first + apart_m * abeam])
+    reference = np.concatenate([first, first + spacing_m * port])
     poses = np.tile(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), (2 * n, 1, 1))
     poses[:, :3, 3] = reference
     truth = dataclasses.replace(
@@ -169,19 +169,19 @@ def diagonal_swaths(apart_m):
     return truth, dataclasses.replace(RESULT, keyframe_rows=np.arange(2 * n), track_of_keyframe=truth.track)
 
 
-def test_overlap_of_loops_is_counted_square_to_their_travel_in_any_direction():
+def test_sidelap_of_loops_is_perpendicular_to_the_direction_of_travel():
     truth, result = diagonal_swaths(0.3)
-    figures = overlap_metrics(result, truth, RIG, None, {"pattern": "loops"})
+    metrics = overlap_metrics(result, truth, RIG, None, {"pattern": "loops"})
     length, width = RIG.height_px * 2.0 / RIG.focal_px, RIG.width_px * 2.0 / RIG.focal_px
 
-    def shared(step):
+    def shared_area(step):
         return (1 - step / np.sqrt(2) / length) * (1 - step / np.sqrt(2) / width)
 
-    assert figures["across_median"] == pytest.approx(shared(0.3), abs=1e-6)
-    assert figures["along_median"] == pytest.approx(shared(0.1), abs=1e-6)
+    assert metrics["across_median"] == pytest.approx(shared_area(0.3), abs=1e-6)
+    assert metrics["along_median"] == pytest.approx(shared_area(0.1), abs=1e-6)
 
 
-def test_the_far_end_of_a_track_is_where_it_is_planned_farthest_from_the_start():
+def test_the_far_end_of_a_track_is_farthest_from_the_start_as_planned():
     poses = TRUTH.trajectory.world_from_camera.copy()
     away = np.linalg.norm(TRUTH.reference - TRUTH.reference[0], axis=1)
     for track, error in ((1, 0.03), (2, 0.07)):
@@ -196,16 +196,15 @@ def test_the_far_end_of_a_track_is_where_it_is_planned_farthest_from_the_start()
 
 
 def test_requirements_bound_errors_from_above_and_quality_from_below():
-    metrics = evaluate(
-        RESULT, ELEVATION, TRUTH, RIG, {}, {}, {}, {"map.le90_m": 0.05, "map.completeness": 1.0, "map.max_m": 1e-9}
-    )
+    require = {"map.le90_m": 0.05, "map.completeness": 1.0, "map.max_m": 1e-9}
+    metrics = evaluate(EvaluationInput(RESULT, ELEVATION, TRUTH, RIG, require=require))
     verdicts = {name: row["passed"] for name, row in metrics["require"].items()}
     assert verdicts == {"map.le90_m": True, "map.completeness": False, "map.max_m": False}
     assert more_is_better("overlap.across_p05") and not more_is_better("timing.wall_s")
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("map.le9_m", "did you mean .*map.le90_m"),
         ("flags", "no such metric"),
@@ -214,24 +213,24 @@ def test_requirements_bound_errors_from_above_and_quality_from_below():
         ("tracks.0.ga_ms", "no such metric"),
     ],
 )
-def test_an_unknown_requirement_is_refused_by_name(name, says):
-    with pytest.raises(TwinError, match=says) as caught:
+def test_an_unknown_requirement_is_rejected_by_name(name, message):
+    with pytest.raises(TwinError, match=message) as caught:
         check_require({name: 1.0})
     assert caught.value.field == f"require.{name}"
 
 
-def test_a_survey_that_broke_off_still_has_every_key_and_no_nan():
+def test_an_aborted_survey_has_every_key_and_no_nan():
     whole = evaluated(RESULT, ELEVATION, TRUTH, RIG)
     for n_frames, n_keyframes in [(0, 0), (1, 0), (1, 1), (2, 1), (9, 2), (8, 2)]:
-        part = evaluate(*broken_off(n_frames, n_keyframes), RIG, {}, {}, {"status": "aborted"}, SCENARIO.require)
+        part = evaluate(aborted(n_frames, n_keyframes))
         json.dumps(part, allow_nan=False)
         assert set(number_paths(part)) >= {p for p in number_paths(whole) if not p.startswith("timing.stages")}
         assert part["map"]["rmse_m"] is None and part["require"]["map.le90_m"]["passed"] is False
-    assert set(number_paths(unflown())) == {p for p in number_paths(whole) if not p.startswith("require.")}
+    assert set(number_paths(empty_metrics())) == {p for p in number_paths(whole) if not p.startswith("require.")}
 
 
-def broken_off(n_frames: int, n_keyframes: int):
-    """The survey as far as it got, without a map and before any alignment."""
+def aborted(n_frames: int, n_keyframes: int) -> EvaluationInput:
+    """Returns the survey aborted after some frames, without a map and before any alignment."""
     cut = {k: Trajectory(t.times_s[:n_frames], t.world_from_camera[:n_frames]) for k, t in vars(RESULT).items()
            if isinstance(t, Trajectory)}  # fmt: skip
     result = dataclasses.replace(
@@ -245,22 +244,23 @@ def broken_off(n_frames: int, n_keyframes: int):
         reference=TRUTH.reference[:n_frames], holding=TRUTH.holding[:n_frames], track=TRUTH.track[:n_frames],
         seen=np.zeros_like(TRUTH.seen),
     )  # fmt: skip
-    return result, None, truth
+    return EvaluationInput(result, None, truth, RIG, identity={"status": "aborted"}, require=SCENARIO.require)
 
 
-def test_what_comes_in_from_outside_cannot_bring_nan_into_the_json():
+def test_inputs_that_are_not_finite_become_none():
     timing = {
         "wall_s": np.nan,
         "simulated_s": np.float32(3),
         "stages": {"ga": {"mean_ms": np.inf, "count": np.int64(2)}},
     }
-    figures = evaluate(RESULT, ELEVATION, TRUTH, RIG, {}, timing, {"seed": np.int64(7)})
-    json.dumps(figures, allow_nan=False)
-    assert figures["seed"] == 7 and figures["timing"]["stages"]["ga"] == {"mean_ms": None, "count": 2}
-    assert figures["timing"]["wall_s"] is None and figures["timing"]["simulated_s"] == 3
+    identity = {"seed": np.int64(7)}
+    metrics = evaluate(EvaluationInput(RESULT, ELEVATION, TRUTH, RIG, timing=timing, identity=identity))
+    json.dumps(metrics, allow_nan=False)
+    assert metrics["seed"] == 7 and metrics["timing"]["stages"]["ga"] == {"mean_ms": None, "count": 2}
+    assert metrics["timing"]["wall_s"] is None and metrics["timing"]["simulated_s"] == 3
 
 
-def test_a_map_without_a_single_estimate_is_judged_as_empty_not_as_nan():
+def test_a_map_without_estimates_has_completeness_zero_and_no_nan():
     empty = dataclasses.replace(ELEVATION, height_m=np.full_like(ELEVATION.height_m, np.nan))
-    figures = evaluate(RESULT, empty, TRUTH, RIG, {}, {}, {})["map"]
-    assert figures["completeness"] == 0 and figures["rmse_m"] is None and figures["max_m"] is None
+    metrics = evaluate(EvaluationInput(RESULT, empty, TRUTH, RIG))["map"]
+    assert metrics["completeness"] == 0 and metrics["rmse_m"] is None and metrics["max_m"] is None

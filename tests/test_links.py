@@ -1,10 +1,10 @@
-"""Rows that grow, and links by columns."""
+"""Growing arrays, and links stored as columns."""
 
 import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.core.growing_array import Rows
+from twin.core.growing_array import GrowingArray
 from twin.core.links import Link, Links
 
 
@@ -16,55 +16,55 @@ def some_links(n):
         yield Link(k, k + 2, motion, root @ root.T + np.eye(6) * 1e-4, 0.1 * k, 10 * k, 1 + k % 4, exact)
 
 
-def assert_same(found, expected):
-    assert (found.i, found.j, found.n_points, found.shared_by) == expected[:2] + expected[5:7]
-    assert found.overlap == expected.overlap
+def assert_same(link, expected):
+    assert (link.i, link.j, link.n_points, link.shared_by) == expected[:2] + expected[5:7]
+    assert link.overlap == expected.overlap
     for name in ("i_from_j", "cov", "own_cov"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9)
-    assert (found.closed_form is None) == (expected.closed_form is None)
+        np.testing.assert_allclose(getattr(link, name), getattr(expected, name), rtol=1e-9)
+    assert (link.closed_form is None) == (expected.closed_form is None)
     if expected.closed_form is not None:
-        np.testing.assert_array_equal(found.closed_form, expected.closed_form)
+        np.testing.assert_array_equal(link.closed_form, expected.closed_form)
 
 
-def test_rows_stay_when_their_room_grows():
+def test_rows_are_unchanged_when_the_capacity_grows():
     numbers = np.arange(6.0).reshape(3, 2)
-    rows = Rows.of(numbers[:1].copy())
+    rows = GrowingArray.wrap(numbers[:1].copy())
     for row in numbers[1:]:
-        rows.add(row)
-    rows.add(10 + numbers)
+        rows.append(row)
+    rows.append(10 + numbers)
     np.testing.assert_array_equal(rows.array, np.concatenate([numbers, 10 + numbers]))
 
 
-def test_links_come_back_one_by_one_and_by_columns():
+def test_links_are_returned_unchanged_one_by_one_and_as_columns():
     given = list(some_links(7))
     links = Links(given[:2])
     assert links.i.tolist() == [0, 1]
     links.add(given[2:5])
     links.add(given[5:])
     assert len(links) == 7
-    for found, expected in zip(links, given, strict=True):
-        assert_same(found, expected)
-    assert [link.i for link in links[-2:]] == [5, 6]
+    for link, expected in zip(links, given, strict=True):
+        assert_same(link, expected)
+    assert [last.i for last in links[-2:]] == [5, 6]
     assert links.j.tolist() == [link.j for link in given]
     np.testing.assert_allclose(links.information @ links.cov, np.tile(np.eye(6), (7, 1, 1)), atol=1e-9)
     np.testing.assert_allclose(links.own_cov, [link.own_cov for link in given], rtol=1e-9)
 
 
-def test_links_of_a_mask_keep_all_that_is_said_of_them_and_leave_the_others():
+def test_selected_links_keep_all_their_fields_and_the_original_is_unchanged():
     given, mask = list(some_links(9)), np.arange(9) % 2 == 0
     links = Links(given)
-    kept = links.kept(mask)
-    for found, expected in zip(kept, given[::2], strict=True):
-        assert_same(found, expected)
-    kept.add(given[1:2])
-    assert kept.i.tolist() == [0, 2, 4, 6, 8, 1] and len(links) == 9
+    selected = links.select(mask)
+    for link, expected in zip(selected, given[::2], strict=True):
+        assert_same(link, expected)
+    selected.add(given[1:2])
+    assert selected.i.tolist() == [0, 2, 4, 6, 8, 1] and len(links) == 9
     closed, forms = Links(given).by_closed_form
     assert closed.tolist() == [k % 3 != 0 for k in range(9)]
     np.testing.assert_array_equal(forms, [link.closed_form for link in given if link.closed_form is not None])
 
 
-def test_no_links_have_empty_columns():
-    none = Links().kept(np.zeros(0, bool))
+def test_an_empty_selection_has_empty_columns():
+    none = Links().select(np.zeros(0, bool))
     assert len(none) == 0 and none.cov.shape == none.own_cov.shape == (0, 6, 6) and none.i_from_j.shape == (0, 4, 4)
     with pytest.raises(IndexError):
         none[0]

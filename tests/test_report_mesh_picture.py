@@ -1,4 +1,4 @@
-"""The picture of the map's surface: its colours, its frame, and none where it cannot be drawn."""
+"""Oblique picture of the map: colours, framing, and no picture if rendering fails."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ ASPECT = mesh_picture.WIDTH_PX / mesh_picture.HEIGHT_PX
 
 
 def write_surface(file: Path, height_m: np.ndarray) -> Path:
-    """A map that is red in the west and green in the east."""
+    """Writes the mesh of a map that is red in the west and green in the east."""
     colours = np.zeros((*height_m.shape, 3), np.uint8)
     colours[:, :40, 0], colours[:, 40:, 1] = 200, 200
     mesh.write_glb(file, ElevationMap(GRID, height_m.astype(np.float32), np.full_like(height_m, 0.01), colours))
     return file
 
 
-def test_the_surface_shows_the_mosaics_colours_with_west_on_the_left(tmp_path):
+def test_the_picture_has_the_colours_of_the_mosaic_with_west_on_the_left(tmp_path):
     picture = mesh_picture.surface_picture(write_surface(tmp_path / "mesh.glb", np.zeros((60, 80))))
     assert picture is not None
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
@@ -36,29 +36,30 @@ def test_the_surface_shows_the_mosaics_colours_with_west_on_the_left(tmp_path):
     assert np.average(columns, weights=west.sum(axis=0)) < np.average(columns, weights=east.sum(axis=0)) - 200
 
 
-def test_the_north_west_side_of_a_rise_is_the_brighter_one():
+def test_slopes_facing_north_west_are_brighter():
     white = np.full((2, 3), 200, np.uint8)
-    towards = np.array([[-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]]) / np.sqrt(3)  # east, up, south
-    bright, dark = mesh_picture.lit(white, towards)[:, 0].astype(int)
+    normals = np.array([[-1.0, 1.0, -1.0], [1.0, 1.0, 1.0]]) / np.sqrt(3)  # east, up, south
+    bright, dark = mesh_picture.shaded_colours(white, normals)[:, 0].astype(int)
     assert bright > dark + 60
 
 
 @pytest.mark.parametrize("shape", [(4.0, 0.3, 1.0), (0.5, 2.0, 6.0), (3.0, 0.0, 3.0)])
-def test_the_eye_sees_all_and_stands_no_farther_than_it_must(shape):
+def test_the_camera_has_all_points_in_view_at_the_smallest_distance(shape):
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3)) * shape + [7.0, -2.0, 30.0]
     low, high = np.percentile(points, mesh_picture.FRAMED_PERCENT, axis=0)
-    seen = geometry.transform(geometry.inverse(mesh_picture.eye(points)), np.clip(points, low, high))
+    in_camera = geometry.transform(geometry.inverse(mesh_picture.camera_pose(points)), np.clip(points, low, high))
     tangents = np.tan(np.deg2rad(mesh_picture.VFOV_DEG) / 2) * np.array([ASPECT, 1.0])
-    reach = (np.abs(seen[:, :2]) / -seen[:, 2:] / tangents).max()
-    assert seen[:, 2].max() < 0 and 0.9 < reach < 1
+    extent = (np.abs(in_camera[:, :2]) / -in_camera[:, 2:] / tangents).max()
+    assert in_camera[:, 2].max() < 0 and 0.9 < extent < 1
 
 
-def test_a_wild_height_does_not_shrink_the_rest(tmp_path):
+def test_an_outlier_of_the_height_does_not_change_the_scale(tmp_path):
     height = np.zeros((60, 80))
     height[30, 40] = -9.0
-    tame = mesh_picture.surface_picture(write_surface(tmp_path / "tame.glb", np.zeros((60, 80))))
-    wild = mesh_picture.surface_picture(write_surface(tmp_path / "wild.glb", height))
-    assert tame is not None and wild is not None and wild.shape[1] == pytest.approx(tame.shape[1], abs=3)
+    plain = mesh_picture.surface_picture(write_surface(tmp_path / "plain.glb", np.zeros((60, 80))))
+    outlier = mesh_picture.surface_picture(write_surface(tmp_path / "outlier.glb", height))
+    assert plain is not None and outlier is not None
+    assert outlier.shape[1] == pytest.approx(plain.shape[1], abs=3)
 
 
 def test_the_report_shows_the_surface(tmp_path):
@@ -67,16 +68,16 @@ def test_the_report_shows_the_surface(tmp_path):
     assert '<section id="surface">' in write_report(folder).read_text()
 
 
-def test_the_report_does_without_where_nothing_draws(tmp_path, monkeypatch):
+def test_the_report_has_no_picture_if_rendering_fails(tmp_path, monkeypatch):
     write_surface(tmp_path / "mesh.glb", np.zeros((60, 80)))
     (tmp_path / "scenario.resolved.toml").write_text("")
-    monkeypatch.setenv("PYOPENGL_PLATFORM", "none such")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "no such platform")
     page = write_report(tmp_path).read_text()
     assert "unfinished" in page and 'id="surface"' not in page
 
 
-def test_what_cannot_be_drawn_is_no_picture(tmp_path, monkeypatch):
-    (tmp_path / "broken.glb").write_bytes(b"no mesh")
+def test_missing_damaged_and_empty_meshes_give_no_picture(tmp_path, monkeypatch):
+    (tmp_path / "broken.glb").write_bytes(b"not a mesh")
     write_surface(tmp_path / "empty.glb", np.full((60, 80), np.nan))
     for name in ("missing.glb", "broken.glb", "empty.glb"):
         assert mesh_picture.surface_picture(tmp_path / name) is None

@@ -1,4 +1,4 @@
-"""The recording: read back, it has every entity on both timelines, and stays small."""
+"""Rerun recording: it has every entity on both timelines and stays small."""
 
 import time
 
@@ -12,8 +12,7 @@ from rerun.chunk import RrdReader
 from twin.core import geometry
 from twin.core.records import Estimate, Frame, MapGrid, Readings
 from twin.errors import TwinError
-from twin.report import recording as view
-from twin.report import recording_surfaces
+from twin.report import recording, recording_surfaces
 from twin.report.images import jpeg_bytes
 from twin.report.run_folder import Raster, load_run
 
@@ -22,68 +21,68 @@ ERRORS = {f"/error/{what}/{name}" for what in ("position", "height", "heading") 
 
 
 def contents(file) -> dict[str, tuple[set[str], int]]:
-    """Timelines and rows of every entity of a recording."""
-    found: dict[str, tuple[set[str], int]] = {}
+    """Returns timelines and number of rows of every entity of a recording."""
+    entities: dict[str, tuple[set[str], int]] = {}
     for chunk in RrdReader(str(file)).stream():
-        lines, rows = found.get(str(chunk.entity_path), (set(), 0))
-        found[str(chunk.entity_path)] = (lines | set(chunk.timeline_names), rows + chunk.num_rows)
-    return found
+        lines, rows = entities.get(str(chunk.entity_path), (set(), 0))
+        entities[str(chunk.entity_path)] = (lines | set(chunk.timeline_names), rows + chunk.num_rows)
+    return entities
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write_folder(tmp_path_factory.mktemp("view") / "run")
+    return write_folder(tmp_path_factory.mktemp("recording") / "run")
 
 
 def test_the_recording_holds_the_whole_survey_on_both_timelines(folder):
     start = time.perf_counter()
-    file = view.write_recording(folder)
+    file = recording.write_recording(folder)
     assert time.perf_counter() - start < 10
     assert file == folder / "run.rrd" and file.stat().st_size < 10_000_000
-    found = contents(file)
+    entities = contents(file)
     expected = PATHS | ERRORS | {"/world", "/world/true_floor", "/world/network", "/world/rig", "/mosaic", "/summary"}
     expected |= {"/world/rig/left", "/world/rig/right", "/timing/f2f", "/timing/stereo", "/timing/ga"}
-    assert expected <= set(found)
-    assert sum(entity.startswith("/world/map/") for entity in found) > 10
+    assert expected <= set(entities)
+    assert sum(entity.startswith("/world/map/") for entity in entities) > 10
     static = {"/world", "/world/true_floor", "/world/path/reference", "/mosaic", "/summary"}
     for entity in expected - static:
-        assert {"frame", "sim_time"} <= found[entity][0], entity
-    assert found["/world/rig"][1] == 720
-    assert found["/world/rig/left"][1] == 87 + 1  # images and the pinhole
+        assert {"frame", "sim_time"} <= entities[entity][0], entity
+    assert entities["/world/rig"][1] == 720
+    assert entities["/world/rig/left"][1] == 87 + 1  # images and the camera model
 
 
-def test_an_unfinished_run_still_gives_a_recording(tmp_path):
-    found = contents(view.write_recording(write_folder(tmp_path / "run", finished=False)))
-    assert {"/world/path/truth", "/world/path/online", "/world/rig/left", "/summary"} <= set(found)
-    assert "/world/path/final" not in found and "/mosaic" not in found
+def test_an_unfinished_run_has_a_recording(tmp_path):
+    entities = contents(recording.write_recording(write_folder(tmp_path / "run", finished=False)))
+    assert {"/world/path/truth", "/world/path/online", "/world/rig/left", "/summary"} <= set(entities)
+    assert "/world/path/final" not in entities and "/mosaic" not in entities
 
 
-def test_a_run_that_has_hardly_begun_gives_a_recording(tmp_path):
+def test_a_run_without_results_has_a_recording(tmp_path):
     (tmp_path / "scenario.resolved.toml").write_text("")
-    assert "/summary" in contents(view.write_recording(tmp_path))
+    assert "/summary" in contents(recording.write_recording(tmp_path))
 
 
-def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(TwinError, match="is no run folder"):
-        view.write_recording(tmp_path)
-    with pytest.raises(TwinError, match="is no run folder"):
-        view.open_viewer(tmp_path)
+def test_a_folder_that_is_not_a_run_is_rejected(tmp_path):
+    with pytest.raises(TwinError, match="is not a run folder"):
+        recording.write_recording(tmp_path)
+    with pytest.raises(TwinError, match="is not a run folder"):
+        recording.open_viewer(tmp_path)
 
 
-def test_every_triangle_of_the_map_appears_once_and_no_hole_is_bridged(folder):
+def test_every_triangle_of_the_map_appears_once_and_none_covers_a_hole(folder):
     run = load_run(folder)
     surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters["mosaic"])
     assert np.isfinite(surface.points[surface.triangles]).all()
     poses = run.trajectories["final"].world_from_camera[run.keyframes.frames]
-    stage = recording_surfaces.first_seen(surface.points, [poses[:40], poses[40:]], SCENARIO.believed_rig())
-    pieces = [recording_surfaces.piece(surface, stage, number) for number in (0, 1)]
-    shown = np.concatenate([piece.points[piece.triangles].reshape(-1, 9) for piece in pieces])
-    whole = surface.points[surface.triangles[(stage[surface.triangles] < 2).all(axis=1)]].reshape(-1, 9)
+    group = recording_surfaces.first_observed(surface.points, [poses[:40], poses[40:]], SCENARIO.believed_rig())
+    parts = [recording_surfaces.submesh(surface, group, number) for number in (0, 1)]
+    shown = np.concatenate([part.points[part.triangles].reshape(-1, 9) for part in parts])
+    whole = surface.points[surface.triangles[(group[surface.triangles] < 2).all(axis=1)]].reshape(-1, 9)
     assert len(shown) == len(whole) > 10_000
     np.testing.assert_array_equal(shown[np.lexsort(shown.T)], whole[np.lexsort(whole.T)])
 
 
-def test_triangles_face_up():
+def test_triangles_face_upwards():
     height = np.random.default_rng(0).normal(0, 0.1, (8, 9))
     surface = recording_surfaces.floor_surface(Raster(MapGrid(0, 0, 0.5, 8, 9), height))
     a, b, c = np.moveaxis(surface.points[surface.triangles], 1, 0)
@@ -92,14 +91,14 @@ def test_triangles_face_up():
     assert (surface.normals[:, 2] > 0).all()
 
 
-def test_a_point_is_first_seen_when_it_enters_an_image():
+def test_a_point_belongs_to_the_first_group_that_has_it_in_an_image():
     rig = SCENARIO.believed_rig()
     down = [geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([x, 0.0, 2.0])) for x in (0.0, 5.0)]
     half_along = 2.0 * rig.height_px / 2 / rig.focal_px
     x = np.array([0.0, half_along - 0.01, half_along + 0.01, 5.0, np.nan])
     points = np.column_stack([x, np.zeros((5, 2))])
-    stages = recording_surfaces.first_seen(points, [np.array(down[:1]), np.array(down[1:])], rig)
-    np.testing.assert_array_equal(stages, [0, 0, recording_surfaces.NEVER, 1, recording_surfaces.NEVER])
+    groups = recording_surfaces.first_observed(points, [np.array(down[:1]), np.array(down[1:])], rig)
+    np.testing.assert_array_equal(groups, [0, 0, recording_surfaces.NOT_OBSERVED, 1, recording_surfaces.NOT_OBSERVED])
 
 
 def test_images_keep_their_colours_in_the_recording():
@@ -110,19 +109,19 @@ def test_images_keep_their_colours_in_the_recording():
     np.testing.assert_allclose(shown.mean(axis=(0, 1)), [200, 100, 30], atol=4)
 
 
-def test_the_live_view_shows_frames_as_they_come(tmp_path):
+def test_the_live_viewer_logs_every_frame_and_the_path_at_keyframes(tmp_path):
     _, _, truth, rig = survey()
-    recording = rr.RecordingStream("live_test")
-    recording.save(tmp_path / "live.rrd")
-    live = view.Live(rig, recording)
+    stream = rr.RecordingStream("live_test")
+    stream.save(tmp_path / "live.rrd")
+    viewer = recording.LiveViewer(rig, stream)
     image = np.zeros((rig.height_px, rig.width_px, 3), np.uint8)
     for k in range(6):
         pose = truth.trajectory.world_from_camera[k]
         right = image if k % 3 == 0 else None
         estimate = Estimate(k / 30, pose, pose, np.zeros(6), 0.01, "ok")
-        live.log_frame(Frame(k, k / 30, image, right, Readings()), estimate)
-    recording.flush()
-    recording.disconnect()
-    found = contents(tmp_path / "live.rrd")
-    assert found["/world/rig"][1] == 6 and found["/world/path/online"][1] == 2
-    assert {"frame", "sim_time"} <= found["/world/rig"][0]
+        viewer.log_frame(Frame(k, k / 30, image, right, Readings()), estimate)
+    stream.flush()
+    stream.disconnect()
+    entities = contents(tmp_path / "live.rrd")
+    assert entities["/world/rig"][1] == 6 and entities["/world/path/online"][1] == 2
+    assert {"frame", "sim_time"} <= entities["/world/rig"][0]

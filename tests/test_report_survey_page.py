@@ -1,4 +1,4 @@
-"""The report: self-contained, drawn from the run folder alone, readable for what is unfinished."""
+"""Survey report: self-contained, made from the run folder alone, also for unfinished runs."""
 
 import base64
 import json
@@ -11,24 +11,24 @@ from judge_synthetic import SCENARIO, write_folder
 
 from twin.core.records import Trajectory
 from twin.errors import TwinError
-from twin.judge.budget import budget
-from twin.judge.stages import stage_rows
+from twin.judge.budget import stage_times
 from twin.report import figures, wording
 from twin.report.run_folder import load_run
-from twin.report.survey_page import sample_photos, write_report
+from twin.report.stage_table import stage_rows
+from twin.report.survey_page import sample_images, write_report
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write_folder(tmp_path_factory.mktemp("whole") / "run")
+    return write_folder(tmp_path_factory.mktemp("complete") / "run")
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory):
-    return write_folder(tmp_path_factory.mktemp("part") / "run", finished=False)
+def unfinished(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("unfinished") / "run", finished=False)
 
 
-def test_a_run_folder_is_read_back_as_it_was_written(folder):
+def test_a_written_run_folder_is_read_back(folder):
     run = load_run(folder)
     assert run.finished and set(run.trajectories) == {"truth", "f2f", "online", "final", "reference"}
     assert len(run.network.positions) == len(run.keyframes.frames) == 87
@@ -36,10 +36,10 @@ def test_a_run_folder_is_read_back_as_it_was_written(folder):
     dem = run.rasters["dem"]
     assert (dem.grid.west_m, dem.grid.north_m, dem.grid.cell_m) == (-2.5, 1.5, pytest.approx(0.02))
     assert np.isnan(dem.values[44, 65]) and run.rasters["mosaic"].values.shape == (150, 250, 3)
-    assert run.imaged_frames() == run.keyframes.frames.tolist()
+    assert run.frames_with_image() == run.keyframes.frames.tolist()
 
 
-def test_the_report_needs_nothing_but_itself(folder):
+def test_the_report_is_self_contained(folder):
     page = write_report(folder).read_text()
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert len(sources) > 8 + 1 + 2
@@ -48,14 +48,14 @@ def test_the_report_needs_nothing_but_itself(folder):
     assert len(page) < 5_000_000
 
 
-def test_the_headline_bewares_of_what_metrics_json_warns_of_and_of_nothing_else(folder):
+def test_the_headline_contains_the_warning_of_the_metrics(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert "Beware" not in wording.headline(metrics | {"warning": ""}, load_run(folder).scenario)
+    assert "Warning" not in wording.headline(metrics | {"warning": ""}, load_run(folder).scenario)
     warned = wording.headline(metrics | {"warning": "surrogate: too murky"}, load_run(folder).scenario)
-    assert warned.endswith("Beware: surrogate: too murky.")
+    assert warned.endswith("Warning: surrogate: too murky.")
 
 
-def test_the_report_tells_the_figures_of_metrics_json(folder):
+def test_the_report_contains_the_values_of_the_metrics(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
     page = write_report(folder).read_text()
     assert "The survey is complete" in page and "Jerlov type IB" in page
@@ -64,28 +64,27 @@ def test_the_report_tells_the_figures_of_metrics_json(folder):
     for row in metrics["tracks"]:
         assert f"<td>{wording.length(row['farthest_error_m'])}</td>" in page
     assert '<td class="good">passed</td>' in page.replace("\n", "")
-    for where in ("along", "across"):
-        assert f"<td>{metrics['links'][where]['count']}</td>" in page
+    for direction in ("along", "across"):
+        assert f"<td>{metrics['links'][direction]['count']}</td>" in page
     for stage in metrics["stages"].values():
         assert f"<td>{wording.length(stage['ate_rmse_m'])}</td>" in page
-    for (
-        section
-    ) in "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing".split():
+    sections = "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing terms"
+    for section in sections.split():
         assert f'<section id="{section}">' in page, section
 
 
-def test_metrics_may_be_handed_in_before_they_are_on_disk(folder, tmp_path):
+def test_the_report_uses_metrics_that_are_not_written_yet(folder, tmp_path):
     metrics = json.loads((folder / "metrics.json").read_text()) | {"status": "aborted", "reason": "disk <full>"}
-    assert "broke off (disk &lt;full&gt;)" in write_report(folder, metrics).read_text()
+    assert "aborted (disk &lt;full&gt;)" in write_report(folder, metrics).read_text()
 
 
-def test_an_unfinished_run_still_has_a_report_that_says_so(part):
-    page = write_report(part).read_text()
+def test_the_report_of_an_unfinished_run_is_marked_as_unfinished(unfinished):
+    page = write_report(unfinished).read_text()
     assert "unfinished" in page
     assert '<section id="plan_view">' in page and '<section id="elevation">' not in page
 
 
-def test_a_run_that_has_hardly_begun_still_has_a_report(tmp_path):
+def test_a_run_without_results_has_a_report(tmp_path):
     (tmp_path / "scenario.resolved.toml").write_text('name = "bare <b>"\n')
     (tmp_path / "trajectory_truth.tum").write_text("")
     page = write_report(tmp_path).read_text()
@@ -96,13 +95,13 @@ def test_a_run_that_has_hardly_begun_still_has_a_report(tmp_path):
     ("name", "text"),
     [
         ("metrics.json", "{broken"),
-        ("dem.tif", "no raster"),
+        ("dem.tif", "not a raster"),
         ("trajectory_final.tum", "1 2 3\n"),
         ("posegraph.g2o", "EDGE_SE3:QUAT 0 1\n"),
         ("scenario.resolved.toml", "= ="),
     ],
 )
-def test_a_broken_file_is_named(tmp_path, name, text):
+def test_a_damaged_file_is_named(tmp_path, name, text):
     (tmp_path / "scenario.resolved.toml").write_text("")
     (tmp_path / name).write_text(text)
     with pytest.raises(TwinError, match="cannot be read") as caught:
@@ -110,12 +109,12 @@ def test_a_broken_file_is_named(tmp_path, name, text):
     assert caught.value.field.endswith(name)
 
 
-def test_a_folder_that_is_no_run_is_refused(tmp_path):
-    with pytest.raises(TwinError, match="is no run folder"):
+def test_a_folder_that_is_not_a_run_is_rejected(tmp_path):
+    with pytest.raises(TwinError, match="is not a run folder"):
         load_run(tmp_path)
 
 
-def test_trajectories_survive_the_tum_file(folder):
+def test_trajectories_are_read_back_from_tum_files(folder):
     run = load_run(folder)
     copy = folder / "copy.tum"
     run.trajectories["f2f"].save(copy)
@@ -123,23 +122,27 @@ def test_trajectories_survive_the_tum_file(folder):
     np.testing.assert_allclose(back.world_from_camera, run.trajectories["f2f"].world_from_camera, atol=1e-8)
 
 
-def test_a_run_judged_before_there_were_stages_and_links_still_has_its_report(folder):
+def test_metrics_without_stages_and_links_have_a_report(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
     page = write_report(folder, {k: v for k, v in metrics.items() if k not in ("links", "stages")}).read_text()
-    assert '<section id="network">' in page and '<section id="stages">' not in page and "Eq. (2)" not in page
+    assert (
+        '<section id="network">' in page
+        and '<section id="stages">' not in page
+        and "Eq. (2) takes the depth" not in page
+    )
 
 
 def stages(**errors_m):
     return {"stages": {stage: {"ate_rmse_m": error_m, "ate_max_m": None} for stage, error_m in errors_m.items()}}
 
 
-def test_a_stage_gains_what_the_one_before_it_was_worse():
+def test_the_gain_of_a_stage_is_the_ratio_of_errors():
     rows = stage_rows(stages(f2f=0.4, chain=0.04, online=0.08, final=0.001), {})
     assert [row.gain for row in rows] == [None, pytest.approx(10), pytest.approx(0.5), pytest.approx(80)]
-    assert [wording.better(row.gain) for row in rows] == ["", "10 × better", "2.0 × worse", "80 × better"]
+    assert [wording.improvement(row.gain) for row in rows] == ["", "10 × smaller", "2.0 × larger", "80 × smaller"]
 
 
-def test_a_broken_chain_is_left_out_and_the_next_stage_measured_against_the_one_before():
+def test_a_stage_without_an_error_is_skipped():
     rows = stage_rows(stages(f2f=0.4, chain=None, online=0.1, final=0.0), {})
     assert [(row.stage, row.gain) for row in rows] == [("f2f", None), ("online", pytest.approx(4)), ("final", None)]
 
@@ -147,26 +150,26 @@ def test_a_broken_chain_is_left_out_and_the_next_stage_measured_against_the_one_
 @pytest.mark.parametrize(
     ("settings", "online", "final"),
     [
-        ({}, "chain, mosaic (F2M), ahrs, GA so far", "all links, ahrs"),
-        ({"use_f2m": False}, "chain, ahrs, GA so far / F2M switched off", "all links, ahrs"),
-        ({"use_ga": False}, "chain, mosaic (F2M), ahrs / GA switched off", "as online / GA switched off"),
+        ({}, "chain, F2M, ahrs, previous GA", "all links, ahrs"),
+        ({"use_f2m": False}, "chain, ahrs, previous GA / F2M disabled", "all links, ahrs"),
+        ({"use_ga": False}, "chain, F2M, ahrs / GA disabled", "same as online / GA disabled"),
         (
             {"use_f2m": False, "use_ga": False},
-            "chain, ahrs / F2M and GA switched off",
-            "as online / GA switched off",
+            "chain, ahrs / F2M and GA disabled",
+            "same as online / GA disabled",
         ),
     ],
 )
-def test_stages_say_what_they_work_from_and_what_was_switched_off(settings, online, final):
+def test_stage_rows_list_inputs_and_disabled_parts(settings, online, final):
     scenario = {"navigation": {"aiding": ["ahrs"]}, "estimate": settings}
     rows = {row.stage: row for row in stage_rows(stages(f2f=1.0, chain=1.0, online=1.0, final=1.0), scenario)}
-    told = {stage: " / ".join(filter(None, [row.uses, row.off])) for stage, row in rows.items()}
-    assert (told["online"], told["final"]) == (online, final)
-    assert rows["f2f"].off == rows["chain"].off == ""
+    texts = {stage: " / ".join(filter(None, [row.inputs, row.disabled])) for stage, row in rows.items()}
+    assert (texts["online"], texts["final"]) == (online, final)
+    assert rows["f2f"].disabled == rows["chain"].disabled == ""
 
 
 @pytest.mark.parametrize(
-    ("value", "words"),
+    ("value", "text"),
     [
         (None, "–"),
         (0.00034, "0.34 mm"),
@@ -176,38 +179,39 @@ def test_stages_say_what_they_work_from_and_what_was_switched_off(settings, onli
         (17.456, "17.46 m"),
     ],
 )
-def test_lengths_are_told_in_the_unit_that_suits(value, words):
-    assert wording.length(value) == words
+def test_lengths_have_a_suitable_unit(value, text):
+    assert wording.length(value) == text
 
 
-def test_the_budget_is_the_papers():
+def test_the_real_time_budget_is_that_of_the_paper():
     stages = {"f2f": {"count": 300, "mean_ms": 40.0, "p95_ms": 60.0, "total_s": 12.0}}
     stages |= {k: {"count": 10, "mean_ms": 30.0, "p95_ms": 30.0, "total_s": 0.3} for k in ("stereo", "f2m", "flow")}
-    rows = {row.what: row for row in budget({"timing": {"stages": stages, "keyframes": 10}}, SCENARIO.model_dump(), 15)}
-    assert rows["frame to frame"].budget_ms == pytest.approx(1000 / 30) and rows["frame to frame"].within is False
-    work = rows["all work at a keyframe"]
-    assert work.budget_ms == pytest.approx(500)  # P26: N / frame rate = 15 / 30 s
-    assert work.mean_ms == pytest.approx(90) and work.within is True
-    assert rows["stereo"].within is None
+    metrics = {"timing": {"stages": stages, "keyframes": 10}}
+    rows = {row.stage: row for row in stage_times(metrics, SCENARIO.model_dump(), 15)}
+    assert rows["f2f"].budget_ms == pytest.approx(1000 / 30) and rows["f2f"].within_budget is False
+    work = rows["keyframe"]
+    assert work.budget_ms == pytest.approx(500)  # N / frame rate = 15 / 30 s
+    assert work.mean_ms == pytest.approx(90) and work.within_budget is True
+    assert rows["stereo"].within_budget is None
 
 
-def test_pictures_keep_their_colours(folder):
+def test_sample_images_keep_their_colours(folder):
     run = load_run(folder)
     image = cv2.imread(str(run.image_file(0, "left")), cv2.IMREAD_COLOR_RGB)
     assert image[..., 1].mean() > image[..., 2].mean() > image[..., 0].mean()  # the fixture's tint: green, blue, red
 
-    data = base64.b64decode(sample_photos(run)[0][1].split(",")[1])
+    data = base64.b64decode(sample_images(run)[0][1].split(",")[1])
     shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     np.testing.assert_allclose(shown.mean(axis=(0, 1)), image.mean(axis=(0, 1)), atol=2)
 
 
-def test_a_wild_height_leaves_the_rest_its_relief():
+def test_an_outlier_of_the_height_does_not_flatten_the_hill_shading():
     x, y = np.meshgrid(np.linspace(0, 20, 120), np.linspace(0, 15, 90))
-    tame = np.sin(x) * np.cos(y)
-    wild = tame.copy()
-    wild[40, 60] = -50.0
-    drawn, expected = figures._relief(wild, "gray"), figures._relief(tame, "gray")
+    plain = np.sin(x) * np.cos(y)
+    outlier = plain.copy()
+    outlier[40, 60] = -50.0
+    shaded, expected = figures.hillshade(outlier, "gray"), figures.hillshade(plain, "gray")
     away = np.hypot(*np.ogrid[-40:50, -60:60]) > 2
-    # not equal: the hill shade is stretched to the darkest slope, which is the pit's
-    assert drawn[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
-    assert np.abs(drawn[away] - expected[away]).max() < 0.2
+    # not equal: the shading is scaled to the steepest slope, which is that of the outlier
+    assert shaded[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
+    assert np.abs(shaded[away] - expected[away]).max() < 0.2

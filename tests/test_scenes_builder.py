@@ -1,4 +1,4 @@
-"""The model is the vehicle of the data sheet, over the floor of the terrain."""
+"""The scene model has the vehicle parameters of the data sheet and the floor of the terrain."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 import terrains
 from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.builder import World, build
+from scenes.builder import CameraPair, SceneModel, build
 from scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
 from scenes.gl import mujoco
 from twin.core import geometry
@@ -17,81 +17,82 @@ LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def scene() -> SceneModel:
     terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, 0.02, 3)
-    return build(terrain, 160, 120, 45.0, 0.2, BODY_FROM_LEFT, 0.004, LAMPS)
+    return build(terrain, CameraPair(160, 120, 45.0, 0.2, BODY_FROM_LEFT), 0.004, LAMPS)
 
 
-def settled(world: World, position: np.ndarray, rotation: np.ndarray) -> mujoco.MjData:
-    data = mujoco.MjData(world.model)
+def data_at(scene: SceneModel, position: np.ndarray, rotation: np.ndarray) -> mujoco.MjData:
+    """Returns MuJoCo data with the vehicle at a pose, after forward kinematics."""
+    data = mujoco.MjData(scene.model)
     data.qpos[:3], data.qpos[3:7] = position, geometry.quaternion_wxyz(rotation)
-    mujoco.mj_forward(world.model, data)
+    mujoco.mj_forward(scene.model, data)
     return data
 
 
 def test_eight_thrusters_control_all_six_degrees_of_freedom() -> None:
-    allocation = BLUEROV2_HEAVY.allocation
-    assert np.linalg.matrix_rank(allocation) == 6
-    # lever of a horizontal thruster in yaw: (0.156 + 0.111) / sqrt(2), all four alike
-    assert np.abs(allocation[5, :4]) == pytest.approx(np.full(4, (0.156 + 0.111) * np.sqrt(0.5)))
+    configuration = BLUEROV2_HEAVY.thrust_configuration
+    assert np.linalg.matrix_rank(configuration) == 6
+    # lever arm of each horizontal thruster in yaw: (0.156 + 0.111) / sqrt(2)
+    assert np.abs(configuration[5, :4]) == pytest.approx(np.full(4, (0.156 + 0.111) * np.sqrt(0.5)))
     assert np.linalg.norm(BLUEROV2_HEAVY.thruster_directions, axis=1) == pytest.approx(np.ones(8))
 
 
-def test_thrust_curve_meets_the_published_points() -> None:
+def test_thrust_curve_agrees_with_the_published_points() -> None:
     u = np.array([0.25, 0.5, 0.75, 1.0])
     thrust_n = sum(c * u**p for c, p in zip(BLUEROV2_HEAVY.thrust_coefficients, (9, 7, 5, 3, 1), strict=True))
     assert thrust_n == pytest.approx([4.6, 16.6, 26.5, 30.4], abs=0.06)
 
 
-def test_thrusters_push_where_their_sites_point(world: World) -> None:
-    data = settled(world, np.array([0, 0, 2.0]), np.eye(3))
-    axes = data.site_xmat[world.thruster_site_ids].reshape(8, 3, 3)[:, :, 2]
+def test_thruster_sites_have_the_published_positions_and_directions(scene: SceneModel) -> None:
+    data = data_at(scene, np.array([0, 0, 2.0]), np.eye(3))
+    axes = data.site_xmat[scene.thruster_site_ids].reshape(8, 3, 3)[:, :, 2]
     assert axes == pytest.approx(BLUEROV2_HEAVY.thruster_directions, abs=1e-12)
-    assert data.site_xpos[world.thruster_site_ids] - [0, 0, 2] == pytest.approx(BLUEROV2_HEAVY.thruster_positions_m)
-    assert data.site_xpos[world.lamp_site_ids] - [0, 0, 2] == pytest.approx(np.array(LAMPS))
+    assert data.site_xpos[scene.thruster_site_ids] - [0, 0, 2] == pytest.approx(BLUEROV2_HEAVY.thruster_positions_m)
+    assert data.site_xpos[scene.lamp_site_ids] - [0, 0, 2] == pytest.approx(np.array(LAMPS))
 
 
-def test_the_stereo_pair_is_mounted_as_calibrated(world: World) -> None:
+def test_the_stereo_pair_is_mounted_as_calibrated(scene: SceneModel) -> None:
     rotation = geometry.rotation_from_rpy(0.1, -0.2, 0.7)
-    data = settled(world, np.array([0.3, -0.4, 2.0]), rotation)
+    data = data_at(scene, np.array([0.3, -0.4, 2.0]), rotation)
     world_from_left = geometry.pose(rotation, np.array([0.3, -0.4, 2.0])) @ BODY_FROM_LEFT
     right_from = geometry.pose(np.eye(3), np.array([0.2, 0, 0]))
-    cv_from_gl = np.diag([1.0, -1.0, -1.0])  # MuJoCo's cameras have y up and look along -z
-    for camera, expected in zip(world.camera_ids, (world_from_left, world_from_left @ right_from), strict=True):
+    cv_from_gl = np.diag([1.0, -1.0, -1.0])  # a MuJoCo camera has y up and points along -z
+    for camera, expected in zip(scene.camera_ids, (world_from_left, world_from_left @ right_from), strict=True):
         assert data.cam_xpos[camera] == pytest.approx(expected[:3, 3], abs=1e-9)
         assert data.cam_xmat[camera].reshape(3, 3) @ cv_from_gl == pytest.approx(expected[:3, :3], abs=1e-9)
-    assert np.all(world.model.cam_fovy == 45.0)
+    assert np.all(scene.model.cam_fovy == 45.0)
 
 
-def test_the_vehicle_weighs_and_turns_as_in_the_data_sheet_and_falls_freely(world: World) -> None:
-    model = world.model
-    assert model.body_mass[world.body_id] == 13.5 and model.body_mass.sum() == 13.5
-    assert model.body_inertia[world.body_id] == pytest.approx([0.26, 0.23, 0.37])
-    assert model.body_ipos[world.body_id] == pytest.approx(np.zeros(3))
-    assert model.body_iquat[world.body_id] == pytest.approx([1, 0, 0, 0])
-    data = settled(world, np.zeros(3), np.eye(3))  # in the floor: there is no contact
+def test_the_vehicle_has_the_published_mass_and_inertia_and_falls_freely(scene: SceneModel) -> None:
+    model = scene.model
+    assert model.body_mass[scene.body_id] == 13.5 and model.body_mass.sum() == 13.5
+    assert model.body_inertia[scene.body_id] == pytest.approx([0.26, 0.23, 0.37])
+    assert model.body_ipos[scene.body_id] == pytest.approx(np.zeros(3))
+    assert model.body_iquat[scene.body_id] == pytest.approx([1, 0, 0, 0])
+    data = data_at(scene, np.zeros(3), np.eye(3))  # inside the floor, which has no contact
     assert data.ncon == 0 and data.qacc[:3] == pytest.approx([0, 0, -9.81]) and model.opt.timestep == 0.004
 
 
-def test_tiles_cover_the_floor_without_gap_or_overlap(world: World) -> None:
-    areas = np.prod((world.tile_high_m - world.tile_low_m)[:, :2], axis=1)
-    assert areas.sum() == pytest.approx(np.prod(world.terrain.size_m))
-    assert world.tile_low_m.min(axis=0) == pytest.approx([-3.0, world.terrain.south_m, 0.2])
-    assert len(areas) == 6  # 120 x 74 cells by 48
+def test_tiles_cover_the_floor_without_gap_or_overlap(scene: SceneModel) -> None:
+    areas = np.prod((scene.tile_high_m - scene.tile_low_m)[:, :2], axis=1)
+    assert areas.sum() == pytest.approx(np.prod(scene.terrain.size_m))
+    assert scene.tile_low_m.min(axis=0) == pytest.approx([-3.0, scene.terrain.south_m, 0.2])
+    assert len(areas) == 6  # 120 x 74 cells in tiles of 48 x 48
 
 
-def test_rays_meet_the_floor_where_the_terrain_says(world: World) -> None:
-    data = settled(world, np.array([0, 0, 50.0]), np.eye(3))
+def test_mujoco_rays_hit_the_floor_at_the_height_of_the_terrain(scene: SceneModel) -> None:
+    data = data_at(scene, np.array([0, 0, 50.0]), np.eye(3))
     rng = np.random.default_rng(0)
-    low, high = np.array([-3.0, world.terrain.south_m]) + 1e-6, np.array([3.0, world.terrain.north_m]) - 1e-6
+    low, high = np.array([-3.0, scene.terrain.south_m]) + 1e-6, np.array([3.0, scene.terrain.north_m]) - 1e-6
     points = rng.uniform(low, high, (300, 2))
     down, geom = np.array([0, 0, -1.0]), np.zeros(1, np.int32)
-    hits = [3 - mujoco.mj_ray(world.model, data, np.array([*p, 3.0]), down, None, 1, -1, geom, None) for p in points]
-    # the model keeps vertices in single precision, turned into each mesh's own axes: 1e-7 of 3 m, times the slope
-    assert np.array(hits) == pytest.approx(world.terrain.height_at(*points.T), abs=5e-6)
+    hits = [3 - mujoco.mj_ray(scene.model, data, np.array([*p, 3.0]), down, None, 1, -1, geom, None) for p in points]
+    # vertices are in single precision, in the axes of their mesh: an error of 1e-7 times 3 m, times the slope
+    assert np.array(hits) == pytest.approx(scene.terrain.height_at(*points.T), abs=5e-6)
 
 
 @pytest.mark.parametrize("n", (1, 48, 800, 4000, 30000))
-def test_tiles_of_any_floor_stay_within_mujoco_s_limit(n: int) -> None:
+def test_the_number_of_tiles_stays_within_the_limit_of_mujoco(n: int) -> None:
     cells = tile_cells(n, n)
     assert cells >= TILE_CELLS and (-(-n // cells)) ** 2 <= MAX_TILES

@@ -1,31 +1,32 @@
-"""The hull moves as Fossen's equations say, in closed form and by their conservation laws."""
+"""Vehicle dynamics against Fossen's equations: closed forms, conservation laws and a dense reference solution."""
 
 import numpy as np
 import pytest
-from physics_world import IDLE, bare_world, vehicle
+from physics_world import IDLE, bare_model, vehicle
 
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
-from twin.simulate.free_body import FreeBody
-from twin.simulate.hull import hull_of, physics_timestep_s
+from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
-from twin.simulate.vehicle import Vehicle
+from twin.simulate.mujoco_vehicle import MujocoVehicle
 
 STEP_S = 1 / 120
-HULL = hull_of(VehicleConfig(buoyancy_n=0.0))
+HULL = trimmed_hull(VehicleConfig(buoyancy_n=0.0))
 
 
 def energy(v, hull=HULL):
+    """Returns the mechanical energy of a vehicle [J]."""
     pose = v.world_from_body
     return mechanical_energy(hull, pose[:3, :3], pose[:3, 3], v.twist_body)
 
 
 def dense_acceleration(hull, rotation, twist, current, wrench):
-    """Fossen's equation with full matrices, linear velocity first as in the book: the slow way."""
+    """Solves Fossen's equation with full matrices, linear velocity first as in the book."""
     mass = np.diag(np.roll(hull.inertia, 3))
-    added = np.diag(np.roll(hull.added, 3))
+    added = np.diag(np.roll(hull.added_inertia, 3))
     nu, flow = np.roll(twist, 3), np.concatenate([rotation.T @ current, np.zeros(3)])
     relative = nu - flow
 
@@ -44,16 +45,16 @@ def dense_acceleration(hull, rotation, twist, current, wrench):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_acceleration_is_the_solution_of_the_equation_written_with_full_matrices(seed):
+def test_acceleration_agrees_with_the_full_matrix_equation(seed):
     rng = np.random.default_rng(seed)
-    hull = hull_of(VehicleConfig(buoyancy_n=3.0, drag_factor=1.7, added_mass_factor=0.6))
+    hull = trimmed_hull(VehicleConfig(buoyancy_n=3.0, drag_factor=1.7, added_mass_factor=0.6))
     rotation = geometry.so3_exp(rng.normal(size=3))
     arguments = rotation, rng.normal(size=6), rng.normal(size=3), rng.normal(size=6)
     np.testing.assert_allclose(acceleration(hull, *arguments), dense_acceleration(hull, *arguments), rtol=1e-10)
 
 
-def test_energy_never_grows_in_still_water_without_thrust():
-    # Leapfrog may put back (rate * step)^3 / 4 of a swing's energy in a step: (1.7/s / 120)^3 / 4 * 0.6 J < 1e-6 J.
+def test_energy_does_not_increase_in_still_water_without_thrust():
+    # Leapfrog can add (rate * step)^3 / 4 of the oscillation energy per step: (1.7/s / 120)^3 / 4 * 0.6 J < 1e-6 J.
     v = vehicle(geometry.pose(geometry.rotation_from_rpy(1.0, 0.5, 2.0), np.zeros(3)))
     v._velocity[:] = [0.8, -0.3, 0.4, 1.0, 0.5, 2.0]
     v.step(IDLE, STEP_S)
@@ -65,19 +66,19 @@ def test_energy_never_grows_in_still_water_without_thrust():
     assert np.diff(energies).max() < 1e-6
 
 
-def test_without_drag_energy_is_kept():
-    hull = hull_of(VehicleConfig(buoyancy_n=0.0))._replace(linear_drag=np.zeros(6), quadratic_drag=np.zeros(6))
+def test_energy_is_conserved_without_drag():
+    hull = trimmed_hull(VehicleConfig(buoyancy_n=0.0))._replace(linear_drag=np.zeros(6), quadratic_drag=np.zeros(6))
     v = vehicle(geometry.pose(geometry.rotation_from_rpy(0.6, -0.3, 0.0), np.zeros(3)))
     v._hull = hull
     start = energy(v, hull)
     energies = [energy(v, hull) for _ in range(120 * 30) if v.step(IDLE, STEP_S) is None]
-    swing = start + hull.buoyancy_n * hull.centre_of_buoyancy_m[2]  # what the pendulum has to give
-    assert np.abs(np.array(energies) - start).max() < 1e-3 * swing  # (1.7/s * step)^2 / 4 = 5e-5, and a margin
+    amplitude = start + hull.buoyancy_n * hull.centre_of_buoyancy_m[2]  # energy above the minimum of the pendulum
+    assert np.abs(np.array(energies) - start).max() < 1e-3 * amplitude  # (1.7/s * step)^2 / 4 = 5e-5, and a margin
 
 
 @pytest.mark.parametrize(("axis", "command"), [("surge", 0.3), ("surge", 0.6), ("heave", 0.3)])
 def test_terminal_speed_balances_thrust_and_drag(axis, command):
-    # The horizontal thrusters sit below the centre of gravity; a huge moment of inertia leaves pure surge.
+    # The horizontal thrusters are below the centre of gravity; a large moment of inertia suppresses the pitching.
     k = {"surge": 0, "heave": 2}[axis]
     v = vehicle()
     v._hull = v._hull._replace(inertia=v._hull.inertia * np.array([1e9, 1e9, 1e9, 1, 1, 1]))
@@ -90,7 +91,7 @@ def test_terminal_speed_balances_thrust_and_drag(axis, command):
     assert v.twist_body[3 + k] == pytest.approx(expected, rel=0.01)
 
 
-def test_a_neutral_vehicle_keeps_its_depth_and_a_buoyant_one_rises_at_its_terminal_speed():
+def test_a_neutral_vehicle_stays_at_depth_and_a_buoyant_one_rises_at_terminal_speed():
     v = vehicle(buoyancy_n=0.0)
     v.step(IDLE, 30.0)
     np.testing.assert_allclose(v.world_from_body, np.eye(4), atol=1e-12)
@@ -103,9 +104,9 @@ def test_a_neutral_vehicle_keeps_its_depth_and_a_buoyant_one_rises_at_its_termin
 
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1)])
 def test_free_decay_of_a_small_tilt_has_the_period_and_damping_of_the_linearised_equation(axis, sign):
-    """I a'' + d a' + B h a = 0; roll is given a linear damping as its published one is zero."""
+    """I a'' + d a' + B h a = 0; roll needs a linear damping because its published value is zero."""
     damping, stiffness = 0.15, HULL.buoyancy_n * HULL.centre_of_buoyancy_m[2]
-    inertia = (HULL.inertia + HULL.added)[axis]
+    inertia = (HULL.inertia + HULL.added_inertia)[axis]
     v = vehicle(geometry.pose(geometry.so3_exp(0.02 * sign * np.eye(3)[axis]), np.zeros(3)))
     v._hull = v._hull._replace(linear_drag=np.array([damping] * 3 + [0.0] * 3), quadratic_drag=np.zeros(6))
     rate, decay = np.sqrt(stiffness / inertia - (damping / 2 / inertia) ** 2), damping / 2 / inertia
@@ -116,8 +117,8 @@ def test_free_decay_of_a_small_tilt_has_the_period_and_damping_of_the_linearised
         angles.append(geometry.so3_log(v.world_from_body[:3, :3])[axis])
     t = np.array(times)
     expected = 0.02 * sign * np.exp(-decay * t) * (np.cos(rate * t) + decay / rate * np.sin(rate * t))
-    # sin(a)/a leaves 0.02^2/6 = 7e-5 of the stiffness, leapfrog (rate step)^2 / 24 = 1e-5 of the rate: over 20 rad
-    # of phase an error below 1e-3 of the amplitude, 2e-5 rad; a margin of 2.
+    # Relative errors: stiffness 0.02^2 / 6 = 7e-5 (sin a against a), rate (rate step)^2 / 24 = 1e-5 (leapfrog). Over
+    # 20 rad of phase this is less than 1e-3 of the amplitude, 2e-5 rad; the tolerance has a margin of 2.
     np.testing.assert_allclose(angles, expected, atol=4e-5)
 
 
@@ -128,8 +129,8 @@ def test_one_step_of_thrust_accelerates_mass_and_added_mass():
     np.testing.assert_allclose(v.twist_body[3:], force[3:] / (13.5 + ROV.added_mass[:3]) * STEP_S, rtol=1e-12)
 
 
-def test_physics_is_the_same_in_a_steady_current_as_in_still_water_that_moves_along():
-    """Galilei: start with the current, in a turn, under thrust; subtract the current's path."""
+def test_motion_relative_to_the_water_is_the_same_in_a_steady_current_as_in_still_water():
+    """Galilean invariance, for a start at the velocity of the current, with rotation and thrust."""
     current = np.array([0.4, -0.3, 0.1])
     pose = geometry.pose(geometry.rotation_from_rpy(0.3, -0.2, 0.5), np.zeros(3))
     drifting, still = vehicle(pose, current), vehicle(pose)
@@ -137,14 +138,14 @@ def test_physics_is_the_same_in_a_steady_current_as_in_still_water_that_moves_al
     for _ in range(90):
         for v in (drifting, still):
             v.step(np.array([0.5, 0.1, 0.3, 0.4, 0.2, 0.1, 0.3, 0.2]), 1 / 30)
-    gone = still.world_from_body
-    gone[:3, 3] += 3.0 * current
+    expected = still.world_from_body
+    expected[:3, 3] += 3.0 * current
     assert np.linalg.norm(still.twist_body[:3]) > 0.2
-    np.testing.assert_allclose(drifting.world_from_body, gone, atol=1e-9)
+    np.testing.assert_allclose(drifting.world_from_body, expected, atol=1e-9)
 
 
-def test_a_steady_current_carries_a_drifting_neutral_vehicle_with_it():
-    # Along sway drag is purely quadratic, so the last of the difference fades as 1/t: (m + m_A) / (quadratic * t).
+def test_a_drifting_neutral_vehicle_reaches_the_velocity_of_a_steady_current():
+    # Drag in sway is purely quadratic, so the velocity difference decays as (m + m_A) / (quadratic * t).
     current = np.array([0.2, 0.1, -0.1])
     v = vehicle(current_mps=current)
     v.step(IDLE, 120.0)
@@ -152,14 +153,14 @@ def test_a_steady_current_carries_a_drifting_neutral_vehicle_with_it():
     np.testing.assert_allclose(velocity, current, atol=2 * (13.5 + 7.12) / 217 / 120)
 
 
-def test_added_mass_and_drag_factors_scale_what_they_name():
-    hull = hull_of(VehicleConfig(drag_factor=2.0, added_mass_factor=3.0))
-    np.testing.assert_allclose(hull.added, 3 * angular_first(ROV.added_mass))
+def test_added_mass_and_drag_factors_scale_added_mass_and_drag():
+    hull = trimmed_hull(VehicleConfig(drag_factor=2.0, added_mass_factor=3.0))
+    np.testing.assert_allclose(hull.added_inertia, 3 * angular_first(ROV.added_mass))
     np.testing.assert_allclose(hull.linear_drag, 2 * angular_first(ROV.linear_damping))
     np.testing.assert_allclose(hull.quadratic_drag, 2 * angular_first(ROV.quadratic_damping))
 
 
-def test_a_motion_that_diverges_aborts_the_survey_and_tells_when_and_where():
+def test_divergence_aborts_the_survey_and_reports_time_and_last_states():
     v = vehicle()
     v.step(IDLE, 0.5)
     with pytest.raises(SurveyAborted, match=r"diverged at 0\.[56].* s; last states: 0\.500 s: at \[0\.0"):
@@ -171,31 +172,31 @@ def test_a_motion_that_diverges_aborts_the_survey_and_tells_when_and_where():
 
 
 @pytest.mark.parametrize("rate_hz", [1, 7.5, 24, 25, 29.97, 30, 60, 100, 119, 120])
-def test_a_whole_number_of_physics_steps_makes_a_frame(rate_hz):
+def test_a_frame_is_a_whole_number_of_physics_steps(rate_hz):
     step = physics_timestep_s(rate_hz)
     assert step <= STEP_S * (1 + 1e-9)
     assert 1 / rate_hz / step == pytest.approx(round(1 / rate_hz / step), abs=1e-9)
-    v = Vehicle(bare_world(step), VehicleConfig(), np.zeros(3), np.eye(4))
+    v = MujocoVehicle(bare_model(step), VehicleConfig(), np.zeros(3), np.eye(4))
     v.step(IDLE, 1 / rate_hz)
     assert v.time_s == pytest.approx(1 / rate_hz)
 
 
-def test_a_fraction_of_a_physics_step_is_refused():
-    with pytest.raises(ValueError, match="no whole number of steps"):
+def test_a_fraction_of_a_physics_step_is_rejected():
+    with pytest.raises(ValueError, match="not a whole number of timesteps"):
         vehicle().step(IDLE, 0.3 * STEP_S)
 
 
-def test_the_body_without_a_world_moves_as_mujoco_moves_it():
-    """A minute of erratic commands in a current: what remains is rounding, amplified by the turns."""
+def test_the_compiled_vehicle_moves_as_mujoco_does():
+    """One minute of random commands in a current; the difference is rounding, amplified by rotation."""
     rng = np.random.default_rng(5)
     start = geometry.exp(np.array([0.1, -0.05, 0.8, 1.0, 2.0, -3.0]))
     current = np.array([0.1, -0.05, 0.02])
-    ours = FreeBody(VehicleConfig(drag_factor=1.3), current, start, 1 / 120)
-    theirs = vehicle(start, current, buoyancy_n=1.0, drag_factor=1.3)
+    compiled = CompiledVehicle(VehicleConfig(drag_factor=1.3), current, start, 1 / 120)
+    reference = vehicle(start, current, buoyancy_n=1.0, drag_factor=1.3)
     for _ in range(600):
         command = rng.uniform(-0.4, 0.4, 8)
-        for body in (ours, theirs):
+        for body in (compiled, reference):
             body.step(command, 0.1)
-    assert np.linalg.norm(theirs.world_from_body[:3, 3] - start[:3, 3]) > 1.0
-    np.testing.assert_allclose(ours.world_from_body, theirs.world_from_body, atol=1e-8)
-    np.testing.assert_allclose(ours.twist_body, theirs.twist_body, atol=1e-8)
+    assert np.linalg.norm(reference.world_from_body[:3, 3] - start[:3, 3]) > 1.0
+    np.testing.assert_allclose(compiled.world_from_body, reference.world_from_body, atol=1e-8)
+    np.testing.assert_allclose(compiled.twist_body, reference.twist_body, atol=1e-8)

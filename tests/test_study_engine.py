@@ -1,4 +1,4 @@
-"""Whatever happens to a task or to its process: each comes back, and none takes another one down."""
+"""Every task has an outcome, whatever happens to the task or its process, and no failure affects another task."""
 
 import os
 import signal
@@ -11,14 +11,15 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import study_tasks
 
+from twin.app.study_command import open_engine
 from twin.errors import TwinError
-from twin.study.engine import LocalEngine, connect
-from twin.study.worker import Crew, Limits
+from twin.study.local_engine import LocalEngine
+from twin.study.worker import TaskLimits, WorkerPool
 
 
 @pytest.fixture(scope="module")
 def engine():
-    with connect(jobs=2) as engine:
+    with open_engine(jobs=2) as engine:
         yield engine
 
 
@@ -26,72 +27,72 @@ def outcomes(engine, tasks, limits, function=study_tasks.misbehave):
     return {outcome.task: outcome for outcome in engine.run_many(function, tasks, limits)}
 
 
-def test_every_task_comes_back_with_its_result(engine):
-    found = outcomes(engine, range(40), Limits(), study_tasks.square)
-    assert {task: (o.result, o.failure, o.attempts) for task, o in found.items()} == {
+def test_every_task_returns_its_result(engine):
+    by_task = outcomes(engine, range(40), TaskLimits(), study_tasks.square)
+    assert {task: (o.result, o.failure, o.attempts) for task, o in by_task.items()} == {
         k: (k * k, "", 1) for k in range(40)
     }
 
 
-def test_each_worker_keeps_to_one_processor(engine):
-    found = [outcome.result for outcome in engine.run_many(study_tasks.processor, range(8), Limits())]
-    assert all(len(processors) == 1 for _, processors in found)
-    n = min(2, len(os.sched_getaffinity(0)), len({pid for pid, _ in found}))
-    assert len(set().union(*(processors for _, processors in found))) == n
+def test_each_worker_is_pinned_to_one_core(engine):
+    results = [o.result for o in engine.run_many(study_tasks.process_and_cores, range(8), TaskLimits())]
+    assert all(len(cores) == 1 for _, cores in results)
+    n = min(2, len(os.sched_getaffinity(0)), len({pid for pid, _ in results}))
+    assert len(set().union(*(cores for _, cores in results))) == n
 
 
-def test_a_task_that_raises_has_failed_with_its_reason_and_place(engine, tmp_path):
-    found = outcomes(engine, [("raise", ""), ("go", "")], Limits())
-    failed = found["raise", ""]
+def test_a_task_that_raises_fails_with_its_exception_and_source_line(engine):
+    by_task = outcomes(engine, [("raise", ""), ("go", "")], TaskLimits())
+    failed = by_task["raise", ""]
     assert failed.result is None
     assert failed.failure.startswith("ValueError: the sea is closed (study_tasks.py:")
-    assert failed.attempts == 1  # it would raise again
-    assert found["go", ""].result == "go"
+    assert failed.attempts == 1  # an exception is not retried
+    assert by_task["go", ""].result == "go"
 
 
-def test_a_task_that_hangs_is_ended_after_its_time(engine):
-    began = time.monotonic()
-    found = outcomes(engine, [("hang", ""), ("go", "")], Limits(timeout_s=1.5))
-    assert found["hang", ""].failure == "did not end within 1.5 s"
-    assert found["go", ""].result == "go"
-    assert time.monotonic() - began < 20
+def test_a_task_that_hangs_is_killed_after_its_timeout(engine):
+    start = time.monotonic()
+    by_task = outcomes(engine, [("hang", ""), ("go", "")], TaskLimits(timeout_s=1.5))
+    assert by_task["hang", ""].failure == "did not finish within 1.5 s"
+    assert by_task["go", ""].result == "go"
+    assert time.monotonic() - start < 20
 
 
-def test_a_task_whose_process_is_killed_is_tried_again_and_no_more_often_than_told(engine, tmp_path):
+def test_a_task_whose_process_is_killed_is_retried_up_to_the_limit(engine, tmp_path):
     once, always = ("die once", str(tmp_path / "once")), ("die", str(tmp_path / "always"))
-    found = outcomes(engine, [once, always], Limits(retries=1))
-    assert (found[once].result, found[once].attempts) == ("die once", 2)
-    assert (found[always].failure, found[always].attempts) == ("its process was killed by SIGKILL", 2)
+    by_task = outcomes(engine, [once, always], TaskLimits(retries=1))
+    assert (by_task[once].result, by_task[once].attempts) == ("die once", 2)
+    assert (by_task[always].failure, by_task[always].attempts) == ("worker process was killed by SIGKILL", 2)
 
 
-def test_a_worker_killed_from_outside_loses_nothing():
-    with connect(jobs=2) as engine:
-        found = {}
-        for outcome in engine.run_many(study_tasks.slow_square, range(10), Limits()):
-            if not found:
-                busy = next(iter(engine.crew._busy))
+def test_no_result_is_lost_if_a_worker_is_killed_from_outside():
+    with open_engine(jobs=2) as engine:
+        results = {}
+        for outcome in engine.run_many(study_tasks.slow_square, range(10), TaskLimits()):
+            if not results:
+                busy = next(iter(engine.pool._busy))
                 os.kill(busy._process.pid, signal.SIGKILL)
-            found[outcome.task] = outcome.result
-    assert found == {k: k * k for k in range(10)}
+            results[outcome.task] = outcome.result
+    assert results == {k: k * k for k in range(10)}
 
 
-def test_who_stops_listening_ends_the_workers():
+def test_closing_the_iterator_kills_the_workers():
     engine = LocalEngine(1)
-    running = engine.run_many(study_tasks.misbehave, [("go", ""), ("hang", ""), ("hang", "")], Limits())
+    running = engine.run_many(study_tasks.misbehave, [("go", ""), ("hang", ""), ("hang", "")], TaskLimits())
     next(running)
-    (worker,) = engine.crew._busy | set(engine.crew._idle)
+    (worker,) = engine.pool._busy | set(engine.pool._idle)
     running.close()
     with pytest.raises(ProcessLookupError):
         os.kill(worker._process.pid, 0)
 
 
-def test_a_pipe_is_closed_once_when_a_study_ends_while_its_worker_is_asked():
-    crew = Crew()
-    with ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(crew.work, study_tasks.misbehave, ("hang", ""), Limits())
-        while not crew._busy:
+def test_a_pipe_is_closed_only_once_when_the_pool_is_closed_during_a_task():
+    pool = WorkerPool()
+    with ThreadPoolExecutor(1) as threads:
+        running = threads.submit(pool.run, study_tasks.misbehave, ("hang", ""), TaskLimits())
+        while not pool._busy:
             time.sleep(0.01)
-        (worker,) = crew._busy
+        (worker,) = pool._busy
         closed = []
 
         def close_slowly():
@@ -99,50 +100,59 @@ def test_a_pipe_is_closed_once_when_a_study_ends_while_its_worker_is_asked():
             time.sleep(0.3)
 
         worker._pipe._close = close_slowly
-        crew.end()
-        reply, attempts = asked.result(timeout=20)
+        pool.close()
+        reply, attempts = running.result(timeout=20)
     assert (reply.kind, attempts, len(closed)) == ("killed", 1, 1)
-    assert crew.work(study_tasks.square, 3, Limits())[0].reason == "the study is over"
+    assert pool.run(study_tasks.square, 3, TaskLimits())[0].reason == "the worker pool is closed"
 
 
-def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
-    monkeypatch.setattr("twin.study.cluster._REACH_S", 0.5)
-    with pytest.raises(TwinError, match="--scheduler: nowhere:1 .*(allowed: as tcp://host:8786)"):
-        with connect(scheduler="nowhere:1"):
+def test_an_unreachable_scheduler_is_reported(monkeypatch):
+    monkeypatch.setattr("twin.study.dask_engine._CONNECT_TIMEOUT_S", 0.5)
+    with pytest.raises(TwinError, match=r"--scheduler: nowhere:1 does not answer: .*e\.g\. tcp://host:8786\)"):
+        with open_engine(scheduler="nowhere:1"):
+            pass
+
+
+def test_slurm_jobs_need_dask_jobqueue(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask_jobqueue.slurm", None)
+    with pytest.raises(TwinError, match="--scheduler: slurm needs dask-jobqueue, which is not installed"):
+        with open_engine(jobs=1, scheduler="slurm"):
             pass
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_answers_like_this_machine_also_when_it_loses_a_worker(tmp_path):
+def test_a_dask_cluster_gives_the_outcomes_of_a_local_engine_even_if_it_loses_a_worker(tmp_path):
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        with connect(scheduler=cluster.scheduler_address) as engine:
-            found = outcomes(engine, [("go", "a"), ("raise", ""), ("die once", str(tmp_path / "x"))], Limits())
-            assert found["go", "a"].result == "go"
-            assert found["raise", ""].failure.startswith("ValueError: the sea is closed")
-            assert found["die once", str(tmp_path / "x")].attempts == 2
+        with open_engine(scheduler=cluster.scheduler_address) as engine:
+            tasks = [("go", "a"), ("raise", ""), ("die once", str(tmp_path / "x"))]
+            by_task = outcomes(engine, tasks, TaskLimits())
+            assert by_task["go", "a"].result == "go"
+            assert by_task["raise", ""].failure.startswith("ValueError: the sea is closed")
+            assert by_task["die once", str(tmp_path / "x")].attempts == 2
             squares = {}
-            for outcome in engine.run_many(study_tasks.slow_square, range(20), Limits()):
+            for outcome in engine.run_many(study_tasks.slow_square, range(20), TaskLimits()):
                 if not squares:
                     os.kill(cluster.workers[0].pid, signal.SIGKILL)
                 squares[outcome.task] = outcome.result
     assert squares == {k: k * k for k in range(20)}
 
 
-def test_workers_end_with_the_program_that_started_them(tmp_path):
+def test_workers_end_when_their_parent_process_is_killed():
     script = (
         "import os, signal, study_tasks\n"
-        "from twin.study.engine import LocalEngine, Limits\n"
-        "e = LocalEngine(1)\n"
-        "for o in e.run_many(study_tasks.processor, [0], Limits()): print(o.result[0], flush=True)\n"
+        "from twin.study.local_engine import LocalEngine, TaskLimits\n"
+        "engine = LocalEngine(1)\n"
+        "for outcome in engine.run_many(study_tasks.process_and_cores, [0], TaskLimits()):\n"
+        "    print(outcome.result[0], flush=True)\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     folder = os.path.dirname(study_tasks.__file__)
-    said = subprocess.run(
+    parent = subprocess.run(
         [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": folder}, capture_output=True, text=True
     )
-    worker = int(said.stdout)
+    worker = int(parent.stdout)
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline and os.path.exists(f"/proc/{worker}"):
         time.sleep(0.1)

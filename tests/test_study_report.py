@@ -1,22 +1,24 @@
-"""The report answers its question first, and says no more than the surveys allow."""
+"""The report begins with its result, and its statistics include the right surveys."""
 
 import numpy as np
 import pyarrow as pa
 import pytest
 from study_surveys import LOST, STUDY, fail, fly, study_of
 
-from twin.study import findings, report, wording
-from twin.study.findings import Findings
-from twin.study.ledger import Ledger
-from twin.study.surveys import keys, surveys
+from twin.study import wording
+from twin.study.analysis import StudyAnalysis, mask_numbers
+from twin.study.analysis import summary as summary_of
+from twin.study.report import write_report
+from twin.study.results_log import ResultsLog
+from twin.study.surveys import survey_keys, surveys
 
 
-def found_of(study, folder, function=fly):
-    """The findings of a study flown here and now."""
-    ledger = Ledger(folder)
+def analyse(study, folder, function=fly):
+    """Returns the analysis of a study flown in this process."""
+    log = ResultsLog(folder)
     for survey in surveys(study, folder):
-        ledger.add(function(survey))
-    return Findings(ledger.table(set(keys(study))), study)
+        log.add(function(survey))
+    return StudyAnalysis(log.table(set(survey_keys(study))), study)
 
 
 @pytest.fixture
@@ -25,166 +27,174 @@ def study(tmp_path):
 
 
 @pytest.fixture
-def found(study, tmp_path):
-    return found_of(study, tmp_path)
+def analysis(study, tmp_path):
+    return analyse(study, tmp_path)
 
 
-def test_the_first_sentence_tells_how_far_the_sought_key_may_go(study, found):
-    first = wording.headline(study, found).partition("). ")[0]
-    assert first.startswith("At least 80 % of surveys pass where water.turbidity is at most ")
-    limit, rising = found.sought
+def test_the_first_sentence_gives_the_threshold_of_the_seek_key(study, analysis):
+    first = wording.headline(study, analysis).partition("). ")[0]
+    assert first.startswith("At least 80 % of surveys pass if water.turbidity is at most ")
+    limit, rising = analysis.threshold
     assert not rising
-    assert 17 < limit.value < 25  # 0.001 turbidity x altitude / 2 m = 0.02, of altitudes from 1.6 to 2.4 m
+    assert 17 < limit.value < 25  # 0.001 turbidity x altitude / 2 m = 0.02 m, for altitudes from 1.6 to 2.4 m
     assert limit.low <= limit.value <= limit.high
 
 
-def test_the_share_that_passes_is_counted_over_what_ended(study, found, tmp_path):
-    murky = [turbidity > 25 for turbidity in found.rows["vary.water.turbidity"].to_pylist()]
-    assert (found.status == "aborted").tolist() == murky
-    assert found.share.value == found.passed.mean()
-    assert f"{found.passed.sum()} of 64 ended complete" in wording.headline(study, found)
+def test_the_pass_probability_includes_aborted_surveys(study, analysis):
+    turbid = [turbidity > 25 for turbidity in analysis.rows["vary.water.turbidity"].to_pylist()]
+    assert (analysis.status == "aborted").tolist() == turbid
+    assert analysis.pass_probability.value == analysis.passed.mean()
+    assert f"{analysis.passed.sum()} of 64 surveys were completed" in wording.headline(study, analysis)
 
 
-def test_surveys_that_failed_do_not_count(tmp_path):
+def test_failed_surveys_are_not_counted(tmp_path):
     study = study_of(tmp_path)
-    half = found_of(study, tmp_path, lambda survey: fail(survey) if survey.sample % 2 else fly(survey))
-    assert half.ended.sum() == 6
-    assert half.share.value == half.passed[half.ended].mean()
-    assert "6 more failed by the machine or the program and do not count" in wording.headline(study, half)
+    half = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample % 2 else fly(survey))
+    assert half.evaluated.sum() == 6
+    assert half.pass_probability.value == half.passed[half.evaluated].mean()
+    failed = "6 more surveys failed because of the computer or the program and are not counted"
+    assert failed in wording.headline(study, half)
 
 
-def test_surveys_to_beware_of_are_counted_and_one_is_told(tmp_path):
+def test_warnings_are_counted_and_the_first_one_is_shown(tmp_path):
     study = study_of(tmp_path)
-    said = found_of(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too murky" if s.sample < 3 else ""})
-    assert wording.headline(study, said).endswith("Beware in 3 of 12: surrogate: too murky.")
+    warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too turbid" if s.sample < 3 else ""})
+    assert wording.headline(study, warned).endswith("Warning in 3 of 12 surveys: surrogate: too turbid.")
 
 
-def test_where_nothing_is_to_beware_of_nothing_is_said(study, found):
-    assert "Beware" not in wording.headline(study, found)
+def test_without_warnings_the_headline_has_none(study, analysis):
+    assert "Warning" not in wording.headline(study, analysis)
 
 
-def test_where_all_failed_nothing_is_said(tmp_path):
+def test_if_all_surveys_failed_there_is_no_result(tmp_path):
     study = study_of(tmp_path)
-    assert wording.headline(study, found_of(study, tmp_path, fail)).startswith("No survey ended")
+    assert wording.headline(study, analyse(study, tmp_path, fail)).startswith("No survey could be evaluated.")
 
 
-def test_the_limits_side_tells_what_is_kept_by_most(found):
-    (level,) = found.levels
-    values = found.numbers("map.le90_m")[found.complete]
-    assert level.bound.value == pytest.approx(np.percentile(values, 95))
-    assert level.limit == 0.02
+def test_the_bound_of_an_error_is_its_95th_percentile(analysis):
+    (metric,) = analysis.metric_summaries
+    values = analysis.numbers("map.le90_m")[analysis.complete]
+    assert metric.bound.value == pytest.approx(np.percentile(values, 95))
+    assert metric.limit == 0.02
 
 
-def test_of_figures_that_are_better_the_higher_the_limits_side_is_the_low_one(tmp_path):
+def test_the_bound_of_a_metric_of_which_more_is_better_is_its_5th_percentile(tmp_path):
     study = study_of(tmp_path, STUDY, ('show = ["map.le90_m"]', 'show = ["map.completeness"]'))
-    shares = np.random.default_rng(0).uniform(0.9, 1.0, 12)
-    found = found_of(study, tmp_path, lambda s: fly(s) | {"map.completeness": shares[s.sample]})
-    level = next(level for level in found.levels if level.name == "map.completeness")
-    assert level.bound.value == pytest.approx(np.percentile(shares[found.complete], 5))
+    completeness = np.random.default_rng(0).uniform(0.9, 1.0, 12)
+    analysis = analyse(study, tmp_path, lambda s: fly(s) | {"map.completeness": completeness[s.sample]})
+    metric = next(metric for metric in analysis.metric_summaries if metric.name == "map.completeness")
+    assert metric.bound.value == pytest.approx(np.percentile(completeness[analysis.complete], 5))
 
 
-def test_a_survey_that_broke_off_has_not_passed_whatever_it_kept_and_its_map_does_not_count(tmp_path):
+def test_an_aborted_survey_has_not_passed_and_its_map_error_is_not_included(tmp_path):
     study = study_of(tmp_path)
 
-    def broken(survey):
+    def half_aborted(survey):
         row = fly(survey)
         return row | {"status": "aborted"} if survey.sample < 6 else row
 
-    for name in ("whole", "broken"):
+    for name in ("whole", "aborted"):
         (tmp_path / name).mkdir()
-    whole, found = found_of(study, tmp_path / "whole"), found_of(study, tmp_path / "broken", broken)
+    whole, analysis = analyse(study, tmp_path / "whole"), analyse(study, tmp_path / "aborted", half_aborted)
     assert whole.passed[:6].any()
-    assert not found.passed[:6].any()
-    assert found.levels[0].surveys == whole.complete[6:].sum()
+    assert not analysis.passed[:6].any()
+    assert analysis.metric_summaries[0].surveys == whole.complete[6:].sum()
 
 
-def test_what_matters_most_comes_first(found):
-    order = [influence.key for influence in found.influences]
+def test_the_strongest_sensitivity_comes_first(analysis):
+    order = [sensitivity.key for sensitivity in analysis.sensitivities]
     assert order[0] == "water.turbidity"
-    by_key = {influence.key: influence for influence in found.influences}
+    by_key = {sensitivity.key: sensitivity for sensitivity in analysis.sensitivities}
     assert by_key["water.turbidity"].correlation.low > 0.8
     assert by_key["water.jerlov"].explained < 0.2
-    assert np.isnan(by_key["water.jerlov"].correlation.value)  # a text has no rank
+    assert np.isnan(by_key["water.jerlov"].correlation.value)  # text has no rank
 
 
-def test_what_failures_share_is_told(found):
-    assert found.contrasts[0].key == "water.turbidity"
-    assert found.contrasts[0].above > 0.95
-    reasons = {reason.reason: reason.surveys for reason in found.reasons}
-    assert reasons[findings.general(LOST)] == (found.status == "aborted").sum()
-    assert reasons["missed map.le90_m"] == (found.complete & ~found.passed).sum()
-    counts = [reason.surveys for reason in found.reasons]
+def test_failure_reasons_and_key_comparisons_describe_the_surveys_that_did_not_pass(analysis):
+    assert analysis.key_comparisons[0].key == "water.turbidity"
+    assert analysis.key_comparisons[0].superiority > 0.95
+    reasons = {reason.reason: reason.surveys for reason in analysis.failure_reasons}
+    assert reasons[mask_numbers(LOST)] == (analysis.status == "aborted").sum()
+    assert reasons["requirement not met: map.le90_m"] == (analysis.complete & ~analysis.passed).sum()
+    counts = [reason.surveys for reason in analysis.failure_reasons]
     assert counts == sorted(counts, reverse=True)
 
 
-def test_reasons_that_differ_in_numbers_only_count_together():
-    assert findings.general("vision lost at 2.0 s: too few") == findings.general("vision lost at 13.25 s: too few")
-    assert findings.general("missed map.le90_m") == "missed map.le90_m"
+def test_reasons_that_differ_only_in_numbers_are_counted_together():
+    assert mask_numbers("vision lost at 2.0 s: too few") == mask_numbers("vision lost at 13.25 s: too few")
+    assert mask_numbers("requirement not met: map.le90_m") == "requirement not met: map.le90_m"
 
 
-def test_a_saltelli_design_gives_sobol_indices_and_a_hole_in_it_none(tmp_path):
+def test_only_a_complete_saltelli_design_gives_sobol_indices(tmp_path):
     changes = ('"lhs"', '"saltelli"'), ("samples = 12", "samples = 64"), ("40.0]", "20.0]")
     study = study_of(tmp_path, STUDY, *changes)
-    found = found_of(study, tmp_path)
-    indices = found.sobol["map.le90_m"]
+    analysis = analyse(study, tmp_path)
+    indices = analysis.sobol["map.le90_m"]
     assert list(indices) == ["water.turbidity", "plan.altitude_m", "water.jerlov + sun.illuminance_lx"]
     assert indices["water.turbidity"].total.value > 0.8
     assert indices["water.jerlov + sun.illuminance_lx"].total.high < 0.05
-    status = pa.array(["aborted"] + found.rows["status"].to_pylist()[1:])
-    holed = found.rows.set_column(found.rows.column_names.index("status"), "status", status)
-    assert Findings(holed, study).sobol == {}
+    status = pa.array(["aborted"] + analysis.rows["status"].to_pylist()[1:])
+    incomplete = analysis.rows.set_column(analysis.rows.column_names.index("status"), "status", status)
+    assert StudyAnalysis(incomplete, study).sobol == {}
 
 
-def test_sobol_indices_are_of_the_means_over_seeds(tmp_path):
-    """Two seeds double every sum; means and so the indices of a law without noise stay."""
+def test_sobol_indices_use_the_means_over_seeds(tmp_path):
+    """Without noise, a second seed does not change the means."""
     changes = (('"lhs"', '"saltelli"'), ("samples = 12", "samples = 64"), ("40.0]", "20.0]"))
 
-    def quiet(survey):
+    def without_noise(survey):
         row = fly(survey)
         return row | {"map.le90_m": 0.001 * survey.values["water.turbidity"]}
 
     def means(*more):
         folder = tmp_path / str(len(more))
         folder.mkdir()
-        return found_of(study_of(folder, STUDY, *changes, *more), folder, quiet)._mean_of_samples("map.le90_m")
+        return analyse(study_of(folder, STUDY, *changes, *more), folder, without_noise)._mean_of_samples("map.le90_m")
 
     np.testing.assert_allclose(means(("samples = 64", "samples = 64\nseeds = 2")), means())
 
 
-def test_the_page_holds_the_answer_the_numbers_and_no_link_to_elsewhere(tmp_path):
-    study = study_of(tmp_path, STUDY.replace("seek", 'question = "How <murky> may it be?"\nseek', 1))
-    found = found_of(study, tmp_path)
-    report.write_report(study, found, tmp_path / "study.html")
+def test_the_page_is_self_contained_and_begins_with_the_result(tmp_path):
+    study = study_of(tmp_path, STUDY.replace("seek", 'question = "How <turbid> may it be?"\nseek', 1))
+    analysis = analyse(study, tmp_path)
+    write_report(study, analysis, tmp_path / "study.html")
     page = (tmp_path / "study.html").read_text()
-    assert "How &lt;murky&gt; may it be?" in page
-    assert page.index("of surveys pass where water.turbidity is at most") < page.index("<img")
-    for title in ("Who passes", "How far off surveys are", "What matters", "did not pass have in common", "The study"):
+    assert "How &lt;turbid&gt; may it be?" in page
+    assert page.index("of surveys pass if water.turbidity is at most") < page.index("<img")
+    titles = (
+        "Pass probability by key",
+        "Metrics of the surveys",
+        "Sensitivity",
+        "Surveys that did not pass",
+        "The study",
+    )
+    for title in titles:
         assert title in page
     assert page.count('src="data:image/png;base64,') == 5
     assert "http://" not in page and "https://" not in page
 
 
-def test_the_summary_has_plain_numbers_only(found):
+def test_the_summary_is_valid_json(analysis):
     import json
 
-    summary = findings.summary(found, {"name": "study"})
+    summary = summary_of(analysis, {"name": "study"})
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     assert summary["surveys"] == summary["complete"] + summary["aborted"] + summary["refused"] + summary["failed"]
 
 
-def test_what_cameras_saw_counts_for_surveys_that_broke_off_and_missing_contrast_is_not_shown(tmp_path):
+def test_image_quality_includes_aborted_surveys_and_a_metric_without_values_is_not_shown(tmp_path):
     shown = 'show = ["map.le90_m", "vision.points_median", "vision.contrast_median"]'
     study = study_of(tmp_path, STUDY, ('show = ["map.le90_m"]', shown), ("samples = 12", "samples = 40"))
 
-    def see(survey):
+    def with_points(survey):
         points = 400.0 if survey.values["water.turbidity"] < 25 else 3.0
         return fly(survey) | {"vision.points_median": points, "vision.contrast_median": None}
 
-    found = found_of(study, tmp_path, see)
-    aborted = found.status == "aborted"
+    analysis = analyse(study, tmp_path, with_points)
+    aborted = analysis.status == "aborted"
     assert aborted.any()
-    assert found.counted("vision.points_median").all()
-    assert not found.counted("map.le90_m")[aborted].any()
-    assert found.metrics == ["map.le90_m", "vision.points_median"]
-    rising = {f.metric: f.correlation.value for f in found.influences if f.key == "water.turbidity"}
-    assert rising["vision.points_median"] < -0.5 < 0.5 < rising["map.le90_m"]
+    assert analysis.included("vision.points_median").all()
+    assert not analysis.included("map.le90_m")[aborted].any()
+    assert analysis.metrics == ["map.le90_m", "vision.points_median"]
+    correlations = {s.metric: s.correlation.value for s in analysis.sensitivities if s.key == "water.turbidity"}
+    assert correlations["vision.points_median"] < -0.5 < 0.5 < correlations["map.le90_m"]

@@ -145,7 +145,7 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
         survey.fly(mission, world, navigator, lambda _, estimate, __: estimates.append(estimate))
         true = world.truth().trajectory
     result = navigator.finish()
-    assert [node.walked is not None for node in navigator.nodes] == [False] + [True] * (len(navigator.nodes) - 1)
+    assert [node.dvl_displacement is not None for node in navigator.nodes] == [False] + [True] * (len(navigator.nodes) - 1)
     assert sum(len(node.readings.beacons) for node in navigator.nodes) > 3
     sigma_m = [estimates[row].sigma_m for row in result.keyframe_rows]
     assert max(sigma_m) < np.sqrt(3) * 1.01e-4  # no worse than the fix just taken

@@ -1,4 +1,4 @@
-"""Laws of generated floors and of the surface between their nodes."""
+"""Properties of generated terrains, and of the surface between grid nodes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import terrains
-from terrains import Terrain, TerrainFault
+from terrains import Terrain
+from twin.errors import TwinError
 
 KINDS = ("ripples", "fractal", "reef")
 
@@ -22,7 +23,7 @@ def from_heights(height_m: np.ndarray, spacing_m: float = 0.5) -> Terrain:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_generated_floor_spans_base_to_relief_exactly(kind: str) -> None:
+def test_a_generated_floor_has_exactly_the_given_base_and_relief(kind: str) -> None:
     terrain = floor(kind)
     assert terrain.lowest_m == np.float32(0.15)
     assert terrain.highest_m == np.float32(0.75)
@@ -31,24 +32,24 @@ def test_a_generated_floor_spans_base_to_relief_exactly(kind: str) -> None:
     assert terrain.texture.shape == (400, 600, 3)
 
 
-def test_a_flat_floor_is_flat_at_its_base() -> None:
+def test_a_flat_floor_has_the_height_of_its_base() -> None:
     assert np.all(floor("flat").height_m == np.float32(0.15))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_floor_without_relief_is_flat_and_one_of_a_single_cell_is_a_floor(kind: str) -> None:
+def test_a_floor_without_relief_is_flat_and_a_floor_can_have_a_single_cell(kind: str) -> None:
     assert np.all(terrains.generate(kind, (2.0, 1.0), 0.0, 0.15, 0.1, 0.05, 0).height_m == np.float32(0.15))
     assert np.isfinite(terrains.generate(kind, (0.1, 0.1), 0.2, 0.0, 0.1, 0.05, 0).height_m).all()
 
 
 @pytest.mark.parametrize("kind", ("flat", *KINDS))
-def test_a_seed_fixes_the_floor_and_its_texture(kind: str) -> None:
+def test_equal_seeds_give_equal_heights_and_textures(kind: str) -> None:
     one, same, other = floor(kind, 1), floor(kind, 1), floor(kind, 2)
     assert np.array_equal(one.height_m, same.height_m) and np.array_equal(one.texture, same.texture)
     assert not np.array_equal(one.texture, other.texture)
 
 
-def test_a_reef_is_steep_but_keeps_to_sixty_degrees() -> None:
+def test_a_reef_is_steep_but_not_beyond_sixty_degrees() -> None:
     terrain = floor("reef", size_m=(9.0, 7.0))
     slope_deg = np.rad2deg(np.arctan(np.hypot(*np.gradient(terrain.height_m, terrain.spacing_m))))
     assert np.percentile(slope_deg, 99.5) <= 60.5
@@ -61,22 +62,22 @@ def test_a_texture_has_detail_at_every_scale_down_to_the_texel(kind: str) -> Non
     for _ in range(6):
         coarser = cv2.pyrDown(grey)
         detail = grey - cv2.pyrUp(coarser, dstsize=grey.shape[::-1])
-        assert detail.std() > 4.0  # twice the read noise of the default sensor (0.008 of 255)
+        assert detail.std() > 4.0  # twice the read noise of the default sensor, 0.008 x 255
         grey = coarser
 
 
-def test_extent_is_rounded_up_to_whole_cells() -> None:
+def test_the_extent_is_rounded_up_to_whole_cells() -> None:
     assert terrains.generate("flat", (1.0, 0.52), 0.0, 0.0, 0.3, 0.1, 0).size_m == pytest.approx((1.2, 0.6))
 
 
 def test_height_is_linear_on_the_two_triangles_of_a_cell() -> None:
     terrain = from_heights([[0.0, 1.0], [2.0, 4.0]])
     x, y = -1.0 + 0.5 * np.array([0.75, 0.25, 0.5]), -2.0 + 0.5 * np.array([0.25, 0.75, 0.5])
-    # south-east triangle 0 + u (1 - 0) + v (4 - 1), north-west 0 + v (2 - 0) + u (4 - 2), the diagonal 0 to 4
+    # south-east triangle 0 + u (1 - 0) + v (4 - 1), north-west 0 + v (2 - 0) + u (4 - 2); diagonal from 0 to 4
     assert terrain.height_at(x, y) == pytest.approx([1.5, 2.0, 2.0])
 
 
-def test_height_at_the_nodes_is_the_grid_and_nan_outside() -> None:
+def test_height_at_the_nodes_is_the_grid_value_and_outside_it_is_nan() -> None:
     heights = np.random.default_rng(0).normal(size=(4, 5)).astype(np.float32)
     terrain = from_heights(heights)
     x, y = np.meshgrid(-1.0 + 0.5 * np.arange(5), -2.0 + 0.5 * np.arange(4))
@@ -92,8 +93,8 @@ def test_height_at_the_nodes_is_the_grid_and_nan_outside() -> None:
         ({"texture_px_m": 0.0001}, "terrain.texture_px_m"),
     ],
 )
-def test_a_floor_that_cannot_be_had_names_its_key(change: dict[str, object], field: str) -> None:
-    wanted = dict(kind="flat", size_m=(6.0, 4.0), relief_m=0.1, base_m=0.0, grid_m=0.1, texture_px_m=0.01, seed=0)
-    with pytest.raises(TerrainFault) as fault:
-        terrains.generate(**(wanted | change))  # pyright: ignore[reportArgumentType]
-    assert fault.value.field == field and fault.value.allowed
+def test_an_invalid_terrain_is_rejected_with_its_scenario_key(change: dict[str, object], field: str) -> None:
+    valid = dict(kind="flat", size_m=(6.0, 4.0), relief_m=0.1, base_m=0.0, grid_m=0.1, texture_px_m=0.01, seed=0)
+    with pytest.raises(TwinError) as caught:
+        terrains.generate(**(valid | change))  # pyright: ignore[reportArgumentType]
+    assert caught.value.field == field and caught.value.allowed

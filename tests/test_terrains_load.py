@@ -1,4 +1,4 @@
-"""Real floors come in as they are: the right way up, in metres, with holes filled and told."""
+"""Terrains from files: orientation, units, filled holes, and errors for invalid files."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import rasterio
 from rasterio.transform import from_origin
 
 import terrains
-from terrains import Terrain, TerrainFault
+from terrains import Terrain
+from twin.errors import TwinError
 
 DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
-#: row 0 = north: the north-east corner is the highest, the south-west the lowest
+#: row 0 = north; the north-east corner is the highest, the south-west corner the lowest
 HEIGHTS = np.array([[2.0, 3.0, 4.0], [1.5, 2.0, 3.0], [1.0, 1.0, 2.0]], np.float32)
 
 
@@ -59,23 +60,23 @@ def test_every_format_gives_the_same_floor_north_up_and_centred(tmp_path: Path, 
     assert terrain.texture.shape == (10, 10, 3) and terrain.n_filled == 0
 
 
-def test_holes_take_their_nearest_height_and_are_counted(tmp_path: Path) -> None:
+def test_holes_are_filled_with_the_nearest_height_and_counted(tmp_path: Path) -> None:
     holed = HEIGHTS.copy()
     holed[0, 0], holed[2, 2] = -9999.0, np.nan
     terrain = load(write_tiff(tmp_path / "dem.tif", holed, nodata=-9999.0))
     assert terrain.n_filled == 2
     assert np.isfinite(terrain.height_m).all() and terrain.highest_m == 3.0
-    assert terrain.height_at(-0.5, 0.5) in (0.5, 2.0)  # 1.5 or 3.0 above the lowest, 1.0
+    assert terrain.height_at(-0.5, 0.5) in (0.5, 2.0)  # 1.5 or 3.0, minus the lowest height 1.0
 
 
-def test_a_tile_s_first_pixel_lies_in_the_north_west_corner(tmp_path: Path) -> None:
+def test_the_texture_image_is_tiled_from_the_north_west_corner(tmp_path: Path) -> None:
     image = np.random.default_rng(0).integers(0, 255, (4, 3, 3), dtype=np.uint8)
     texture = write_png(tmp_path / "tile.png", image[..., ::-1])
     terrain = load(write_npy(tmp_path / "dem.npy", HEIGHTS), texture, 0.1)
     assert np.array_equal(terrain.texture, np.tile(image, (3, 4, 1))[:10, :10])
 
 
-def test_feet_are_turned_into_metres(tmp_path: Path) -> None:
+def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
     file = write_tiff(tmp_path / "dem.tif", HEIGHTS, crs="EPSG:2222", spacing=10.0)  # Arizona East, international feet
     assert load(file).spacing_m == pytest.approx(3.048)
 
@@ -91,10 +92,10 @@ BAD = [
     ("8-bit PNG", lambda p: write_png(p / "dem.png", HEIGHTS.astype(np.uint8)), "is an image, not heights"),
     ("RGB PNG", lambda p: write_png(p / "dem.png", np.ones((4, 4, 3), np.uint16)), "is an image, not heights"),
     ("JPEG", lambda p: write_png(p / "dem.jpg", HEIGHTS.astype(np.uint8)), "is not a height file"),
-    ("3-D array", lambda p: write_npy(p / "dem.npy", np.ones((3, 3, 3))), "holds no heights"),
-    ("text array", lambda p: write_npy(p / "dem.npy", np.array([["a", "b"]])), "holds no heights"),
-    ("all NaN", lambda p: write_npy(p / "dem.npy", np.full((3, 3), np.nan)), "no height at all"),
-    ("all nodata", lambda p: write_tiff(p / "dem.tif", np.full((3, 3), -1.0), nodata=-1.0), "no height at all"),
+    ("3-D array", lambda p: write_npy(p / "dem.npy", np.ones((3, 3, 3))), "contains no heights"),
+    ("text array", lambda p: write_npy(p / "dem.npy", np.array([["a", "b"]])), "contains no heights"),
+    ("all NaN", lambda p: write_npy(p / "dem.npy", np.full((3, 3), np.nan)), "no valid height"),
+    ("all nodata", lambda p: write_tiff(p / "dem.tif", np.full((3, 3), -1.0), nodata=-1.0), "no valid height"),
     ("1 row", lambda p: write_npy(p / "dem.npy", HEIGHTS[:1]), "1 row(s) and 3 column(s)"),
     ("1 column", lambda p: write_tiff(p / "dem.tif", HEIGHTS[:, :1]), "3 row(s) and 1 column(s)"),
     ("degrees", lambda p: write_tiff(p / "dem.tif", HEIGHTS, crs="EPSG:4326"), "is in degrees"),
@@ -107,25 +108,25 @@ def _bytes(file: Path, content: bytes = b"not a raster") -> Path:
 
 
 @pytest.mark.parametrize(("make", "problem"), [(b[1], b[2]) for b in BAD], ids=[b[0] for b in BAD])
-def test_a_bad_height_file_is_told_in_one_line(tmp_path: Path, make: object, problem: str) -> None:
-    with pytest.raises(TerrainFault) as fault:
+def test_an_invalid_height_file_is_rejected_with_a_one_line_message(tmp_path: Path, make: object, problem: str) -> None:
+    with pytest.raises(TwinError) as caught:
         load(make(tmp_path))  # pyright: ignore[reportCallIssue]
-    assert fault.value.field == "terrain.height_file"
-    assert problem in fault.value.problem and "\n" not in str(fault.value) and fault.value.allowed
+    assert caught.value.field == "terrain.height_file"
+    assert problem in caught.value.problem and "\n" not in str(caught.value) and caught.value.allowed
 
 
 @pytest.mark.parametrize(("name", "problem"), [("none.png", "no such file"), ("dem.npy", "is not an image")])
-def test_a_bad_texture_is_told(tmp_path: Path, name: str, problem: str) -> None:
+def test_an_invalid_texture_file_is_rejected(tmp_path: Path, name: str, problem: str) -> None:
     file = write_npy(tmp_path / "dem.npy", HEIGHTS)
-    with pytest.raises(TerrainFault, match=problem) as fault:
+    with pytest.raises(TwinError, match=problem) as caught:
         load(file, tmp_path / name)
-    assert fault.value.field == "terrain.texture_file"
+    assert caught.value.field == "terrain.texture_file"
 
 
-def test_the_real_reef_keeps_its_measured_relief() -> None:
+def test_the_horseshoe_reef_has_its_measured_relief() -> None:
     if not (DATA / "horseshoe_reef_dem.tif").is_file():
-        pytest.skip("no ../shared/data (or TWIN_DATA): the real reef is not shipped")
+        pytest.skip("no ../shared/data (or TWIN_DATA): the reef data are not distributed")
     terrain = load(DATA / "horseshoe_reef_dem.tif", DATA / "gravel.png", 0.0025)
     assert terrain.height_m.shape == (800, 800) and terrain.spacing_m == pytest.approx(0.01)
-    assert terrain.highest_m == pytest.approx(-2.584359 + 3.9536424, abs=1e-5)  # extremes as gdalinfo tells them
+    assert terrain.highest_m == pytest.approx(-2.584359 + 3.9536424, abs=1e-5)  # minimum and maximum by gdalinfo
     assert terrain.texture.shape == (3196, 3196, 3)

@@ -10,7 +10,7 @@ from twin import survey
 from twin.core.records import Trajectory
 from twin.errors import ScenarioError, SurveyAborted
 from twin.scenario.file import load_scenario
-from twin.simulate.carrier import Carrier
+from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.world.mission import prepare
 
 SCENES = sorted(Path(scenes.__file__).parent.glob("*.toml"))
@@ -77,7 +77,7 @@ def test_the_carrier_moves_in_a_plane_without_rotation_and_the_survey_is_complet
 def test_a_carrier_goes_where_it_is_told_at_once_but_never_up():
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # bow to the north
-    carrier = Carrier(pose)
+    carrier = KinematicVehicle(pose)
     for _ in range(30):
         carrier.step(np.array([0.3, 0.6, 9.0]), 1 / 30)
     np.testing.assert_allclose(carrier.world_from_body[:3, 3], [0.3, 0.6, 0.0], atol=1e-12)

@@ -1,4 +1,4 @@
-"""A simulation-first digital twin of an underwater stereo survey."""
+"""Simulation-first digital twin of an underwater stereo survey."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ if TYPE_CHECKING:
 
 __all__ = ["load_scenario", "run"]
 
-# Read when numpy is loaded. Its threads wait for each other over matrices as small as ours: with two, the last
-# alignment of 25 tracks takes more than twice as long.
+# OpenBLAS reads this when numpy is imported. Threads slow down small matrices: with two threads, the final alignment
+# of 25 tracks takes more than twice as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file, or a name in scenes/, with `key=value` overrides.
+    """Reads a scenario.
+
+    Args:
+        path: a TOML file, or a name in scenes/.
+        overrides: `key=value` each, as in `plan.tracks=2`.
 
     Raises:
-        ScenarioError: every fault of the file, each as `FILE:LINE: key: what is wrong`.
+        ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
     from twin.scenario.file import load_scenario
 
@@ -30,10 +34,17 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def run(scenario: Scenario, out: str | Path) -> RunResult:
-    """Flies a survey and leaves a run folder at `out`.
+    """Runs a survey and writes its run folder.
+
+    Args:
+        scenario: the survey, from `load_scenario`.
+        out: folder to write.
+
+    Returns:
+        Status and metrics of the survey.
 
     Raises:
-        ScenarioError: the survey cannot be flown as asked; nothing was written.
+        ScenarioError: the survey cannot be carried out as described; nothing was written.
     """
     from twin import survey
 

@@ -1,4 +1,4 @@
-"""`python -m twin` is `twin`."""
+"""Runs the command line: `python -m twin` is the same as `twin`."""
 
 from twin.cli import main
 

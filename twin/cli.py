@@ -1,6 +1,6 @@
-"""The command `twin`: each command a few lines in front of a function that does the work.
+"""Command line `twin`: reads arguments and calls the function of each command.
 
-Exit status: 0 done; 1 the survey failed or missed a requirement; 2 bad usage or scenario; 130 interrupted.
+Exit status: 0 success; 1 the survey failed or missed a requirement; 2 bad usage or scenario; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -21,142 +21,155 @@ if TYPE_CHECKING:
     from twin.session.conclusion import RunResult
 
 app = typer.Typer(
-    help="A digital twin of an underwater stereo survey: fly one, and be told how far off it was.",
+    help="Digital twin of an underwater stereo survey: simulates it and compares trajectory and map with the truth.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
-reproductions = typer.Typer(help="Run the paper's experiments again.", no_args_is_help=True)
+reproductions = typer.Typer(help="Reproduce experiments of the paper.", no_args_is_help=True)
 app.add_typer(reproductions, name="reproduce")
 
-SceneArgument = Annotated[str, typer.Argument(metavar="SCENE", help="A name in scenes/ or the path of a TOML file.")]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run.")]
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")
+]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
 SetOption = Annotated[
-    list[str], typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as plan.tracks=2; may be repeated.")
+    list[str],
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the scenario, as in plan.tracks=2; repeatable."),
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all randomness.")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/NAME-SEED where not given.")]
-PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-plan.png where not given.")]
-SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write; runs/NAME-look.png where not given.")]
-LadderOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
+SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all random numbers.")]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
+PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-plan.png.")]
+SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-look.png.")]
+TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
-    str | None, typer.Option("--at", metavar="X,Y,Z", help="Place of the left camera [m]; mid-survey where not given.")
+    str | None,
+    typer.Option("--at", metavar="X,Y,Z", help="Position of the left camera [m]. Default: centre of the survey."),
 ]
-LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it is flown.")]
+LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it runs.")]
 FitArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="FILE", help="Studies of rendered surveys; the project's own if none.")
+    list[str] | None, typer.Argument(metavar="FILE", help="Studies of rendered surveys. Default: the built-in ones.")
 ]
-ModelOption = Annotated[Path, typer.Option("--out", help="TOML to write, for `imaging.error_model`.")]
-RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of what was flown for it.")]
+ModelOption = Annotated[
+    Path, typer.Option("--out", help="Error model to write (TOML), for the key imaging.error_model.")
+]
+RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the rendered surveys; finished ones are reused.")]
 StudyArgument = Annotated[
-    str, typer.Argument(metavar="FILE", help="A study's TOML file, or a name in scenes/studies/.")
+    str, typer.Argument(metavar="FILE", help="Study: a name in scenes/studies/ or the path of a TOML file.")
 ]
-StudyOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/study-NAME if not given.")]
-TuneOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write; runs/tune-NAME if not given.")]
+StudyOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/study-NAME.")]
+TuneOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/tune-NAME.")]
 JobsOption = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Surveys at a time, each a process (or a SLURM job); one a core.")
+    int | None,
+    typer.Option("--jobs", min=1, help="Parallel surveys, each a process or a SLURM job. Default: one per core."),
 ]
 SchedulerOption = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Fly on this Dask cluster, as tcp://host:8786.")
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the word slurm.",
+    ),
 ]
-SlurmOption = Annotated[bool, typer.Option("--slurm", help="Fly as jobs of a SLURM cluster (by dask-jobqueue).")]
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Fly only what is missing in the folder, or failed.")]
-LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each survey that ends.")]
-SummaryOption = Annotated[bool, typer.Option("--json", help="Print a summary as JSON and nothing else.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as JSON and nothing else.")]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Run only surveys that are missing in the folder or failed.")
+]
+LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
+SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics, as JSON.")]
 
 
 def main() -> None:
-    """Runs the command line; a fault of the user ends it with exit status 2 and a line for each."""
+    """Runs the command line; a TwinError is printed and ends it with exit status 2."""
     try:
         app()
     except TwinError as error:
-        console.fault(str(error))
+        console.print_error(str(error))
         sys.exit(2)
 
 
 @app.command()
 def demo(out: OutOption = None) -> None:
-    """Fly a small complete survey (under 2 minutes) and show its errors."""
-    result = _survey("quickstart", [], out, live=False)
-    console.errors(result.metrics)
-    console.pictures(result.folder)
+    """Run a small complete survey (under 2 minutes) and print its errors."""
+    result = _run_survey("quickstart", [], out, live=False)
+    console.print_metrics(result.metrics)
+    console.print_outputs(result.folder)
     raise typer.Exit(exit_status(result))
 
 
 @app.command()
 def run(
     scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006  typer copies it
+    overrides: SetOption = [],  # noqa: B006 (typer copies it)
     seed: SeedOption = None,
     out: OutOption = None,
     live: LiveOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly one survey and leave its folder: map, trajectories, report, recording, metrics."""
-    result = _survey(scene, overrides + ([] if seed is None else [f"seed={seed}"]), out, live)
+    """Run one survey and write its folder: map, trajectories, report, recording, metrics."""
+    result = _run_survey(scene, overrides + ([] if seed is None else [f"seed={seed}"]), out, live)
     if as_json:
         print(json.dumps(result.metrics, indent=1))
     else:
-        console.errors(result.metrics)
-        console.pictures(result.folder)
+        console.print_metrics(result.metrics)
+        console.print_outputs(result.folder)
     raise typer.Exit(exit_status(result))
 
 
 @app.command()
 def plan(
     scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006  typer copies it
+    overrides: SetOption = [],  # noqa: B006 (typer copies it)
     out: PictureOption = None,
 ) -> None:
-    """Show the numbers and a picture of a survey; nothing is simulated."""
+    """Print the numbers of a survey plan and draw it, without simulation."""
     from twin.app import plan as planning
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
 
     mission = prepare(load_scenario(scene, overrides))
-    console.table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
+    console.print_table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
     print(f"Picture: {planning.draw(mission, out or Path(f'runs/{mission.scenario.name}-plan.png'))}")
 
 
 @app.command()
 def look(
     scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006  typer copies it
+    overrides: SetOption = [],  # noqa: B006 (typer copies it)
     at: AtOption = None,
     out: SheetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Look through the cameras at one place: the stereo pair, and all that the left image consists of, as one sheet."""
-    from twin.app import look as looking
+    """Render the stereo pair at one position, with the layers of light and the image quality, as one sheet."""
+    from twin.app import look as viewing
     from twin.app import look_sheet
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
 
-    place = None if at is None else looking.parse_place(at)
+    position_m = None if at is None else viewing.parse_position(at)
     mission = prepare(load_scenario(scene, overrides))
-    seen = looking.look(mission, place)
-    sheet = look_sheet.draw(mission.scenario, seen, out or Path(f"runs/{mission.scenario.name}-look.png"))
-    figures = looking.figures(seen)
+    view = viewing.render_view(mission, position_m)
+    sheet = look_sheet.draw(mission.scenario, view, out or Path(f"runs/{mission.scenario.name}-look.png"))
+    quality = viewing.image_quality(view)
     if as_json:
-        print(json.dumps({"name": mission.scenario.name, "sheet": str(sheet)} | figures, indent=1))
+        print(json.dumps({"name": mission.scenario.name, "sheet": str(sheet)} | quality, indent=1))
     else:
-        console.table(f"Look at {mission.scenario.name}", looking.table(figures))
+        console.print_table(f"View of {mission.scenario.name}", viewing.quality_rows(quality))
         print(f"Sheet: {sheet}")
 
 
 @reproductions.command()
-def turbidity(out: LadderOption = Path("runs/turbidity"), as_json: SummaryOption = False) -> None:
-    """One object at five turbidity levels with histograms (the paper's Fig. 8), and contrast against range."""
-    from twin.reproduce import turbidity as ladder
+def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: SummaryOption = False) -> None:
+    """Render one object at five turbidity levels with histograms (Fig. 8 of the paper), and contrast against range."""
+    from twin.reproduce import turbidity as experiment
 
-    _need_graphics()
-    told = ladder.write(ladder.climb(), out)
+    _require_rendering()
+    summary = experiment.write(experiment.render_levels(), out)
     if as_json:
-        print(json.dumps(told, indent=1))
+        print(json.dumps(summary, indent=1))
     else:
-        console.table(f"The block at {told['range_m']:.2f} m in green light", ladder.table(told))
+        console.print_table(f"Block at {summary['range_m']:.2f} m in green light", experiment.table(summary))
         print(f"Sheet: {out / 'turbidity.png'}")
 
 
@@ -166,10 +179,16 @@ def fit_surrogate(
     out: ModelOption = Path("error_model.toml"),
     runs: RunsOption = Path("runs/fit-surrogate"),
 ) -> None:
-    """Fit the surrogate's error model to rendered surveys; what was flown before is not flown again."""
-    from twin.surrogate_fit import command
+    """Fit the error model of the surrogate to rendered surveys; finished surveys are reused."""
+    from twin.app import fit_command
 
-    raise typer.Exit(command.run(files or [], out, runs))
+    raise typer.Exit(fit_command.run(files or [], out, runs))
+
+
+@app.command("calibrate", hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def calibrate() -> None:
+    """Old name of fit-surrogate."""
+    raise TwinError("calibrate", "renamed to fit-surrogate")
 
 
 @app.command()
@@ -178,17 +197,16 @@ def study(
     out: StudyOutOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
-    slurm: SlurmOption = False,
     resume: ResumeOption = False,
     live: LinesOption = False,
     as_json: SummaryOption = False,
 ) -> None:
-    """Fly many surveys that differ in what the study varies, and tell how probable it is that one passes."""
-    from twin.study import command
+    """Run the surveys of a study and estimate the probability that a survey meets the requirements."""
+    from twin.app import study_command
 
-    if not (scheduler or slurm):
-        _need_graphics()
-    raise typer.Exit(command.run(file, command.Options(out, jobs, scheduler, slurm, resume, live, as_json)))
+    if not scheduler:
+        _require_rendering()
+    raise typer.Exit(study_command.run(file, study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json)))
 
 
 @app.command()
@@ -197,22 +215,21 @@ def tune(
     out: TuneOutOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
-    slurm: SlurmOption = False,
     resume: ResumeOption = False,
     live: LinesOption = False,
     as_json: SummaryOption = False,
 ) -> None:
-    """Search the plan that the section tune of a study asks for, and write the one recommended as a scenario."""
-    from twin.study import command
+    """Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario."""
+    from twin.app import study_command
 
-    if not (scheduler or slurm):
-        _need_graphics()
-    raise typer.Exit(command.tune(file, command.Options(out, jobs, scheduler, slurm, resume, live, as_json)))
+    if not scheduler:
+        _require_rendering()
+    raise typer.Exit(study_command.tune(file, study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json)))
 
 
 @app.command()
 def report(folder: RunArgument) -> None:
-    """Write the report of a run again from its folder."""
+    """Write the report of a run again, from the files in its folder."""
     from twin.report.survey_page import write_report
 
     print(f"Report: {write_report(folder)}")
@@ -228,71 +245,73 @@ def view(folder: RunArgument) -> None:
 
 @app.command()
 def doctor() -> None:
-    """Tell what this machine renders with and what it lacks, with the line that installs it."""
-    from twin.app.doctor import examine
+    """Check rendering, packages and disk, and print how to fix a failure."""
+    from twin.app.doctor import check_machine
 
-    findings = examine(Path.cwd())
-    for finding in findings:
-        print(finding)
-    raise typer.Exit(0 if all(finding.ok for finding in findings) else 2)
+    checks = check_machine(Path.cwd())
+    for check in checks:
+        print(check)
+    raise typer.Exit(0 if all(check.ok for check in checks) else 2)
 
 
 @app.command()
 def schema() -> None:
-    """Print the JSON schema of the scenario; editors complete from it."""
+    """Print the JSON schema of the scenario, for completion in editors."""
     from twin.scenario.model import Scenario
 
     print(json.dumps(Scenario.model_json_schema(), indent=1))
 
 
 def exit_status(result: RunResult) -> int:
-    """What the shell is told of a survey."""
+    """Returns the exit status of a survey: 130 interrupted; 1 failed or requirement missed; 0 otherwise."""
     if result.metrics["reason"] == "interrupted":
         return 130
     missed = [r for r in result.metrics["require"].values() if not r["passed"]]
     return 1 if result.status != "complete" or missed else 0
 
 
-def _survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
+def _run_survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
+    """Runs one survey with a progress bar."""
     from twin.scenario.file import load_scenario
 
     scenario = load_scenario(scene, overrides)
     folder = _new_folder(scenario, out)
-    _need_graphics()
-    from twin import survey  # only now: it needs OpenGL
+    _require_rendering()
+    from twin import survey  # imported here because it needs OpenGL
 
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live)
 
 
-def _need_graphics() -> None:
-    """Ends the command where nothing can be drawn."""
-    from twin.app.doctor import graphics
+def _require_rendering() -> None:
+    """Ends the command with exit status 2 if this machine cannot render."""
+    from twin.app.doctor import check_rendering
 
-    drawing = graphics()
-    if not drawing.ok:
-        console.fault(str(drawing))
+    check = check_rendering()
+    if not check.ok:
+        console.print_error(str(check))
         raise typer.Exit(2)
 
 
 def _new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """The folder to write: what was asked for, or the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is free."""
+    """Returns the folder to write: `out`, or the first unused one of runs/NAME-SEED, runs/NAME-SEED-2, ..."""
     if out is not None:
-        return _checked(out)
+        return _writable(out)
     first = Path("runs") / f"{scenario.name}-{scenario.seed}"
     folder, count = first, 1
     while folder.exists() and not _empty(folder):
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
-    return _checked(folder)
+    return _writable(folder)
 
 
-def _checked(folder: Path) -> Path:
+def _writable(folder: Path) -> Path:
+    """Returns the folder. Raises TwinError unless it is new or empty and can be written."""
     parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     if folder.exists() and not _empty(folder):
-        raise TwinError("--out", f"{folder} is there and not empty", "a new or an empty folder")
+        raise TwinError("--out", f"{folder} is not empty", "a new or an empty folder")
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise TwinError("--out", f"{parent} cannot be written to", "a folder that can")
+        raise TwinError("--out", f"{parent} is not writable", "a writable folder")
     return folder
 
 

@@ -1,15 +1,15 @@
-"""What the user did wrong, said so that the user can mend it."""
+"""Exceptions of the project. This module imports nothing, so that every package can use it."""
 
 from __future__ import annotations
 
 
 class TwinError(Exception):
-    """A fault at a boundary: the field, the value that came, what is allowed there.
+    """Invalid user input or a missing system library; the command line reports it and exits with status 2.
 
     Args:
-        field: dotted scenario key (``plan.altitude_m``) or the name of the file or argument at fault.
-        problem: what is wrong, in a few words.
-        allowed: what would be right.
+        field: dotted scenario key (``plan.altitude_m``), or the name of the file or argument that is invalid.
+        problem: the invalid value and why it is invalid, in a few words.
+        allowed: the valid values.
     """
 
     def __init__(self, field: str, problem: str, allowed: str = ""):
@@ -18,12 +18,12 @@ class TwinError(Exception):
 
 
 class ScenarioError(TwinError):
-    """All faults of one scenario at once, each with its file and line."""
+    """All errors of one scenario together, one line each with file and line number."""
 
     def __init__(self, lines: list[str]):
         self.lines = lines
         Exception.__init__(self, "\n".join(lines))
 
 
-class SurveyAborted(Exception):  # noqa: N818 (an outcome, not a mistake)
-    """The survey cannot go on (physics diverged, disk full, vision lost); partial results are kept."""
+class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
+    """The survey cannot continue (physics diverged, disk full, vision lost); partial results are kept."""

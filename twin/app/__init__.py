@@ -1,1 +1,1 @@
-"""Commands that a person meets: console, doctor, plan, look."""
+"""User-facing parts of the command line: terminal output, machine check, survey plan, camera view."""

@@ -1,6 +1,6 @@
-"""What this machine brings, and what it lacks, each with the line that mends it.
+"""Checks of this machine: Python, packages, rendering and disk, each with the command that fixes a failure.
 
-Run as a program it is the probe: it draws one frame, in a process of its own, as a broken driver can take it down.
+`python -m twin.app.doctor` renders one image: a process of its own, because a broken driver can crash it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,19 @@ _PROBE_LIMIT_S = 60
 
 _SPHERE = """
 <mujoco><worldbody><light pos="0 0 3"/><geom type="sphere" size="0.5" rgba="1 1 1 1"/>
-<camera name="eye" pos="0 0 3"/></worldbody></mujoco>
+<camera name="camera" pos="0 0 3"/></worldbody></mujoco>
 """
 
 
-class Finding(NamedTuple):
-    """One thing looked at: its name, whether it will do, what was found, and the line that mends it."""
+class Check(NamedTuple):
+    """Result of one check.
+
+    Args:
+        name: what was checked.
+        ok: whether it is sufficient.
+        found: version, size or error message.
+        remedy: command or action that fixes a failure.
+    """
 
     name: str
     ok: bool
@@ -33,27 +40,31 @@ class Finding(NamedTuple):
     remedy: str = ""
 
     def __str__(self) -> str:
-        line = f"{'ok' if self.ok else 'LACKING':<8} {self.name}: {self.found}"
-        return line if self.ok else f"{line}\n{'':<8} mend it by: {self.remedy}"
+        line = f"{'ok' if self.ok else 'FAILED':<8} {self.name}: {self.found}"
+        return line if self.ok else f"{line}\n{'':<8} to fix it: {self.remedy}"
 
 
-def examine(folder: Path) -> list[Finding]:
-    """All findings about this machine; runs would be written below `folder`."""
-    return [_python(), *(_package(name) for name in _PACKAGES), graphics(), _disk(folder), _processors()]
+def check_machine(folder: Path) -> list[Check]:
+    """Returns the results of all checks.
+
+    Args:
+        folder: folder below which runs are written, for the check of free disk space.
+    """
+    return [_python(), *(_package(name) for name in _PACKAGES), check_rendering(), _disk(folder), _processors()]
 
 
-def graphics() -> Finding:
-    """Whether a frame can be drawn without a screen."""
+def check_rendering() -> Check:
+    """Returns whether OpenGL renders an image without a screen."""
     try:
         command = [sys.executable, "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)
     except subprocess.TimeoutExpired:
-        return Finding("OpenGL", False, f"drawing did not end within {_PROBE_LIMIT_S} s", _gl_remedy())
+        return Check("OpenGL", False, f"rendering did not finish within {_PROBE_LIMIT_S} s", _gl_remedy())
     if probe.returncode == 0:
-        return Finding("OpenGL", True, probe.stdout.strip())
+        return Check("OpenGL", True, probe.stdout.strip())
     lines = probe.stderr.strip().splitlines()
-    found = lines[-1] if lines else f"drawing ended with status {probe.returncode}"
-    return Finding("OpenGL", False, found, _gl_remedy())
+    found = lines[-1] if lines else f"rendering failed with exit status {probe.returncode}"
+    return Check("OpenGL", False, found, _gl_remedy())
 
 
 def _gl_remedy() -> str:
@@ -62,35 +73,36 @@ def _gl_remedy() -> str:
     return INSTALL_LINE if os.geteuid() == 0 else f"sudo {INSTALL_LINE}"
 
 
-def _python() -> Finding:
-    return Finding("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer")
+def _python() -> Check:
+    return Check("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer")
 
 
-def _package(name: str) -> Finding:
+def _package(name: str) -> Check:
     try:
-        return Finding(name, True, version(name))
+        return Check(name, True, version(name))
     except PackageNotFoundError:
-        return Finding(name, False, "not installed", f"{sys.executable} -m pip install {name}")
+        return Check(name, False, "not installed", f"{sys.executable} -m pip install {name}")
 
 
-def _disk(folder: Path) -> Finding:
+def _disk(folder: Path) -> Check:
     free_gb = shutil.disk_usage(folder).free / 1e9
     remedy = f"free {_ENOUGH_DISK_GB:g} GB, or choose another disk with --out"
-    return Finding("disk", free_gb >= _ENOUGH_DISK_GB, f"{free_gb:.1f} GB free", remedy)
+    return Check("disk", free_gb >= _ENOUGH_DISK_GB, f"{free_gb:.1f} GB free", remedy)
 
 
-def _processors() -> Finding:
-    return Finding("processors", True, f"{os.cpu_count()} ({platform.machine()})")
+def _processors() -> Check:
+    return Check("processors", True, f"{os.cpu_count()} ({platform.machine()})")
 
 
-def draw_one_frame() -> str:
-    """Draws a white sphere and reads it back.
+def render_test_image() -> str:
+    """Renders a white sphere and checks that the image is not black.
 
     Returns:
-        The name of what drew it.
+        The name of the OpenGL renderer and of the back end.
 
     Raises:
-        RuntimeError: nothing was drawn, or there is no OpenGL (`scenes.gl.GlMissing`).
+        TwinError: OpenGL is missing.
+        RuntimeError: the rendered image is black.
     """
     from scenes.gl import mujoco, offscreen_context
 
@@ -100,20 +112,20 @@ def draw_one_frame() -> str:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, 48, 64) as renderer:
-        renderer.update_scene(data, "eye")
+        renderer.update_scene(data, "camera")
         brightness = renderer.render().mean()
         from OpenGL.GL import GL_RENDERER, glGetString
 
-        name = bytes(glGetString(GL_RENDERER) or b"a nameless renderer").decode()
+        name = bytes(glGetString(GL_RENDERER) or b"unnamed renderer").decode()
     if brightness < 1:
-        raise RuntimeError(f"{name} draws nothing but black")
-    return f"{name} through {os.environ.get('MUJOCO_GL', 'the default')}"
+        raise RuntimeError(f"{name} renders a black image")
+    return f"{name}, MUJOCO_GL={os.environ.get('MUJOCO_GL', 'default')}"
 
 
 def _probe() -> int:
     try:
-        print(draw_one_frame())
-    except Exception as error:  # the parent tells the user, whatever it is
+        print(render_test_image())
+    except Exception as error:  # the parent process reports it, whatever it is
         print(getattr(error, "problem", error), file=sys.stderr)
         return 1
     return 0

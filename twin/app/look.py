@@ -1,4 +1,4 @@
-"""One look through the cameras, taken apart: how water and lamps make an image, before anything is flown."""
+"""Stereo pair at one position without a survey, with the layers of light and the quality of the left image."""
 
 from __future__ import annotations
 
@@ -11,139 +11,149 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
-from twin.imaging.camera import Anatomy, Shot
+from twin.imaging.camera import DecomposedImage, StereoCapture
 from twin.imaging.renderer import NEAR_M
 from twin.report.wording import DASH, percent
 from twin.world.mission import Mission
 from twin.world.rendered_world import RenderedWorld
 
-#: Side of the window in which contrast is told, as a share of the image's width.
+#: Side of the window in which contrast is computed, as a fraction of the image width.
 WINDOW_SHARE = 1 / 20
-#: A channel of this value and above is full [of 255].
-FULL = 255
+#: A channel with this value or more is saturated [of 255].
+SATURATED = 255
 
-
-_WORDS = {
-    "gray_level": "gray level, of full scale",
-    "contrast": "contrast, local deviation by mean",
-    "veil_share": "share of the veil in the light",
+_LABELS = {
+    "gray_level": "gray level, fraction of full scale",
+    "contrast": "contrast, local standard deviation / mean",
+    "veil_share": "backscatter, fraction of the light",
     "saturated_share": "saturated pixels",
-    "snr": "signal by noise",
-    "texture_snr": "texture by noise",
+    "snr": "signal-to-noise ratio",
+    "texture_snr": "texture-to-noise ratio",
 }
 
 
-class Look(NamedTuple):
-    """The stereo pair at a place, and the left image taken apart."""
-
-    world_from_left: Array
-    shot: Shot
-    anatomy: Anatomy
-
-
-def look(mission: Mission, at_m: tuple[float, float, float] | None = None) -> Look:
-    """Looks straight down, bow to the east.
+class ViewLayers(NamedTuple):
+    """Stereo pair at one pose, and the layers of the left image.
 
     Args:
-        at_m: position of the left camera in the world [m]; above the middle of the survey where None.
-    Raises:
-        TwinError: the cameras or a lamp would be in the floor, or beside it.
+        world_from_left: (4, 4) pose of the left camera.
+        stereo_pair: the stereo pair, with noise.
+        decomposed: the left image without noise, and the light that it consists of.
     """
-    place = (0.0, 0.0, mission.scenario.plan.altitude_m) if at_m is None else at_m
-    world_from_left = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(place))
-    _check_place(mission, world_from_left)
+
+    world_from_left: Array
+    stereo_pair: StereoCapture
+    decomposed: DecomposedImage
+
+
+def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None) -> ViewLayers:
+    """Renders the stereo pair and its layers, with the cameras looking straight down and the bow to the east.
+
+    Args:
+        at_m: position of the left camera in the world [m]; default: above the centre of the survey at its altitude.
+
+    Raises:
+        TwinError: a camera or a lamp is outside the terrain, or not above the sea floor.
+    """
+    position_m = (0.0, 0.0, mission.scenario.plan.altitude_m) if at_m is None else at_m
+    world_from_left = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(position_m))
+    _check_rig(mission, world_from_left)
     with RenderedWorld(mission, Stopwatch()) as world:
-        anatomy = world.camera.dissect(world_from_left)
-        return Look(world_from_left, world.camera.shoot(world_from_left, stereo=True), anatomy)
+        decomposed = world.camera.decompose(world_from_left)
+        return ViewLayers(world_from_left, world.camera.capture(world_from_left, stereo=True), decomposed)
 
 
-def parse_place(text: str) -> tuple[float, float, float]:
-    """X,Y,Z in metres."""
+def parse_position(text: str) -> tuple[float, float, float]:
+    """Returns the position [m] written as X,Y,Z. Raises TwinError if it is not three finite numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise TwinError("--at", f"{text!r} is no place", "X,Y,Z of the left camera [m], as in 0.5,-1,2") from None
+        raise TwinError("--at", f"{text!r} is not a position", "X,Y,Z of the left camera [m], as in 0.5,-1,2") from None
     if not np.isfinite([x, y, z]).all():
-        raise TwinError("--at", f"{text!r} is no place", "finite numbers")
+        raise TwinError("--at", f"{text!r} is not a position", "finite numbers")
     return x, y, z
 
 
-def _check_place(mission: Mission, world_from_left: Array) -> None:
-    """Both cameras and all lamps are over the floor and above it."""
+def _check_rig(mission: Mission, world_from_left: Array) -> None:
+    """Raises TwinError unless both cameras and all lamps are inside the terrain and above the sea floor."""
     rig = mission.rig
     world_from_body = world_from_left @ geometry.inverse(rig.body_from_camera)
-    eyes = [world_from_left[:3, 3], (world_from_left @ rig.left_from_right)[:3, 3]]
-    for name, eye in zip(("the left camera", "the right camera"), eyes, strict=True):
-        _check_above(mission, "--at", name, eye, world_from_left)
+    cameras = [world_from_left[:3, 3], (world_from_left @ rig.left_from_right)[:3, 3]]
+    for name, position in zip(("the left camera", "the right camera"), cameras, strict=True):
+        _check_above(mission, "--at", name, position, world_from_left)
     for k, lamp in enumerate(mission.scenario.lamps):
         position = geometry.transform(world_from_body, np.array([lamp.position_m]))[0]
         _check_above(mission, f"lamps.{k}.position_m", f"lamp {k}", position, world_from_left)
 
 
 def _check_above(mission: Mission, field: str, name: str, position: Array, world_from_left: Array) -> None:
+    """Raises TwinError unless the position is inside the terrain and above the sea floor."""
     terrain = mission.terrain
     x, y, z = position
     floor_m = float(terrain.height_at(x, y))
     if np.isnan(floor_m):
         raise TwinError(
-            field, f"{name} at ({x:g}, {y:g}) lies outside the terrain",
+            field, f"{name} at ({x:g}, {y:g}) is outside the terrain",
             f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
         )  # fmt: skip
     if z < floor_m + NEAR_M:
         lift = world_from_left[2, 3] + floor_m + NEAR_M - z
         raise TwinError(
-            field, f"{name} at z {z:.3f} m lies in the floor or on it ({floor_m:.3f} m)", f"--at ...,{lift:.2f} or more"
+            field, f"{name} at z {z:.3f} m is not above the sea floor ({floor_m:.3f} m)", f"--at ...,{lift:.2f} or more"
         )
 
 
-def figures(seen: Look) -> dict[str, Any]:
-    """What the image is worth, for each band R, G, B.
+def image_quality(view: ViewLayers) -> dict[str, Any]:
+    """Computes measures of image quality, each for R, G, B.
 
-    `contrast`: median over the image of local deviation by local mean, without noise; `veil_share`: share of the veil
-    in all light; `saturated_share`: pixels that are full; `snr`: mean signal by deviation of the noise; `texture_snr`:
-    median local deviation of the image by that of the noise, which is what matching lives on.
+    Returns:
+        Position of the left camera and median range; exposure of a physical sensor; and `gray_level`: mean;
+        `contrast`: median over the image of local standard deviation / local mean, without noise; `veil_share`:
+        backscattered fraction of the light; `saturated_share`: fraction of saturated pixels; `snr`: mean / standard
+        deviation of the noise; `texture_snr`: median local standard deviation / that of the noise, which limits
+        matching. None stands for an undefined value.
     """
-    a = seen.anatomy
-    signal = a.layers.total.astype(np.float64) * a.gain
+    a = view.decomposed
+    signal = a.components.total.astype(np.float64) * a.gain
     side = max(3, round(signal.shape[1] * WINDOW_SHARE) | 1)
     mean = cv2.blur(signal, (side, side))
-    deviation = np.sqrt(np.maximum(cv2.blur(signal**2, (side, side)) - mean**2, 0))
-    noise = noise_of(seen).std(axis=(0, 1)) / 255
+    local_sigma = np.sqrt(np.maximum(cv2.blur(signal**2, (side, side)) - mean**2, 0))
+    noise = noise_image(view).std(axis=(0, 1)) / 255
     with np.errstate(divide="ignore", invalid="ignore"):
-        table = {
-            "gray_level": seen.shot.left.mean(axis=(0, 1)) / 255,
-            "contrast": np.median(deviation / mean, axis=(0, 1)),
-            "veil_share": a.layers.veil.mean(axis=(0, 1), dtype=np.float64)
-            / a.layers.total.mean(axis=(0, 1), dtype=np.float64),
-            "saturated_share": (seen.shot.left >= FULL).mean(axis=(0, 1)),
-            "snr": seen.shot.left.mean(axis=(0, 1)) / 255 / noise,
-            "texture_snr": np.median(deviation, axis=(0, 1)) / noise,
+        values = {
+            "gray_level": view.stereo_pair.left.mean(axis=(0, 1)) / 255,
+            "contrast": np.median(local_sigma / mean, axis=(0, 1)),
+            "veil_share": a.components.backscatter.mean(axis=(0, 1), dtype=np.float64)
+            / a.components.total.mean(axis=(0, 1), dtype=np.float64),
+            "saturated_share": (view.stereo_pair.left >= SATURATED).mean(axis=(0, 1)),
+            "snr": view.stereo_pair.left.mean(axis=(0, 1)) / 255 / noise,
+            "texture_snr": np.median(local_sigma, axis=(0, 1)) / noise,
         }
-    range_m = float(np.median(seen.shot.depth_left))
-    place = {"at_m": seen.world_from_left[:3, 3].tolist(), "depth_median_m": _number(range_m)}
-    return place | _exposure(a) | {name: [_number(v) for v in values] for name, values in table.items()}
+    range_m = float(np.median(view.stereo_pair.depth_left))
+    position = {"at_m": view.world_from_left[:3, 3].tolist(), "depth_median_m": _number(range_m)}
+    return position | _exposure(a) | {name: [_number(v) for v in bands] for name, bands in values.items()}
 
 
-def _exposure(anatomy: Anatomy) -> dict[str, float]:
-    """Time and gain of a physical sensor."""
-    if anatomy.raw is None:
+def _exposure(decomposed: DecomposedImage) -> dict[str, float]:
+    """Returns exposure time and analogue gain of a physical sensor; empty for the plain sensor."""
+    if decomposed.raw is None:
         return {}
-    return {"exposure_ms": 1000 * anatomy.setting.exposure_s, "analogue_gain": anatomy.setting.analogue_gain}
+    return {"exposure_ms": 1000 * decomposed.setting.exposure_s, "analogue_gain": decomposed.setting.analogue_gain}
 
 
-def table(told: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The figures in words."""
+def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Returns the values of `image_quality` as the rows of a table: label, red, green, blue."""
     percent_of = {"gray_level", "veil_share", "saturated_share"}
     rows = [
-        (what, *(DASH if v is None else percent(v) if name in percent_of else f"{v:.3g}" for v in told[name]))
-        for name, what in _WORDS.items()
+        (label, *(DASH if v is None else percent(v) if name in percent_of else f"{v:.3g}" for v in quality[name]))
+        for name, label in _LABELS.items()
     ]
     return [("", "red", "green", "blue"), *rows]
 
 
-def noise_of(seen: Look) -> Array:
-    """(H, W, 3) left image less the one without noise [gray levels of 255]."""
-    return seen.shot.left.astype(np.float64) - seen.anatomy.clean
+def noise_image(view: ViewLayers) -> Array:
+    """Returns the (H, W, 3) left image minus the same image without noise [gray levels of 255]."""
+    return view.stereo_pair.left.astype(np.float64) - view.decomposed.noise_free
 
 
 def _number(value: float) -> float | None:

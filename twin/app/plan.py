@@ -1,4 +1,4 @@
-"""What a survey will cost and promise, before anything is simulated: its numbers and a picture."""
+"""Forecast of a survey without simulation: its numbers and a picture of the plan."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
 from twin.report.wording import length, percent
 from twin.world.mission import Mission
 
-#: Noise of disparity that good texture allows [px]; the promised depth noise is proportional to it.
+#: Standard deviation of the disparity on good texture [px]; the predicted depth error is proportional to it.
 DISPARITY_SIGMA_PX = 0.1
 _SHADE_SAMPLES = 400
-#: What a swath of a pattern is called, and what a track has of it.
+#: Name of a swath of each pattern, and the swaths of a track.
 _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
 def numbers(mission: Mission) -> list[tuple[str, str]]:
-    """The plan's figures in words, in the order in which they follow from each other."""
+    """Returns name and value of the numbers of a plan, each after those that it depends on."""
     f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     width_m, height_m = f.footprint_m
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]
@@ -37,24 +37,24 @@ def numbers(mission: Mission) -> list[tuple[str, str]]:
         (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
         ("keyframes", f"{f.n_keyframes}"),
         ("frames", f"{mission.n_frames}"),
-        ("time", f"{f.duration_s + hold_s:.0f} s, {hold_s:.0f} s of it keeping station"),
+        ("time", f"{f.duration_s + hold_s:.0f} s, of which {hold_s:.0f} s station keeping"),
         ("path", length(f.path_m)),
         ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
         ("footprint", f"{length(width_m)} across, {length(height_m)} along"),
-        ("spacing", f"{length(f.keyframe_spacing_m)} of keyframes, {length(f.swath_spacing_m)} of {swath}s"),
+        ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {length(f.swath_spacing_m)} between {swath}s"),
         ("overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("disparity", f"{f.disparity_px:.1f} px"),
-        ("depth noise", f"{length(f.depth_sigma_m)} (1 sigma, for {DISPARITY_SIGMA_PX:g} px of disparity)"),
+        ("depth error", f"{length(f.depth_sigma_m)} (1 sigma, for a disparity error of {DISPARITY_SIGMA_PX:g} px)"),
     ]
 
 
 def draw(mission: Mission, file: Path) -> Path:
-    """Writes a picture of the plan from above: floor, path, keyframe footprint, area."""
+    """Writes a PNG of the plan from above: sea floor, path, footprint of an image, area. Returns the file."""
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(7.5, 6.5))
         axes = figure.add_subplot()
-        _floor(axes, mission)
-        _path(axes, mission)
+        _draw_floor(axes, mission)
+        _draw_path(axes, mission)
         axes.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
         axes.set_aspect("equal")
         figure.legend(loc="outside lower center", ncols=4)
@@ -63,8 +63,8 @@ def draw(mission: Mission, file: Path) -> Path:
     return file
 
 
-def _floor(axes: Axes, mission: Mission) -> None:
-    """The floor, shaded, with its height as contours."""
+def _draw_floor(axes: Axes, mission: Mission) -> None:
+    """Draws the shaded sea floor with height contours."""
     t = mission.terrain
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
     height = t.height_at(*np.meshgrid(x, y))
@@ -76,7 +76,8 @@ def _floor(axes: Axes, mission: Mission) -> None:
         axes.clabel(contours, fmt="%.2f m", fontsize=7)
 
 
-def _path(axes: Axes, mission: Mission) -> None:
+def _draw_path(axes: Axes, mission: Mission) -> None:
+    """Draws the planned path, the footprint of the first image and the area."""
     path = mission.plan.outline()
     axes.plot(path[:, 0], path[:, 1], color=COLOURS["online"], label=f"{LABELS['reference']} path")
     axes.plot(*path[0, :2], "o", color=COLOURS["final"], label="start")
@@ -88,7 +89,7 @@ def _path(axes: Axes, mission: Mission) -> None:
 
 
 def _area(mission: Mission, **style) -> Patch:
-    """The outline of what is to be covered."""
+    """Returns the outline of the survey area."""
     area_x, area_y = mission.plan.area_m
     if mission.scenario.plan.pattern == "loops":
         return Circle((0, 0), area_x / 2, **style)

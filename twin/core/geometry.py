@@ -1,7 +1,7 @@
-"""Rigid motions: the one home of every rotation, quaternion and axis convention.
+"""Rigid motions: all rotation, quaternion and axis conventions are defined here.
 
-A pose is a 4x4 homogeneous matrix named ``world_from_camera``; inner names cancel in products. A small motion is a
-6-vector ``[rotation, translation]`` (rad, m), applied on the right: ``pose @ exp(motion)``: gtsam's order.
+A pose is a 4x4 homogeneous matrix named ``world_from_camera``; in products, adjacent inner names cancel. A small motion
+is a twist ``[rotation, translation]`` (rad, m), applied on the right, ``pose @ exp(motion)``, in the order of GTSAM.
 
 World: x east, y north, z up. Body: x forward, y left, z up. Camera: x right, y down, z forward. Pixel (0, 0) is the
 centre of the top-left pixel.
@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: A camera that looks straight down with the top of its image towards the bow: columns are its axes in the body.
+#: Rotation of a camera that looks straight down, with the top of the image towards the bow.
 BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 @njit(cache=True, nogil=True)
 def put(target: Array, values: Array) -> None:
-    """target[...] = values, both of one shape (n,) or (n, m).
+    """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
-    numba's own brings the text of an error that cannot happen here into all who call it: a third of all compiled code.
+    Numba's own slice assignment compiles an error message for unequal shapes into every caller, a third of all
+    compiled code.
     """
     for i in range(target.shape[0]):
         if target.ndim == 1:
@@ -35,13 +36,13 @@ def put(target: Array, values: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def skew(v: Array) -> Array:
-    """The matrix whose product with x is the cross product v x x. (3,) -> (3, 3)."""
+    """Returns the skew-symmetric matrix (3, 3) of a vector (3,): skew(v) @ x is the cross product of v and x."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @njit(cache=True, nogil=True)
 def pose(rotation: Array, position: Array) -> Array:
-    """A pose from a (3, 3) rotation and a (3,) position [m]."""
+    """Returns the pose (4, 4) with a rotation (3, 3) and a position (3,) [m]."""
     result = np.zeros((4, 4))
     put(result[:3, :3], rotation)
     put(result[:3, 3], position)
@@ -51,7 +52,7 @@ def pose(rotation: Array, position: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def inverse(a_from_b: Array) -> Array:
-    """b_from_a, exactly rigid. (4, 4) -> (4, 4)."""
+    """Returns b_from_a (4, 4), with the transposed rotation."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(3):
@@ -63,7 +64,7 @@ def inverse(a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def compose(a_from_b: Array, b_from_c: Array) -> Array:
-    """a_from_c, of poses (4, 4): their product in a third of the time that it takes a library for large matrices."""
+    """Returns a_from_c (4, 4). Takes a third of the time of a matrix product by BLAS."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(4):
@@ -77,7 +78,7 @@ def compose(a_from_b: Array, b_from_c: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def sandwich(matrix: Array, cov: Array) -> Array:
-    """matrix cov matrix' (6, 6), of a symmetric cov, symmetric to the last bit."""
+    """Returns matrix @ cov @ matrix.T (6, 6) of a symmetric cov, symmetric to the last bit."""
     half, result = np.empty((6, 6)), np.empty((6, 6))
     for i in range(6):
         for k in range(6):
@@ -96,7 +97,7 @@ def sandwich(matrix: Array, cov: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def product(a: Array, b: Array) -> Array:
-    """a b, of matrices as small as a rotation. (n, m), (m, k) -> (n, k)."""
+    """Returns the product (n, k) of small matrices (n, m) and (m, k), without BLAS."""
     result = np.zeros((a.shape[0], b.shape[1]))
     for i in range(a.shape[0]):
         for k in range(b.shape[1]):
@@ -105,21 +106,24 @@ def product(a: Array, b: Array) -> Array:
     return result
 
 
-def rigid(almost: Array) -> Array:
-    """The rigid motion nearest to a product of many: `inverse` doubles what a rotation lacks of orthogonality.
+def nearest_rigid(matrices: Array) -> Array:
+    """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    (..., 4, 4) -> (..., 4, 4)
+    Removes rounding errors from long products of motions: `inverse` doubles a deviation from orthogonality.
     """
-    return _rigid(np.ascontiguousarray(almost).reshape(-1, 4, 4)).reshape(almost.shape)
+    return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
 
 @njit(cache=True, nogil=True)
-def _rigid(almost):
-    """Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986). (n, 4, 4) -> (n, 4, 4)."""
-    result = almost.copy()
+def _nearest_rigid(matrices):
+    """Compiled kernel of `nearest_rigid` for matrices (n, 4, 4).
+
+    Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986).
+    """
+    result = matrices.copy()
     for motion in result:
         change = np.inf
-        while change > 1e-12:  # the next one is its square
+        while change > 1e-12:  # convergence is quadratic
             a, b, c = motion[0, :3], motion[1, :3], motion[2, :3]
             cofactors = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)))
             step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - motion[:3, :3])
@@ -130,30 +134,34 @@ def _rigid(almost):
 
 @njit(cache=True, nogil=True)
 def so3_exp(w: Array) -> Array:
-    """Rotation matrix of a rotation vector [rad], by the formula of Rodrigues, exact near identity. (3,) -> (3, 3)."""
+    """Returns the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula.
+
+    Near the identity the coefficients are computed by their Taylor series.
+    """
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-4:
         a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    return _of_powers(w, a, b)
+    return _skew_polynomial(w, a, b)
 
 
 @njit(cache=True, nogil=True)
 def _left_jacobian(w: Array) -> Array:
+    """Returns the left Jacobian (3, 3) of SO(3) at a rotation vector (3,): it maps translations in `exp`."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-3:
         a, b = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
     else:
         a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
-    return _of_powers(w, a, b)
+    return _skew_polynomial(w, a, b)
 
 
 @njit(cache=True, nogil=True)
-def _of_powers(w: Array, a: float, b: float) -> Array:
-    """I + a K + b K^2 with K the cross product by w; K^2 = w w' - |w|^2 I."""
+def _skew_polynomial(w: Array, a: float, b: float) -> Array:
+    """Returns I + a K + b K^2 (3, 3) with K = skew(w) and K^2 = w w' - |w|^2 I."""
     x, y, z = w[0], w[1], w[2]
     angle2 = x * x + y * y + z * z
     result = np.empty((3, 3))
@@ -168,12 +176,12 @@ def _of_powers(w: Array, a: float, b: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def so3_log(rotation: Array) -> Array:
-    """Rotation vector [rad] of a rotation matrix, angle in [0, pi]. (3, 3) -> (3,)."""
+    """Returns the rotation vector (3,) [rad] of a rotation matrix (3, 3), with an angle in [0, pi]."""
     w = np.empty(3)
     w[0], w[1], w[2] = rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]
     sine = 0.5 * np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     cosine = 0.5 * (rotation[0, 0] + rotation[1, 1] + rotation[2, 2] - 1.0)
-    if cosine < -0.9:  # near half a turn the difference above says little: the axis is in the diagonal
+    if cosine < -0.9:  # near an angle of pi, w vanishes: the axis follows from the symmetric part
         i = 0
         for k in range(1, 3):
             if rotation[k, k] > rotation[i, i]:
@@ -182,8 +190,8 @@ def so3_log(rotation: Array) -> Array:
         for k in range(3):
             axis[k] = 0.5 * (rotation[i, k] + rotation[k, i]) - (cosine if k == i else 0.0)
         length = np.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
-        forth = axis[0] * w[0] + axis[1] * w[1] + axis[2] * w[2] >= 0
-        return axis * ((1.0 if forth else -1.0) * np.arctan2(sine, cosine) / length)
+        same_sign = axis[0] * w[0] + axis[1] * w[1] + axis[2] * w[2] >= 0
+        return axis * ((1.0 if same_sign else -1.0) * np.arctan2(sine, cosine) / length)
     scale = 0.5 if sine < 1e-8 else 0.5 * np.arctan2(sine, cosine) / sine
     for k in range(3):
         w[k] *= scale
@@ -192,7 +200,7 @@ def so3_log(rotation: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def exp(motion: Array) -> Array:
-    """Pose reached by a twist [rotation, translation] (rad, m) held for unit time. (6,) -> (4, 4)."""
+    """Returns the pose (4, 4) that a constant twist (6,) [rotation, translation] (rad, m) reaches in unit time."""
     w, result = motion[:3], np.zeros((4, 4))
     jacobian = _left_jacobian(w)
     put(result[:3, :3], so3_exp(w))
@@ -205,43 +213,43 @@ def exp(motion: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def log(a_from_b: Array) -> Array:
-    """Twist [rotation, translation] of a pose: the inverse of `exp`. (4, 4) -> (6,)."""
+    """Returns the twist (6,) [rotation, translation] (rad, m) of a pose (4, 4), the inverse of `exp`."""
     w, result = so3_log(a_from_b[:3, :3]), np.zeros(6)
-    c, _ = _of_half_turn(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    inward = _of_powers(w, -0.5, c)
+    c, _ = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    inverse_jacobian = _skew_polynomial(w, -0.5, c)
     for i in range(3):
         result[i] = w[i]
         for k in range(3):
-            result[3 + i] += inward[i, k] * a_from_b[k, 3]
+            result[3 + i] += inverse_jacobian[i, k] * a_from_b[k, 3]
     return result
 
 
 @njit(cache=True, nogil=True)
 def log_derivative(motion: Array) -> Array:
-    """The matrix J with log(exp(motion) exp(d)) = motion + J d for small d. (6,) -> (6, 6).
+    """Returns the inverse right Jacobian (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) = motion + J d.
 
-    Of the rotation alone it is I + K / 2 + c K^2 with K the cross product by w. Motions are rotations by dual numbers
-    w + e v, so that the part by which a rotation moves the position is that matrix's derivative along v (Selig 2005).
+    For the rotation alone it is I + K / 2 + c K^2 with K = skew(w). A motion is a rotation by the dual vector w + e v,
+    so the block of translation by rotation is the derivative of that matrix along v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
-    c, slope = _of_half_turn(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    c, slope = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     along = w[0] * v[0] + w[1] * v[1] + w[2] * v[2]
-    of_rotation = _of_powers(w, 0.5, c)
-    square = _of_powers(w, 0.0, 2.0 * slope * along)
-    lever = 0.5 * skew(v)
+    rotation_block = _skew_polynomial(w, 0.5, c)
+    square = _skew_polynomial(w, 0.0, 2.0 * slope * along)
+    coupling = 0.5 * skew(v)
     for i in range(3):
         for k in range(3):
-            lever[i, k] += c * (v[i] * w[k] + w[i] * v[k]) + square[i, k]
-        lever[i, i] -= 2.0 * c * along + 1.0
-    put(result[:3, :3], of_rotation)
-    put(result[3:, 3:], of_rotation)
-    put(result[3:, :3], lever)
+            coupling[i, k] += c * (v[i] * w[k] + w[i] * v[k]) + square[i, k]
+        coupling[i, i] -= 2.0 * c * along + 1.0
+    put(result[:3, :3], rotation_block)
+    put(result[3:, 3:], rotation_block)
+    put(result[3:, :3], coupling)
     return result
 
 
 @njit(cache=True, nogil=True)
-def _of_half_turn(angle2: float) -> tuple[float, float]:
-    """c = 1 / a^2 - cot(a / 2) / (2 a) of an angle a, and its derivative by a^2; by the square of the angle."""
+def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
+    """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and its derivative by a^2, given the squared angle a^2."""
     if angle2 < 1e-2:
         return (
             1 / 12 + angle2 * (1 / 720 + angle2 * (1 / 30240 + angle2 / 1209600)),
@@ -255,7 +263,7 @@ def _of_half_turn(angle2: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True)
 def adjoint(a_from_b: Array) -> Array:
-    """The 6x6 matrix that carries a motion in b into a: a_from_b exp(m) = exp(Ad m) a_from_b."""
+    """Returns the adjoint Ad (6, 6) of a pose: a_from_b exp(m) = exp(Ad m) a_from_b for motions m in b."""
     result = np.zeros((6, 6))
     x, y, z = a_from_b[0, 3], a_from_b[1, 3], a_from_b[2, 3]
     for k in range(3):
@@ -268,13 +276,13 @@ def adjoint(a_from_b: Array) -> Array:
 
 
 def transform(a_from_b: Array, points_b: Array) -> Array:
-    """Points (n, 3) of b in a."""
+    """Transforms points (n, 3) from b to a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 @njit(cache=True, nogil=True)
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """world_from_body rotation: yaw about z, then pitch about y, then roll about x (rad, intrinsic z-y'-x'')."""
+    """Returns the rotation world_from_body (3, 3) of angles [rad]: yaw about z, pitch about y', roll about x''."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     cy, sy = np.cos(yaw), np.sin(yaw)
     return np.array(
@@ -288,43 +296,46 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def rpy_from_rotation(rotation: Array) -> Array:
-    """[roll, pitch, yaw] (rad) of world_from_body: the inverse of `rotation_from_rpy`. (3, 3) -> (3,).
+    """Returns roll, pitch, yaw (3,) [rad] of the rotation world_from_body (3, 3), the inverse of `rotation_from_rpy`.
 
-    Straight up or down, where only their difference is known, roll is zero.
+    At a pitch of +-90 deg, where only a combination of roll and yaw is defined, roll is zero.
     """
-    level = np.hypot(rotation[0, 0], rotation[1, 0])
-    pitch = np.arctan2(-rotation[2, 0], level)
-    if level < 1e-12:
+    horizontal = np.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = np.arctan2(-rotation[2, 0], horizontal)
+    if horizontal < 1e-12:
         return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
     return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
 @njit(cache=True, nogil=True)
 def wrap_angle(angle: Array) -> Array:
-    """The same angles in [-pi, pi) (rad)."""
+    """Returns angles wrapped to [-pi, pi) [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def quaternion_wxyz(rotation: Array) -> Array:
-    """MuJoCo's quaternion [w, x, y, z] of a rotation matrix, w >= 0."""
+    """Returns the quaternion [w, x, y, z] (MuJoCo's order) of a rotation matrix (3, 3), w >= 0."""
     return quaternion_xyzw(rotation)[[3, 0, 1, 2]]
 
 
 def rotation_from_wxyz(quaternion: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of MuJoCo's quaternions [w, x, y, z] (..., 4)."""
-    from scipy.spatial.transform import Rotation  # here: it takes 0.15 s and 20 MB, and most surveys need none
+    """Returns the rotation matrices (..., 3, 3) of quaternions [w, x, y, z] (..., 4) in MuJoCo's order."""
+    from scipy.spatial.transform import Rotation  # takes 0.15 s and 20 MB to import, and most surveys do not need it
 
     return Rotation.from_quat(np.asarray(quaternion)[..., [1, 2, 3, 0]]).as_matrix()
 
 
 def quaternion_xyzw(rotation: Array) -> Array:
-    """Rerun's and TUM's quaternion [x, y, z, w] of a rotation matrix, w >= 0."""
+    """Returns the quaternion [x, y, z, w] (order of Rerun and TUM) of a rotation matrix (3, 3), w >= 0."""
     return quaternions_xyzw(np.asarray(rotation, np.float64)[None])[0]
 
 
 @njit(cache=True, nogil=True)
 def quaternions_xyzw(rotations: Array) -> Array:
-    """The same of many: (n, 3, 3) -> (n, 4), from the largest of the four for precision (Shepperd 1978)."""
+    """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0.
+
+    Computed from the component of largest magnitude, for precision (Shepperd 1978).
+    """
     out = np.empty((len(rotations), 4))
     for k in range(len(rotations)):
         r = rotations[k]
@@ -343,6 +354,6 @@ def quaternions_xyzw(rotations: Array) -> Array:
 
 
 def heading_of_camera(world_from_camera: Array) -> Array:
-    """Heading of the bow [rad, counter-clockwise from east] of down-looking cameras. (..., 4, 4) -> (...)."""
+    """Returns the heading of the bow (...) [rad, counter-clockwise from east] of down-looking cameras (..., 4, 4)."""
     forward = -world_from_camera[..., :3, 1]  # the top of the image
     return np.arctan2(forward[..., 1], forward[..., 0])

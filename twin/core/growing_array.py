@@ -1,4 +1,4 @@
-"""Arrays that grow at their end."""
+"""Array that grows along its first axis."""
 
 from __future__ import annotations
 
@@ -7,39 +7,44 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-_ROOM = 2**17
+_INITIAL_CAPACITY = 2**17
 
 
-class Rows:
-    """Rows of one shape, one after another in one array; its room doubles when it is full.
+class GrowingArray:
+    """Contiguous array of rows of one shape; its capacity doubles when it is full.
 
-    It begins with what most surveys need: pages that nothing is written to take no memory, copies to new room do.
+    The initial capacity covers most surveys. Pages that are never written take no memory, so a large buffer is cheaper
+    than the copies of a growing one.
+
+    Args:
+        shape: of one row; nothing for scalars.
+        dtype: of the elements.
     """
 
-    def __init__(self, *shape: int, kind: DTypeLike = float):
-        self._room, self._n = np.empty((_ROOM, *shape), kind), 0
+    def __init__(self, *shape: int, dtype: DTypeLike = float):
+        self._buffer, self._n = np.empty((_INITIAL_CAPACITY, *shape), dtype), 0
 
     @classmethod
-    def of(cls, rows: NDArray[Any]) -> Rows:
-        """These (n, *shape), and more to come."""
-        made = cls.__new__(cls)
-        made._room, made._n = rows, len(rows)
-        return made
+    def wrap(cls, rows: NDArray[Any]) -> GrowingArray:
+        """Returns a growing array that holds the rows (n, *shape) without a copy."""
+        wrapped = cls.__new__(cls)
+        wrapped._buffer, wrapped._n = rows, len(rows)
+        return wrapped
 
     def __len__(self) -> int:
         return self._n
 
     @property
     def array(self) -> NDArray[Any]:
-        """All of them so far (n, *shape), a view."""
-        return self._room[: self._n]
+        """Returns all rows (n, *shape), a view of the buffer."""
+        return self._buffer[: self._n]
 
-    def add(self, rows: ArrayLike) -> None:
-        """Adds one row (*shape) or more (k, *shape)."""
-        rows = np.asarray(rows).reshape(-1, *self._room.shape[1:])
+    def append(self, rows: ArrayLike) -> None:
+        """Appends one row (*shape) or several (k, *shape)."""
+        rows = np.asarray(rows).reshape(-1, *self._buffer.shape[1:])
         end = self._n + len(rows)
-        if end > len(self._room):
-            grown = np.empty((max(end, 2 * len(self._room)), *self._room.shape[1:]), self._room.dtype)
+        if end > len(self._buffer):
+            grown = np.empty((max(end, 2 * len(self._buffer)), *self._buffer.shape[1:]), self._buffer.dtype)
             grown[: self._n] = self.array
-            self._room = grown
-        self._room[self._n : end], self._n = rows, end
+            self._buffer = grown
+        self._buffer[self._n : end], self._n = rows, end

@@ -1,4 +1,4 @@
-"""The measured motions of the keyframe network, one by one and by columns."""
+"""Measured motions between nodes of the keyframe network, as single records and as columns."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.growing_array import Rows
+from twin.core.growing_array import GrowingArray
 
 
 class Link(NamedTuple):
-    """One connection of the keyframe network: the measured motion between two nodes.
+    """Measured motion between two nodes of the keyframe network.
 
     Args:
         i, j: keyframe numbers, i < j.
         i_from_j: (4, 4) pose of camera j in camera i.
-        cov: (6, 6) covariance of [rotation, translation] in j (rad, m).
-        overlap: share of image j that is seen in image i (0 to 1).
-        n_points: matched points used; 0 where frame-to-frame motion stands in.
-        shared_by: links of node j that rest on its one stereo look: `cov` is that of this motion alone, so many times.
-        closed_form: (4, 4) the same motion by eq. (2), depth taken as exact; None without.
+        cov: (6, 6) covariance of [rotation, translation] (rad, m) in camera j, as used by the alignment.
+        overlap: fraction of image j that is visible in image i (0 to 1).
+        n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
+        shared_by: number of links that share the stereo observation of node j. Their errors are correlated, which `cov`
+            accounts for: it is this many times the covariance of the single measurement.
+        closed_form: (4, 4) motion by the closed form of eq. (2), with depth treated as exact; None: not computed.
     """
 
     i: int
@@ -36,7 +37,7 @@ class Link(NamedTuple):
 
     @property
     def own_cov(self) -> Array:
-        """(6, 6) covariance of this motion alone, beside no other link of its node."""
+        """Returns the covariance (6, 6) of this measurement by itself, without the other links of its node."""
         return self.cov / self.shared_by
 
 
@@ -49,33 +50,33 @@ _LINK = np.dtype(
 
 
 class Links(Sequence[Link]):
-    """Many links by columns, as arrays; one by one where speed does not matter."""
+    """Sequence of links stored as columns, for vectorised access; access to single links is slower."""
 
     def __init__(self, links: Iterable[Link] = ()):
-        self._rows = Rows(kind=_LINK)
+        self._rows = GrowingArray(dtype=_LINK)
         self._closed_forms: list[Array | None] = []
-        self._new = list(links)  # not among the rows yet
+        self._pending = list(links)  # added, but not yet converted to rows
 
     @classmethod
-    def of(cls, links: Sequence[Link]) -> Links:
-        """These by columns."""
+    def from_sequence(cls, links: Sequence[Link]) -> Links:
+        """Returns the links as columns; the argument itself if it is stored so already."""
         return links if isinstance(links, cls) else cls(links)
 
     def add(self, links: Iterable[Link]) -> None:
-        """Appends."""
-        self._new += links
+        """Appends links."""
+        self._pending += links
 
-    def kept(self, mask: NDArray[np.bool_]) -> Links:
-        """Those of a mask (n,); these themselves where all are."""
+    def select(self, mask: NDArray[np.bool_]) -> Links:
+        """Returns the links where the mask (n,) is true; this object itself if it is true everywhere."""
         if mask.all():
             return self
-        kept = Links()
-        kept._rows = Rows.of(self._table[mask])
-        kept._closed_forms = [form for form, stays in zip(self._closed_forms, mask.tolist(), strict=True) if stays]
-        return kept
+        selected = Links()
+        selected._rows = GrowingArray.wrap(self._table[mask])
+        selected._closed_forms = [form for form, keep in zip(self._closed_forms, mask.tolist(), strict=True) if keep]
+        return selected
 
     def __len__(self) -> int:
-        return len(self._rows) + len(self._new)
+        return len(self._rows) + len(self._pending)
 
     @overload
     def __getitem__(self, k: int) -> Link: ...
@@ -85,73 +86,75 @@ class Links(Sequence[Link]):
 
     def __getitem__(self, k: int | slice) -> Link | list[Link]:
         if isinstance(k, slice):
-            return [self[at] for at in range(*k.indices(len(self)))]
+            return [self[index] for index in range(*k.indices(len(self)))]
         i, j, i_from_j, information, overlap, n_points, shared_by = self._table[k]
         numbers = float(overlap), int(n_points), int(shared_by)
-        return Link(int(i), int(j), i_from_j, inverses(information[None])[0], *numbers, self._closed_forms[k])
+        cov = symmetric_inverses(information[None])[0]
+        return Link(int(i), int(j), i_from_j, cov, *numbers, self._closed_forms[k])
 
     @property
     def i(self) -> NDArray[np.int64]:
-        """(n,) numbers of the earlier keyframes."""
+        """Returns the numbers (n,) of the earlier keyframes."""
         return self._table["i"]
 
     @property
     def j(self) -> NDArray[np.int64]:
-        """(n,) numbers of the later ones."""
+        """Returns the numbers (n,) of the later keyframes."""
         return self._table["j"]
 
     @property
     def i_from_j(self) -> Array:
-        """(n, 4, 4) motions."""
+        """Returns the measured motions (n, 4, 4)."""
         return self._table["i_from_j"]
 
     @property
     def cov(self) -> Array:
-        """(n, 6, 6) their covariances."""
-        return inverses(self.information)
+        """Returns the covariances (n, 6, 6) of [rotation, translation] (rad, m)."""
+        return symmetric_inverses(self.information)
 
     @property
     def own_cov(self) -> Array:
-        """(n, 6, 6) those of each alone."""
+        """Returns the covariances (n, 6, 6) of the single measurements, see `Link.own_cov`."""
         return self.cov / self._table["shared_by"][:, None, None]
 
     @property
     def information(self) -> Array:
-        """(n, 6, 6) inverse covariances, which is what is kept."""
+        """Returns the information matrices (n, 6, 6), the inverses of `cov`."""
         return self._table["information"]
 
     @property
     def n_points(self) -> NDArray[np.int64]:
-        """(n,) matched points; 0 where frame-to-frame motion stands in."""
+        """Returns the numbers (n,) of matched points; 0 for frame-to-frame motion."""
         return self._table["n_points"]
 
     @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
-        """Which links (n,) have a closed form, and theirs (m, 4, 4)."""
-        self._settle()
-        found = [form for form in self._closed_forms if form is not None]
-        return np.array([form is not None for form in self._closed_forms], bool), np.array(found).reshape(-1, 4, 4)
+        """Returns a mask (n,) of the links with a closed-form motion, and these motions (m, 4, 4)."""
+        self._convert_pending()
+        motions = [form for form in self._closed_forms if form is not None]
+        return np.array([form is not None for form in self._closed_forms], bool), np.array(motions).reshape(-1, 4, 4)
 
     @property
     def _table(self) -> NDArray[Any]:
-        self._settle()
+        """Returns all links as a structured array (n,)."""
+        self._convert_pending()
         return self._rows.array
 
-    def _settle(self) -> None:
-        """Gives new ones their rows, many at a time."""
-        if self._new:
-            new, self._new = self._new, []
-            *columns, closed_forms = zip(*new, strict=True)
-            table = np.empty(len(new), _LINK)
+    def _convert_pending(self) -> None:
+        """Converts added links to rows, all at once."""
+        if self._pending:
+            pending, self._pending = self._pending, []
+            *columns, closed_forms = zip(*pending, strict=True)
+            table = np.empty(len(pending), _LINK)
             for name, column in zip(_LINK.names or (), columns, strict=True):
-                table[name] = inverses(np.array(column)) if name == "information" else column
-            self._rows.add(table)
+                table[name] = symmetric_inverses(np.array(column)) if name == "information" else column
+            self._rows.append(table)
             self._closed_forms += closed_forms
 
 
-def inverses(covs: Array) -> Array:
-    """Information of covariances (m, d, d), or the other way round; symmetric to the last bit."""
-    found = np.asarray(np.linalg.inv(covs), np.float64)
-    found = found + found.transpose(0, 2, 1)
-    found /= 2
-    return found
+def symmetric_inverses(matrices: Array) -> Array:
+    """Returns the inverses (m, d, d) of symmetric matrices (m, d, d), symmetric to the last bit."""
+    inverse = np.asarray(np.linalg.inv(matrices), np.float64)
+    inverse = inverse + inverse.transpose(0, 2, 1)
+    inverse /= 2
+    return inverse

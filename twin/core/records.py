@@ -1,4 +1,4 @@
-"""What passes between the rooms: frames (all an estimator may see), truth beside them, estimates, and their files."""
+"""Records that are exchanged between packages: calibration, frames, readings, estimates, maps, and the truth."""
 
 from __future__ import annotations
 
@@ -18,74 +18,120 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class StereoRig:
-    """The rig as its maker believes it: two equal rectified pinhole cameras, the right one at +x of the left.
+    """Believed calibration of a rectified stereo pair: two equal pinhole cameras, the right one at +x of the left one.
+
+    The cameras may look in any direction.
 
     Args:
         width_px, height_px: image size.
-        focal_px: focal length; the principal point is the image centre ((width - 1) / 2, (height - 1) / 2).
+        focal_px: focal length along the rows of the image (fx).
         baseline_m: distance between the cameras.
-        frame_rate_hz: frames per second.
+        frame_rate_hz: nominal number of frames per second; the times of the frames count where they differ from it.
         body_from_camera: (4, 4) pose of the left camera in the vehicle's body.
+        focal_y_px: focal length along the columns of the image (fy); equal to `focal_px` by default.
+        principal_point_px: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
     """
 
     width_px: int
     height_px: int
     focal_px: float
     baseline_m: float
-    frame_rate_hz: float
-    body_from_camera: Array
+    frame_rate_hz: float = 30.0
+    body_from_camera: Array = field(default_factory=lambda: np.eye(4))
+    focal_y_px: float | None = None
+    principal_point_px: tuple[float, float] | None = None
+
+    @property
+    def fx_px(self) -> float:
+        """Focal length along the rows of the image [px]."""
+        return self.focal_px
+
+    @property
+    def fy_px(self) -> float:
+        """Focal length along the columns of the image [px]."""
+        return self.focal_px if self.focal_y_px is None else self.focal_y_px
+
+    @property
+    def focals_px(self) -> Array:
+        """(fx, fy) [px]."""
+        return np.array([self.fx_px, self.fy_px])
 
     @property
     def cx_px(self) -> float:
-        return (self.width_px - 1) / 2
+        """Column of the principal point [px]."""
+        return (self.width_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[0]
 
     @property
     def cy_px(self) -> float:
-        return (self.height_px - 1) / 2
+        """Row of the principal point [px]."""
+        return (self.height_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[1]
 
     @property
     def matrix(self) -> Array:
         """(3, 3) camera matrix K of both cameras [px]."""
-        return np.array([[self.focal_px, 0, self.cx_px], [0, self.focal_px, self.cy_px], [0, 0, 1.0]])
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     @property
     def left_from_right(self) -> Array:
-        """(4, 4) pose of the right camera in the left."""
+        """(4, 4) pose of the right camera in the left camera."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
-        """The same rig where squares of `by` x `by` pixels are one; sides are multiples of it."""
-        size = self.width_px // by, self.height_px // by
-        return replace(self, width_px=size[0], height_px=size[1], focal_px=self.focal_px / by)
+        """Returns the rig of images whose pixels are blocks of `by` x `by` pixels of this one."""
+        if by == 1:
+            return self
+        centre = self.principal_point_px
+        return replace(
+            self,
+            width_px=self.width_px // by,
+            height_px=self.height_px // by,
+            focal_px=self.focal_px / by,
+            focal_y_px=None if self.focal_y_px is None else self.focal_y_px / by,
+            principal_point_px=centre and ((centre[0] + 0.5) / by - 0.5, (centre[1] + 0.5) / by - 0.5),
+        )
 
     def project(self, points: Array) -> Array:
-        """Pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind it."""
+        """Returns the pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind the camera."""
         depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
-        return points[:, :2] / depth_m * self.focal_px + [self.cx_px, self.cy_px]
+        return points[:, :2] / depth_m * self.focals_px + [self.cx_px, self.cy_px]
+
+    def normalised(self, pixels: NDArray[np.floating]) -> Array:
+        """Returns (x, y) = (pixel - principal point) / focal length, (n, 2), of pixels (n, 2)."""
+        return (pixels.astype(np.float64) - [self.cx_px, self.cy_px]) / self.focals_px
 
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """What is believed of the navigation sensors: standard deviations by their data sheets, beacons by a survey.
+    """Believed noise of the navigation sensors: standard deviations by data sheet, and surveyed beacon positions.
 
     Args:
-        dvl_mps: white noise of each axis of velocity.
-        dvl_scale: of the scale error, one for a whole survey (the speed of sound and the beams' angles are not exact).
-        beacons_m: (x, y, z) of each beacon in the world, taken as exact.
+        pressure_m: height from pressure [m].
+        attitude_rad: roll and pitch [rad].
+        heading_rad: heading [rad].
+        dvl_mps: white noise of each axis of the velocity [m/s].
+        dvl_scale: relative scale error, constant over a survey (speed of sound, beam angles).
+        usbl_m: each axis of an acoustic position fix [m].
+        beacon_px: column and row of a beacon in the image [px].
+        beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
     """
 
-    pressure_m: float
-    attitude_rad: float
-    heading_rad: float
+    pressure_m: float = 0.01
+    attitude_rad: float = float(np.deg2rad(0.2))
+    heading_rad: float = float(np.deg2rad(0.5))
     dvl_mps: float = 0.005
     dvl_scale: float = 0.002
     usbl_m: float = 0.3
     beacon_px: float = 0.2
     beacons_m: tuple[tuple[float, float, float], ...] = ()
 
+    @property
+    def attitude_sigmas_rad(self) -> Array:
+        """Returns the standard deviations (3,) of roll, pitch and yaw [rad]."""
+        return np.array([self.attitude_rad, self.attitude_rad, self.heading_rad])
+
 
 class Sighting(NamedTuple):
-    """A beacon in the left image: which one of those surveyed (from 0), and its (column, row) [px]."""
+    """A beacon detected in the left image: its index among the surveyed beacons, and its (column, row) [px]."""
 
     beacon: int
     pixel: tuple[float, float]
@@ -93,14 +139,14 @@ class Sighting(NamedTuple):
 
 @dataclass(frozen=True)
 class Readings:
-    """What the navigation sensors said with this frame; None where a sensor is not fitted or has nothing new.
+    """Readings of the navigation sensors at a frame; None where a sensor is not fitted or has no new reading.
 
     Args:
         pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
         ahrs_rpy_rad: (3,) roll, pitch, yaw of the body in the world [rad].
         dvl_mps: (3,) velocity of the body's origin over ground, in the body [m/s].
         usbl_m: (3,) position of the left camera in the world, at some keyframes [m].
-        beacons: those in view, at keyframes.
+        beacons: the beacons in view, at keyframes.
     """
 
     pressure_z_m: float | None = None
@@ -111,40 +157,50 @@ class Readings:
 
 
 class Displacement(NamedTuple):
-    """How far the body's origin went since a node, in the body's axes at that node.
+    """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node.
 
     Args:
         since: number of that node.
-        metres: (3,) as the log says; its scale error makes it (1 + s) times too long, in the whole survey alike.
-        cov: (3, 3) by the log's white noise and the error of the attitude between.
+        displacement_m: (3,) measured; the scale error s, constant over the survey, makes it 1 + s times the true
+            displacement.
+        cov: (3, 3) covariance by the white noise of the DVL and the attitude error since the node; without scale error.
     """
 
     since: int
-    metres: Array
+    displacement_m: Array
     cov: Array
 
 
 @dataclass(frozen=True)
 class Frame:
-    """All that an estimator gets: time, images (H, W, 3) uint8 RGB, readings; the right image at keyframes."""
+    """Input of the estimators at one time.
+
+    Args:
+        index: number of the frame, from 0.
+        time_s: time of the exposure [s].
+        left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
+        readings: of the navigation sensors.
+        keyframe: whether the frame becomes a keyframe; None leaves the choice to the estimator.
+    """
 
     index: int
     time_s: float
     left: Image
     right: Image | None
-    readings: Readings
+    readings: Readings = field(default_factory=Readings)
+    keyframe: bool | None = None
 
 
 class Estimate(NamedTuple):
-    """Where the vehicle believes it is.
+    """Online estimate at one frame.
 
     Args:
         time_s: time of the frame.
         world_from_camera: (4, 4) pose of the left camera, online.
         f2f_from_start: (4, 4) pose of the left camera by frame-to-frame motion alone.
         camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
-        sigma_m: one standard deviation of the online position, root of the summed variances [m].
-        status: "ok", or why vision failed in this frame.
+        sigma_m: standard deviation of the online position, the root of the summed variances of x, y and z [m].
+        status: "ok", or the reason why vision failed at this frame.
     """
 
     time_s: float
@@ -157,7 +213,12 @@ class Estimate(NamedTuple):
 
 @dataclass
 class Trajectory:
-    """Poses of the left camera over time: times (n,) [s], world_from_camera (n, 4, 4)."""
+    """Poses of the left camera over time.
+
+    Args:
+        times_s: (n,) [s].
+        world_from_camera: (n, 4, 4).
+    """
 
     times_s: Array
     world_from_camera: Array
@@ -167,11 +228,11 @@ class Trajectory:
 
     @property
     def positions(self) -> Array:
-        """(n, 3) [m]"""
+        """(n, 3) positions of the left camera in the world [m]."""
         return self.world_from_camera[:, :3, 3]
 
     def save(self, path: Path) -> None:
-        """Writes TUM: time x y z qx qy qz qw, a line a pose."""
+        """Writes a TUM file: time x y z qx qy qz qw, one line per pose."""
         poses = self.world_from_camera
         rows = np.column_stack([self.times_s, self.positions, geometry.quaternions_xyzw(poses[:, :3, :3])])
         line = "%.6f" + " %.9g" * 7 + "\n"
@@ -179,7 +240,7 @@ class Trajectory:
 
     @staticmethod
     def load(path: Path) -> Trajectory:
-        """Reads a TUM file that `save` or another tool wrote."""
+        """Reads a TUM file."""
         rows = np.loadtxt(path, ndmin=2)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
@@ -188,7 +249,14 @@ class Trajectory:
 
 
 class Alignment(NamedTuple):
-    """One global alignment: which track closed it, its cost in time and size."""
+    """Size and cost of one global alignment.
+
+    Args:
+        track: last track of the window.
+        ms: wall time [ms].
+        nodes, edges: nodes and links of the window.
+        dropped: links rejected as outliers.
+    """
 
     track: int
     ms: float
@@ -198,12 +266,12 @@ class Alignment(NamedTuple):
 
 
 class StereoObservation(NamedTuple):
-    """What a look with both cameras had to go by, whether it made a keyframe or not.
+    """Image quality of one stereo pair, whether it became a keyframe or not.
 
     Args:
-        row: frame of the trajectory.
-        n_points: matched points; of a surrogate, those it stands for.
-        contrast: of the left image (`matching.contrast`); None where there is no image.
+        row: row of its frame in the trajectories.
+        n_points: matched points; with the surrogate, the number of points that it represents.
+        contrast: RMS contrast of the left image (`matching.contrast`); None without an image.
     """
 
     row: int
@@ -213,12 +281,18 @@ class StereoObservation(NamedTuple):
 
 @dataclass
 class SurveyResult:
-    """What the estimators leave behind: the three trajectories, the network and the map.
+    """Result of the estimators over a whole survey.
 
-    ``keyframe_rows`` are the rows of the trajectories that are keyframes, ``track_of_keyframe`` the track of each (from 1).
-    ``node_cov`` (n_keyframes, 6, 6) is the marginal covariance of each final keyframe pose, in the camera.
-    ``before_ga``/``after_ga`` hold per track the keyframes' positions (n, 3) just before and after its alignment.
-    ``stereo_observations`` are all with both cameras, also those that found too little for a keyframe.
+    Args:
+        f2f, online, final: trajectories by frame-to-frame motion alone, as estimated online, after the last alignment.
+        keyframe_rows: (n_keyframes,) rows of the trajectories that are keyframes.
+        track_of_keyframe: (n_keyframes,) number of the track of each, from 1.
+        node_cov: (n_keyframes, 6, 6) marginal covariance of each final pose [rotation, translation] in camera axes.
+        keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
+        links: measured motions of the network.
+        alignments: size and cost of each global alignment.
+        before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
+        stereo_observations: image quality of all stereo pairs, also of those with too few points for a keyframe.
     """
 
     f2f: Trajectory
@@ -227,16 +301,25 @@ class SurveyResult:
     keyframe_rows: NDArray[np.int64]
     track_of_keyframe: NDArray[np.int64]
     node_cov: Array
+    keyframe_depth_m: Array = field(default_factory=lambda: np.zeros(0))
     links: Links = field(default_factory=Links)
     alignments: list[Alignment] = field(default_factory=list)
     before_ga: list[Array] = field(default_factory=list)
     after_ga: list[Array] = field(default_factory=list)
     stereo_observations: list[StereoObservation] = field(default_factory=list)
 
+    @property
+    def step_cov(self) -> Array:
+        """(n_keyframes, 6, 6) covariance of each keyframe relative to the one before, zero where no link connects them."""
+        cov = np.zeros((len(self.keyframe_rows), 6, 6))
+        chain = self.links.j == self.links.i + 1
+        cov[self.links.j[chain]] = self.links.own_cov[chain]
+        return cov
+
 
 @dataclass(frozen=True)
 class MapGrid:
-    """The cells of every map of a survey: row 0 = north, (west_m, north_m) the outer corner of cell (0, 0)."""
+    """Cells of the maps of a survey: row 0 is the northernmost; (west_m, north_m) is the outer corner of cell (0, 0)."""
 
     west_m: float
     north_m: float
@@ -245,7 +328,7 @@ class MapGrid:
     cols: int
 
     def centres(self) -> tuple[Array, Array]:
-        """x (cols,) and y (rows,) of the cell centres [m]."""
+        """Returns x (cols,) and y (rows,) of the cell centres [m]."""
         return (
             self.west_m + (np.arange(self.cols, dtype=np.float64) + 0.5) * self.cell_m,
             self.north_m - (np.arange(self.rows, dtype=np.float64) + 0.5) * self.cell_m,
@@ -254,10 +337,10 @@ class MapGrid:
 
 @dataclass
 class ElevationMap:
-    """A digital elevation model with its uncertainty and orthophoto on a `MapGrid`; NaN (black) where nothing was seen.
+    """Digital elevation model with its uncertainty and orthomosaic; NaN (black) in cells without a measurement.
 
     Args:
-        height_m, sigma_m: (rows, cols) float32.
+        height_m, sigma_m: (rows, cols) float32, height and its standard deviation [m].
         mosaic: (rows, cols, 3) uint8 RGB.
     """
 
@@ -269,15 +352,15 @@ class ElevationMap:
 
 @dataclass
 class Truth:
-    """What only a simulator has; it meets the estimate in `judge` and nowhere else.
+    """Ground truth of a survey; it is compared with the estimate in `judge` and nowhere else.
 
     Args:
-        trajectory: true poses of the left camera, one a frame.
+        trajectory: true poses of the left camera, one per frame.
         reference: (n_frames, 3) planned positions of the left camera [m].
-        holding: (n_frames,) bool, true while keeping station.
+        holding: (n_frames,) bool, true during station keeping.
         track: (n_frames,) number of the track, from 1.
         height_m: (rows, cols) float32, true height at the cell centres of the survey's grid.
-        seen: (rows, cols) bool, cells that at least one keyframe truly saw with both cameras.
+        seen: (rows, cols) bool, cells that both cameras saw in at least one keyframe.
     """
 
     trajectory: Trajectory

@@ -1,20 +1,22 @@
-"""How long every stage took."""
+"""Stopwatch for the processing stages of a survey."""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 
-#: The stages of a survey, in the order of the data.
+#: Returns a context manager that times the named stage, such as a `Stopwatch`.
+StageTimer = Callable[[str], AbstractContextManager[None]]
+#: Stages of a survey, in processing order.
 STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map")
 
 
 class Stopwatch:
-    """Collects the durations of named stages; `with watch("f2f"): ...`."""
+    """Collects the durations of named stages: `with watch("f2f"): ...`."""
 
     def __init__(self) -> None:
         self._durations_s: dict[str, list[float]] = defaultdict(list)
@@ -28,15 +30,16 @@ class Stopwatch:
             self._durations_s[stage].append(time.perf_counter() - start)
 
     def durations_ms(self, stage: str) -> list[float]:
-        """Every duration of a stage, in order [ms]."""
+        """Returns all durations of a stage [ms], in order of measurement."""
         return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
 
     def summary(self) -> dict[str, dict[str, float | int | None]]:
-        """Per stage: count, mean and 95th percentile [ms], total [s]."""
+        """Returns count, mean and 95th percentile [ms] and total [s] of every stage."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
 
 
 def _summary(durations_s: list[float]) -> dict[str, float | int | None]:
+    """Returns count, mean and 95th percentile [ms] and total [s] of one stage."""
     if not durations_s:
         return {"count": 0, "mean_ms": None, "p95_ms": None, "total_s": 0.0}
     ms = np.array(durations_s) * 1e3

@@ -1,1 +1,33 @@
-"""The method: motion, positioning, alignment and mapping from frames alone."""
+"""The estimators as a library: path and elevation map of a stereo camera, from frames alone.
+
+`Navigator` processes frames one by one and builds the map at the end; see docs/estimators.md. Nothing here depends on
+the simulator, its scenarios or its missions.
+"""
+
+from twin.core.records import (
+    ElevationMap,
+    Estimate,
+    Frame,
+    MapGrid,
+    Readings,
+    SensorNoise,
+    StereoRig,
+    SurveyResult,
+    Trajectory,
+)
+from twin.core.settings import EstimatorSettings
+from twin.estimate.pipeline import Navigator
+
+__all__ = [
+    "ElevationMap",
+    "Estimate",
+    "EstimatorSettings",
+    "Frame",
+    "MapGrid",
+    "Navigator",
+    "Readings",
+    "SensorNoise",
+    "StereoRig",
+    "SurveyResult",
+    "Trajectory",
+]

@@ -1,8 +1,8 @@
-"""Global alignment (P15, P16): the poses of all nodes that agree best with the motions measured between them.
+"""Global alignment (P15, P16): maximum-likelihood poses of all nodes given the motions measured between them.
 
-Eliminating the multipliers of the mixed-adjustment model, eq. (7), leaves a least-squares problem whose blocks are the
-links. `pose_graph` solves it (with Huber weights) and gives the marginals. Links that contradict the rest are dropped
-and told.
+Eliminating the Lagrange multipliers of the mixed-adjustment model, eq. (7), leaves a least-squares problem with one
+residual block per link. It is solved as a factor graph with Huber loss; links that contradict all others are removed
+and reported.
 """
 
 from __future__ import annotations
@@ -16,22 +16,29 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
 from twin.core.records import SensorNoise, StereoRig
-from twin.estimate.adjustment import pose_graph
+from twin.estimate import adjustment
+from twin.estimate.adjustment import FactorGraph, GraphState, Solution
 from twin.estimate.navigation import aiding
 from twin.estimate.vision.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
 
-_OUTLIER_CHI2 = 40.0  # six degrees of freedom: one in 2 million
-_OF_THE_WORST = 0.01
-_ROUNDS = 10
-_MOST_ITERATIONS = 100
-_FEW_ITERATIONS = 10  # of a round: with gross links in, Huber's weights settle slowly
-_HUBER = 3.0
+_OUTLIER_CHI2 = 40.0  # of six degrees of freedom: exceeded by one inlier in 2 million
+_MIN_SHARE_OF_WORST = 0.01  # links with a chi2 below this share of the largest one are not removed in the same round
+_MAX_ROUNDS = 10
+_MAX_ITERATIONS = 100
+_ROUND_ITERATIONS = 10  # per round: with gross outliers in the graph, the Huber weights converge slowly
+_HUBER = 3.0  # standard deviations
 
 
-class Aligned(NamedTuple):
-    """Poses (n, 4, 4) and marginal covariances (n, 6, 6) of the nodes asked for, and the links that were dropped."""
+class AlignmentResult(NamedTuple):
+    """Result of a global alignment.
+
+    Args:
+        poses: (n, 4, 4) aligned world_from_camera of the nodes.
+        covs: (n, 6, 6) marginal covariances; zeros for nodes whose covariance was not requested.
+        dropped: links that were removed as outliers.
+    """
 
     poses: Array
     covs: Array
@@ -45,80 +52,90 @@ def align(
     rig: StereoRig,
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
-) -> Aligned:
+) -> AlignmentResult:
     """Aligns a window of nodes.
 
     Args:
-        nodes: of the window, with their poses so far as start values.
+        nodes: nodes of the window; their poses are the initial values.
         links: motions between nodes of the window.
-        anchors: number of each held node: its covariance (6, 6) [rotation, translation].
-        rig, noise: calibration as believed.
-        marginals_of: numbers of the few nodes whose covariance is wanted, zeros for the others; all if None.
+        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node, by number.
+        rig, noise: nominal calibration.
+        marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
-        LinAlgError: the links do not hold every node.
+        LinAlgError: links and readings do not constrain every node.
     """
-    places = {node.number: k for k, node in enumerate(nodes)}
-    fit = _Fit(Links.of(links), places, _graph(nodes, links, anchors, places, rig, noise))
+    index_of = {node.number: k for k, node in enumerate(nodes)}
+    graph = _factor_graph(nodes, links, anchors, rig, noise)
+    window = _Window(Links.from_sequence(links), index_of, graph)
     dropped: list[Link] = []
-    found = fit.optimise(pose_graph.State(np.array([node.world_from_camera for node in nodes])), _FEW_ITERATIONS)
-    for _ in range(_ROUNDS):
-        wrong = fit.contradictions(found.chi2[0])
-        if not wrong.any():
+    solution = window.optimise(GraphState(np.array([node.world_from_camera for node in nodes])), _ROUND_ITERATIONS)
+    for _ in range(_MAX_ROUNDS):
+        outliers = window.outliers(solution.chi2[0])
+        if not outliers.any():
             break
-        dropped += fit.links.kept(wrong)
-        fit, state = fit.without(wrong), found.state
-        del found  # its factor goes before the next one comes
-        found = fit.optimise(state, _FEW_ITERATIONS)
-    if not found.reached:
-        state = found.state
-        del found
-        found = fit.optimise(state, _MOST_ITERATIONS)
-    return Aligned(found.state.poses, _marginals(found, marginals_of, places), dropped)
+        dropped += window.links.select(outliers)
+        window, state = window.without(outliers), solution.state
+        del solution  # frees its Cholesky factor before the next one is allocated
+        solution = window.optimise(state, _ROUND_ITERATIONS)
+    if not solution.converged:
+        state = solution.state
+        del solution
+        solution = window.optimise(state, _MAX_ITERATIONS)
+    return AlignmentResult(solution.state.poses, _marginals(solution, marginals_of, index_of), dropped)
 
 
-class _Fit(NamedTuple):
-    """What a window knows: its links, places of the nodes by number, and the graph whose first pairs the links are."""
+class _Window(NamedTuple):
+    """Links of a window of nodes, and its factor graph, whose first binary factors are these links."""
 
     links: Links
-    places: dict[int, int]
-    graph: pose_graph.Graph
+    index_of: dict[int, int]
+    graph: FactorGraph
 
-    def optimise(self, start: pose_graph.State, iterations: int) -> pose_graph.Optimum:
-        return pose_graph.optimise(self.graph, start, iterations)
+    def optimise(self, start: GraphState, max_iterations: int) -> Solution:
+        """Returns the optimum reached from `start`."""
+        return adjustment.optimise(self.graph, start, max_iterations)
 
-    def contradictions(self, chi2: Array) -> Mask:
-        """(n,) links that contradict the rest by their chi2 (n,).
+    def outliers(self, chi2: Array) -> Mask:
+        """Returns a mask (n,) of the links to remove, given the chi2 (n,) of all links.
 
-        Those small beside the worst may be its doing, and stay for now. The path's own chain always stands.
+        A large chi2 next to a much larger one may be caused by the latter; such links stay until the next round. Links
+        between consecutive keyframes are never removed.
         """
         chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
-        return chi2 > max(_OUTLIER_CHI2, _OF_THE_WORST * float(chi2.max(initial=0.0)))
+        return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
 
-    def without(self, wrong: Mask) -> _Fit:
-        kept = self.links.kept(~wrong)
-        pairs = [pose_graph.motions(kept, self.places, _HUBER), *self.graph.pairs[1:]]
-        return _Fit(kept, self.places, self.graph._replace(pairs=pairs))
+    def without(self, outliers: Mask) -> _Window:
+        """Returns the window without these links."""
+        inliers = self.links.select(~outliers)
+        binary = [adjustment.motion_factors(inliers, self.index_of, _HUBER), *self.graph.binary[1:]]
+        return _Window(inliers, self.index_of, self.graph._replace(binary=binary))
 
 
-def _graph(nodes, links, anchors, places, rig, noise) -> pose_graph.Graph:
-    held = [node for node in nodes if node.number in anchors]
-    known = pose_graph.given(
-        [places[node.number] for node in held],
-        np.array([node.world_from_camera for node in held]).reshape(-1, 4, 4),
-        np.array([anchors[node.number] for node in held]).reshape(-1, 6, 6),
+def _factor_graph(
+    nodes: Sequence[Keyframe], links: Sequence[Link], anchors: dict[int, Array], rig: StereoRig, noise: SensorNoise
+) -> FactorGraph:
+    """Returns the factor graph of links, anchors and navigation sensors; the first binary factors are the links."""
+    index_of = {node.number: k for k, node in enumerate(nodes)}
+    anchored = [node for node in nodes if node.number in anchors]
+    priors = adjustment.prior_factors(
+        [index_of[node.number] for node in anchored],
+        np.array([node.world_from_camera for node in anchored]).reshape(-1, 4, 4),
+        np.array([anchors[node.number] for node in anchored]).reshape(-1, 6, 6),
     )
-    singles, pairs = [known, *aiding.singles(nodes, rig, noise)], [pose_graph.motions(links, places, _HUBER)]
-    walked = aiding.displacements(nodes, rig)
-    if not len(walked.i):
-        return pose_graph.Graph(len(nodes), singles, pairs)
-    return pose_graph.Graph(len(nodes), singles, [*pairs, walked], noise.dvl_scale)
+    unary = [priors, *aiding.unary_factors(nodes, rig, noise)]
+    motions = adjustment.motion_factors(links, index_of, _HUBER)
+    displacements = aiding.displacement_factors(nodes, rig)
+    if not len(displacements.i):
+        return FactorGraph(len(nodes), unary, [motions])
+    return FactorGraph(len(nodes), unary, [motions, displacements], noise.dvl_scale)
 
 
-def _marginals(found: pose_graph.Optimum, wanted: Sequence[int] | None, places: dict[int, int]) -> Array:
-    if wanted is None:
-        return found.into_marginals()
-    covs = np.zeros((len(places), 6, 6))
-    for number in wanted:
-        covs[places[number]] = found.marginal(places[number])
+def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
+    """Returns the marginal covariances (n, 6, 6) of the nodes with these numbers, zeros for others; None: of all."""
+    if numbers is None:
+        return solution.marginals_in_place()
+    covs = np.zeros((len(index_of), 6, 6))
+    for number in numbers:
+        covs[index_of[number]] = solution.marginal(index_of[number])
     return covs

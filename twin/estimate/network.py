@@ -1,208 +1,278 @@
-"""The keyframe network (P10, P11, P13, P14): which nodes are linked, and the motion measured between them."""
+"""The keyframe network (P10 to P16): keyframes, the links between its nodes, and their global alignment."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.links import Link
-from twin.core.records import StereoRig
-from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
-from twin.estimate.vision.image_spool import ImageSpool
+from twin.core.links import Link, Links
+from twin.core.records import Alignment, Displacement, SensorNoise, StereoRig
+from twin.core.settings import EstimatorSettings
+from twin.core.timing import StageTimer
+from twin.errors import SurveyAborted
+from twin.estimate import link_selection
+from twin.estimate.alignment import AlignmentResult, align
 from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision_interface import Vision
 
-_SAME_SWATH = 2  # the paper's two previous keyframes on the same swath
-LEAST_SHARE = 0.3  # of matched points that agree on one motion
-COMMON_PX = 0.005  # bias that all points of a match share: what interpolation leaves
-_NEAREST_M = 1e-3  # of a point before a camera
-_LEVELS = 2  # a quarter of the image: matches are found though positions err by 8 pixels
-
-
-def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
-    """Shares (n,) of the node's points that the left images at poses (n, 4, 4) show: overlap of true 3-D footprints.
-
-    Predicted from poses and depth (P11), not from a flat floor.
-    """
-    if node.points is None or len(node.points.xyz) == 0:
-        return np.zeros(len(poses))
-    world = np.ascontiguousarray(geometry.transform(node.world_from_camera, node.points.xyz))
-    camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
-    here, reach_m = node.world_from_camera[:3, 3].copy(), _reach_m(node.points.xyz, rig)
-    return _overlaps(world, here, np.ascontiguousarray(poses), reach_m, *camera)
+_REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
+_FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are fixed
+_START_NODES = 4  # the reference position stays in the window: loops return to it
+_MOST_PENDING = 8  # nodes whose links are still being measured
 
 
-def choose_links(
-    node: Keyframe,
-    earlier: Sequence[Keyframe],
-    poses: Array,
-    rig: StereoRig,
-    min_overlap: float,
-    max_links: int,
-    patch_px: int,
-) -> list[tuple[Keyframe, float]]:
-    """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
-
-    The last link of a run of overlapping nodes carries the longest base; links to other swaths tie the legs together,
-    and the oldest of them ties loops to where they all began.
+class LinkQueue:
+    """Link measurements in progress, in the order of their nodes.
 
     Args:
-        poses: (n, 4, 4) of the earlier ones.
+        background: measure in a thread of its own, worthwhile where images are processed; otherwise when collected.
     """
-    shares = overlaps(node, poses, rig, patch_px)
-    linked = np.flatnonzero(shares >= min_overlap)[::-1].tolist()
-    previous = [k for k in linked if k >= len(earlier) - _SAME_SWATH]
-    rest = linked[len(previous) :]
-    same = _unbroken(rest, len(earlier) - _SAME_SWATH - 1)
-    others = sorted(rest[len(same) :], key=lambda k: -shares[k])
-    oldest = [min(others)] if others else []
-    rest = [k for k in others if k not in oldest]
-    chosen = (previous + same[-1:] + oldest + _spread(rest, earlier, max_links))[:max_links]
-    return [(earlier[k], float(shares[k])) for k in chosen]
+
+    def __init__(self, background: bool):
+        self._executor = ThreadPoolExecutor(1) if background else None
+        self._pending: deque[Callable[[], list[Link]]] = deque()
+
+    def submit(self, measure: Callable[[], list[Link]]) -> None:
+        """Adds a measurement."""
+        self._pending.append(self._executor.submit(measure).result if self._executor else measure)
+
+    def collect(self, all_but: int = 0) -> Iterator[list[Link]]:
+        """Yields the links of the oldest nodes until at most `all_but` nodes are pending.
+
+        Raises:
+            OSError: images could not be read or written; the measurements that are still pending are dropped.
+        """
+        while len(self._pending) > all_but:
+            try:
+                links = self._pending[0]()
+            except OSError:
+                self._pending.clear()
+                raise
+            self._pending.popleft()
+            yield links
+
+    def close(self) -> None:
+        """Ends the thread; pending measurements are dropped."""
+        self._pending.clear()
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
 
 
-def share_noise(links: Sequence[Link]) -> list[Link]:
-    """The links of one new node with the covariance that they have together.
+@dataclass
+class AlignmentHistory:
+    """Record of the global alignments so far.
 
-    They all start from the node's own stereo points, whose noise is most of what a link's motion errs by. Taken as
-    independent, n links would count the node's one look n times: positions came out over-sure by n, about 5.
+    Attributes:
+        alignments: cost and size of each.
+        dropped: links rejected as outliers.
+        before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
     """
-    return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
+
+    alignments: list[Alignment] = field(default_factory=list)
+    dropped: list[Link] = field(default_factory=list)
+    before_ga: list[Array] = field(default_factory=list)
+    after_ga: list[Array] = field(default_factory=list)
 
 
-def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Those that follow one another without a gap, back from the newest: the node's own swath."""
-    return [k for back, k in enumerate(linked) if k == newest - back]
+class KeyframeNetwork:
+    """Keyframes of a survey, the nodes among them, and the measured motions that link the nodes.
 
+    Args:
+        vision: measures the links.
+        rig, noise: believed calibration, and believed noise of the navigation sensors.
+        settings: settings of the estimators.
+        stopwatch: context manager per stage name.
+    """
 
-def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """The best of other swaths, no two of them neighbours on theirs as long as there is a choice."""
-    chosen: list[int] = []
-    for k in others:
-        if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
-            chosen.append(k)
-    return (chosen + [k for k in others if k not in chosen])[:count]
+    def __init__(
+        self, vision: Vision, rig: StereoRig, noise: SensorNoise, settings: EstimatorSettings, stopwatch: StageTimer
+    ):
+        self.vision, self.rig, self.noise, self.settings, self.stopwatch = vision, rig, noise, settings, stopwatch
+        self.keyframes: list[Keyframe] = []
+        self.nodes: list[Keyframe] = []
+        self.links = Links()
+        self.history = AlignmentHistory()
+        self._node_poses = np.empty((64, 4, 4))  # capacity grows by doubling
+        self._queue = LinkQueue(vision.runs_in_background)
+        self._alignable = True
 
+    def close(self) -> None:
+        """Ends the background thread."""
+        self._queue.close()
 
-def _reach_m(points: Array, rig: StereoRig) -> float:
-    """No camera farther away sees the same floor: the image's diagonal at the largest depth of the points (n, 3)."""
-    return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
+    @property
+    def poses(self) -> Array:
+        """(n, 4, 4) world_from_camera of all keyframes."""
+        return np.array([k.world_from_camera for k in self.keyframes]).reshape(-1, 4, 4)
 
+    def add(self, keyframe: Keyframe) -> None:
+        """Adds a keyframe; memory keeps the matched points of the newest one only."""
+        if self.keyframes:
+            self.keyframes[-1].points = None  # links start from the points of the newer node
+        self.keyframes.append(keyframe)
 
-@njit(cache=True, nogil=True)
-def _overlaps(world, here, poses, reach, focal, cx, cy, width, height, margin):
-    """As `overlaps`, of points (m, 3) in the world; cameras out of reach of the node's (3,) share nothing."""
-    shares = np.zeros(len(poses))
-    for k in range(len(poses)):
-        pose, count = poses[k], 0
-        if np.sum((here - pose[:3, 3]) ** 2) >= reach * reach:
-            continue
-        for x, y, z in world:
-            dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
-            depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-            if depth < _NEAREST_M:
-                continue
-            u = focal * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + cx
-            v = focal * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + cy
-            count += margin <= u < width - margin and margin <= v < height - margin
-        shares[k] = count / len(world)
-    return shares
+    def is_node(self, keyframe: Keyframe) -> bool:
+        """Returns whether a keyframe becomes a node."""
+        return keyframe.number % self.settings.node_stride == 0
 
+    def overlap_with_last(self, world_from_camera: Array) -> float:
+        """Returns the predicted overlap of a pose (4, 4) with the last keyframe, 0 to 1."""
+        last = self.keyframes[-1]
+        poses = np.ascontiguousarray(world_from_camera[None])
+        return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
 
-class Matched(NamedTuple):
-    """The same points as two stereo pairs measure them, normalised (x, y, disparity): (n, 3) with (n, 3, 3)."""
-
-    other: Array
-    other_cov: Array
-    node: Array
-    node_cov: Array
-
-
-class PairMatch:
-    """Matches one node with an earlier one and measures the motion between them."""
-
-    def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
-        self.rig, self.spool, self.patch_px = rig, spool, patch_px
-        self._workers = ThreadPoolExecutor(2)
-
-    def flows(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Matched | None]:
-        """The node's points found in both images of each other pair, two pairs at a time; None where it has none."""
-        points = node.points
-        if points is None:
-            return [None for _ in others]
-        left, _ = self.spool.gray(node.row)
-        cut = patches.cut(patches.pyramid(left, _LEVELS), points.pixels, self.patch_px)
-        return list(self._workers.map(lambda other: self._flow(node, points, cut, other), others))
-
-    def _flow(
-        self, node: Keyframe, points: stereo.StereoPoints, cut: Sequence[patches.Patches], other: Keyframe
-    ) -> Matched:
-        """The points found in both images of one other pair.
-
-        Matching starts from the flow that positions and depth predict (P11), and from how the plane under each patch
-        looks from there.
-        """
-        rig = self.rig
-        other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        expected, by_point, _ = observation_equations.transfer(points.measured, other_from_node, rig.baseline_m)
-        warp = by_point[:, :, :2] + by_point[:, :, 2:] * points.slope[:, None, :]
-        left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
-        left_px, shift_px = self._places(expected)
-        left, right = self.spool.gray(other.row)
-        left_target = patches.splines(patches.pyramid(left, _LEVELS))
-        in_left = patches.register(cut, left_target, left_px, left_warp)
-        right_px, right_target = in_left.points - shift_px, patches.splines([right])
-        in_right = patches.register(cut, right_target, right_px, right_warp)
-        ok = in_left.ok & in_right.ok & stereo.on_one_row(in_left.points, in_right.points)
-        ok &= self._shows(points, other_from_node)
-        in_node_px = (in_left.cov[ok] + in_right.cov[ok]) / 2
-        cov = left_warp[ok] @ in_node_px @ left_warp[ok].transpose(0, 2, 1)
-        measured, measured_cov = stereo.fuse(in_left.points[ok], in_right.points[ok], cov, rig)
-        return Matched(measured, measured_cov, points.measured[ok], points.cov[ok])
-
-    def _shows(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
-        """Which points (n,) both images of the other pair show, patch and all."""
-        around = np.column_stack([points.measured[:, :2], points.around_px / self.rig.focal_px])
-        expected, _, _ = observation_equations.transfer(around, other_from_node, self.rig.baseline_m)
-        left_px, shift_px = self._places(expected)
-        in_left, in_right = (stereo.well_inside(px, self.rig, self.patch_px) for px in (left_px, left_px - shift_px))
-        return in_left & in_right
-
-    def _places(self, expected: Array) -> tuple[Array, Array]:
-        """Where the left image shows points (n, 3), and how much farther left the right one does: (n, 2) [px]."""
-        left_px = expected[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
-        return left_px, np.column_stack([expected[:, 2] * self.rig.focal_px, np.zeros(len(expected))])
-
-    def motion(self, node: Keyframe, other: Keyframe, matched: Matched) -> two_view_motion.Motion | None:
-        """Motion between the two pairs by structure and motion together (P14), None where it is not to be trusted.
-
-        It starts from the closed form of eq. (2), or where that has none from the predicted poses.
-        """
-        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        closed_form = two_view_motion.exact_depth_motion(matched.other, matched.node, self.rig.baseline_m, predicted)
-        result = two_view_motion.pair_motion(
-            matched.other,
-            matched.node,
-            matched.other_cov,
-            matched.node_cov,
-            self.rig.baseline_m,
-            predicted if closed_form is None else closed_form,
-            common_sigma=COMMON_PX / self.rig.focal_px,
-            correlation=matching.correlation(matched.node[:, :2] * self.rig.focal_px, self.patch_px),
-        )
-        if result is None or result.n_points < LEAST_SHARE * len(matched.node):
+    def link_to_last_node(self, node: Keyframe) -> Link | None:
+        """Measures the motion from the last node to a new one; None where that fails or the node is the first."""
+        if not self.nodes:
             return None
-        return result._replace(closed_form=closed_form)
+        last = self.nodes[-1]
+        pose = last.world_from_camera[None]
+        overlap = float(link_selection.overlaps(node, pose, self.rig, self.settings.patch_px)[0])
+        links = self._measure(node, [(last, overlap)])
+        return links[0] if links else None
 
+    def connect(self, node: Keyframe, chain: Link | None, bridge: Link | None, displacement: Displacement | None) -> None:
+        """Adds a node and links it to earlier ones; the links are measured in the background.
 
-def to_link(node: Keyframe, other: Keyframe, share: float, result: two_view_motion.Motion) -> Link:
-    """The network's record of a measured motion."""
-    return Link(
-        other.number, node.number, result.a_from_b, result.cov, share, result.n_points, closed_form=result.closed_form
-    )
+        Args:
+            chain: measured motion from the last node.
+            bridge: motion from the last node by F2F, where the measurement failed.
+            displacement: displacement since the last node by the DVL.
+        """
+        s = self.settings
+        with self.stopwatch("network"):
+            first = bisect_left(self.nodes, node.track - s.window_tracks, key=lambda k: k.track)
+            oldest, n = min(_START_NODES, first), len(self.nodes)
+            window = self.nodes[:oldest] + self.nodes[first:]
+            poses = np.concatenate([self._node_poses[:oldest], self._node_poses[first:n]])
+            chosen = link_selection.choose_links(
+                node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px
+            )
+        others = [(k, overlap) for k, overlap in chosen if k is not self.nodes[-1]]
+        # a copy, because the points of the node are released before its links are measured
+        self._queue.submit(partial(self._links_of, replace(node), others, chain, bridge))
+        self._collect_links(all_but=_MOST_PENDING)
+        node.dvl_displacement = displacement if chain else None  # otherwise the F2F motion includes it
+        self.nodes.append(node)
+        if len(self.nodes) > len(self._node_poses):
+            self._node_poses = np.concatenate([self._node_poses, np.empty_like(self._node_poses)])
+        self._node_poses[len(self.nodes) - 1] = node.world_from_camera
+
+    def align_window(self, track: int) -> Array | None:
+        """Aligns the window of tracks that ends with this track, and rebuilds the mosaic from the track.
+
+        Returns:
+            (6, 6) marginal covariance of the last node in its own axes, or None where nothing was aligned.
+        """
+        if not self.settings.use_ga or len(self.nodes) < 2:
+            return None
+        self.history.before_ga.append(self.poses[:, :3, 3].copy())
+        self._collect_links()
+        first = track - self.settings.window_tracks
+        with self.stopwatch("ga"):
+            aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
+        self.vision.rebuild_mosaic([k for k in self.keyframes if k.track >= track])
+        left = bisect_left(self.nodes, first, key=lambda k: k.track)
+        if left > _START_NODES:
+            self.vision.discard(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
+        self.history.after_ga.append(self.poses[:, :3, 3].copy())
+        return aligned.covs[-1]
+
+    def align_all(self) -> Array | None:
+        """Aligns all nodes.
+
+        Returns:
+            (n_keyframes, 6, 6) marginal covariance of each keyframe's node, or None where nothing was aligned.
+
+        Raises:
+            SurveyAborted: the alignment failed; a second call returns None.
+        """
+        if not (self.settings.use_ga and self._alignable and len(self.nodes) >= 2):
+            return None
+        with self.stopwatch("ga"):
+            aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
+        numbers = [k.number for k in self.keyframes]
+        return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
+
+    def truncate(self, n_frames: int) -> None:
+        """Drops a keyframe whose frame was interrupted before it was recorded."""
+        self._collect_links()
+        self.keyframes = [k for k in self.keyframes if k.row < n_frames]
+        self.nodes = [k for k in self.nodes if k.row < n_frames]
+        self.links = self.links.select(self.links.j < len(self.keyframes))
+
+    def _links_of(
+        self, node: Keyframe, others: list[tuple[Keyframe, float]], chain: Link | None, bridge: Link | None
+    ) -> list[Link]:
+        """Returns all links of one new node."""
+        measured = self._measure(node, others)
+        return link_selection.share_noise([*measured, chain] if chain else measured) + ([bridge] if bridge else [])
+
+    def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
+        """Returns the links from earlier nodes (each with its overlap) that could be measured."""
+        motions = self.vision.measure_motions(node, [other for other, _ in others])
+        return [
+            link_selection.to_link(node, other, overlap, motion)
+            for (other, overlap), motion in zip(others, motions, strict=True)
+            if motion is not None
+        ]
+
+    def _collect_links(self, all_but: int = 0) -> None:
+        """Adds the links that were measured in the background.
+
+        Raises:
+            OSError: images could not be read or written; the incomplete network is not aligned any more.
+        """
+        try:
+            for links in self._queue.collect(all_but):
+                self.links.add(links)
+        except OSError:
+            self._alignable = False
+            raise
+
+    def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
+        """Aligns the last nodes; older nodes that are linked to them are fixed. All keyframes move with their nodes."""
+        first = nodes[0].number
+        links = self.links.select(self.links.j >= first)
+        fixed = set(links.i[links.i < first].tolist())
+        everyone = [k for k in self.nodes if k.number in fixed] + nodes
+        anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: _REFERENCE_COV}
+        start_s = time.perf_counter()
+        try:
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+        except np.linalg.LinAlgError as error:
+            self._alignable = False
+            raise SurveyAborted(f"global alignment failed: {error}") from None
+        ms = (time.perf_counter() - start_s) * 1e3
+        self.history.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
+        self.history.dropped += aligned.dropped
+        if aligned.dropped:
+            dropped = {link[:2] for link in aligned.dropped}
+            ends = zip(self.links.i.tolist(), self.links.j.tolist(), strict=True)
+            self.links = self.links.select(np.array([pair not in dropped for pair in ends]))
+        poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
+        self._move({number: pose for number, pose in poses.items() if number >= first})
+        return aligned
+
+    def _move(self, poses: dict[int, Array]) -> None:
+        """Sets new poses of nodes by number; keyframes between nodes move with the node before them."""
+        moving = self.keyframes[min(poses) :]
+        old = np.array([keyframe.world_from_camera for keyframe in moving])
+        numbers = {node.number for node in self.nodes}
+        owner = np.maximum.accumulate([k if keyframe.number in numbers else 0 for k, keyframe in enumerate(moving)])
+        new = np.array([poses.get(keyframe.number, pose) for keyframe, pose in zip(moving, old, strict=True)])
+        shift = new[owner] @ np.linalg.inv(old[owner])
+        # without orthogonalisation, rounding errors triple with every alignment
+        for keyframe, pose in zip(moving, geometry.nearest_rigid(shift @ old), strict=True):
+            keyframe.world_from_camera = pose
+        for k, node in enumerate(self.nodes):
+            self._node_poses[k] = node.world_from_camera

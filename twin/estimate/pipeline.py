@@ -1,331 +1,287 @@
-"""The method in the paper's order: F2F at every frame; stereo, F2M and network at keyframes; GA at a track's end."""
+"""The method in the order of the paper: F2F at every frame; stereo, F2M and network at keyframes; GA at a track's end."""
 
 from __future__ import annotations
 
-import time
-from bisect import bisect_left
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
-from dataclasses import replace
-from functools import partial
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.growing_array import Rows
-from twin.core.links import Link, Links
-from twin.core.records import Alignment, Estimate, Frame, SensorNoise, StereoRig, SurveyResult, Trajectory
-from twin.errors import SurveyAborted
-from twin.estimate import network
-from twin.estimate.alignment import Aligned, align
-from twin.estimate.navigation.dead_reckoning import Instruments, Reckoning, reckon, said
-from twin.estimate.navigation.dvl import VelocityLog
-from twin.estimate.navigation.pose_filter import PoseFilter, carried, clipped
-from twin.estimate.stereo_vision import Vision
+from twin.core.links import Link
+from twin.core.records import ElevationMap, Estimate, Frame, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.core.settings import EstimatorSettings
+from twin.core.timing import StageTimer, Stopwatch
+from twin.estimate.mapping.footprint import footprint_grid
+from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
+from twin.estimate.navigation.dvl import DvlIntegrator
+from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance, transport_covariance
+from twin.estimate.network import KeyframeNetwork
+from twin.estimate.pose_log import PoseLog
+from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import interpolate_between_keyframes
 from twin.estimate.vision.keyframes import Keyframe
-from twin.scenario.model import EstimateConfig
+from twin.estimate.vision_interface import Vision
 
-_REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
-_START_NODES = 4  # the reference position stays in the window: loops come back to it
-_MOST_BEHIND = 8  # nodes whose links are still being measured
-_HELD_COV = np.eye(6) * 1e-10  # nodes older than the window are held
-_F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # what the mosaic's own sampling leaves [rad, m]
+#: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
+_DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
+_F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # resampling error of the mosaic [rad, m]
+_SAME_INTERVAL = 1e-6  # relative; timestamps are rounded
+
+
+class MotionSinceNode(NamedTuple):
+    """Motion since the last node of the network.
+
+    Args:
+        motion: (4, 4) pose of the camera now in the camera at the node.
+        cov: (6, 6) its covariance [rotation, translation] (rad, m).
+        cov_at_node: (6, 6) covariance of the online pose at the node.
+    """
+
+    motion: Array
+    cov: Array
+    cov_at_node: Array
 
 
 class Navigator:
-    """Positions the vehicle from frames alone.
+    """Estimates the path of a stereo camera from frames alone. Use as a context manager.
 
     Args:
-        vision: what answers for the stereo camera.
-        rig, noise: calibration as believed.
-        settings: the scenario's [estimate].
-        start: (4, 4) world_from_camera of the reference position, where the survey begins by plan.
-        watch: context manager per stage name.
-        beside: links are measured by a thread beside the flight: worth it where images take long.
+        rig: believed calibration.
+        settings: settings of the estimators.
+        start: (4, 4) world_from_camera of the first frame, the reference position; by default the camera is at the
+            origin with its optical axis along -z of the world. Frames that bring readings of height or attitude need a
+            world whose z axis points up.
+        readings_noise: believed noise of the navigation sensors whose readings come with the frames.
+        vision: visual measurements; by default from the images of the frames.
+        folder: where images of keyframes and the mosaic are kept while the survey runs; by default a temporary folder.
+        stopwatch: context manager per stage name.
     """
 
     def __init__(
         self,
-        vision: Vision,
         rig: StereoRig,
-        noise: SensorNoise,
-        settings: EstimateConfig,
-        start: Array,
-        watch: Callable[[str], AbstractContextManager[None]],
-        beside: bool = True,
+        settings: EstimatorSettings | None = None,
+        start: Array | None = None,
+        readings_noise: SensorNoise | None = None,
+        vision: Vision | None = None,
+        folder: Path | None = None,
+        stopwatch: StageTimer | None = None,
     ):
-        self.vision, self.rig, self.noise, self.settings, self.watch = vision, rig, noise, settings, watch
-        self.velocity_log = VelocityLog(rig, noise)
-        self.filter = PoseFilter(start.copy(), rig, noise)
-        self.f2f_pose = start.copy()
-        self.since_node = (np.eye(4), np.zeros((6, 6)))
-        self.cov_at_node = np.zeros((6, 6))
-        self.alignable = True
-        self.keys: list[Keyframe] = []
-        self.nodes: list[Keyframe] = []
-        self.node_poses = np.empty((64, 4, 4))  # theirs, and room for more
-        self.links = Links()
-        self.measuring: deque[Callable[[], list[Link]]] = deque()
-        self.behind = ThreadPoolExecutor(1) if beside else None
-        self.times_s, self.f2f_poses, self.online_poses = Rows(), Rows(4, 4), Rows(4, 4)
-        self.dropped: list[Link] = []
-        self.alignments: list[Alignment] = []
-        self.before_ga: list[Array] = []
-        self.after_ga: list[Array] = []
+        self.rig, self.settings = rig, settings or EstimatorSettings()
+        self.stopwatch = stopwatch or Stopwatch()
+        self._resources = ExitStack()
+        self.vision = vision or self._image_vision(folder)
+        noise = readings_noise or SensorNoise()
+        self.dvl = DvlIntegrator(rig, noise)
+        self.f2f_pose = (_DEFAULT_START if start is None else start).copy()
+        self.filter = PoseFilter(self.f2f_pose.copy(), rig, noise)
+        self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))
+        self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
+        self._resources.callback(self.network.close)
+        self.log = PoseLog()
 
-    def update(self, frame: Frame, track: int) -> Estimate:
-        """Takes one frame; a frame with a right image is a keyframe of the track (from 1)."""
-        seen, status = self.vision.track_frame(frame)
-        reckoned, moved = reckon(self.reckoning, self.instruments, seen.a_from_b, seen.cov, *said(frame.readings))
-        self.go_on(reckoned)
-        if frame.right is not None:
-            status = self._visit_keyframe(frame, track, status)
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the threads and removes the temporary folder."""
+        self._resources.close()
+
+    def update(self, frame: Frame, track: int = 1) -> Estimate:
+        """Processes one frame.
+
+        A frame with `keyframe` True becomes a keyframe, one with False does not; None leaves the choice to the
+        estimator: a stereo pair becomes a keyframe where its overlap with the last one falls below
+        `settings.keyframe_overlap`, or where tracking failed.
+
+        Args:
+            track: number of the track, from 1; tracks limit the window of `align_track`.
+        """
+        interval_s = self._interval_s(frame.time_s)
+        motion, status = self.vision.track_frame(frame)
+        aiding = readings_as_arrays(frame.readings)
+        state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
+        self.adopt(state)
+        if self._is_keyframe(frame, status):
+            status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
-        self.record(frame.time_s, f2f, online)
-        velocity = geometry.log(moved) * self.rig.frame_rate_hz
+        self.log.append(frame.time_s, f2f, online)
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
-        return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
-
-    @property
-    def reckoning(self) -> Reckoning:
-        """Where the frames have led so far."""
-        believed = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
-        return Reckoning(self.f2f_pose, *believed, *self.since_node)
-
-    @property
-    def instruments(self) -> Instruments:
-        """What speaks at every frame."""
-        return Instruments(self.filter.level, self.velocity_log.beams, self.velocity_log.way)
-
-    def go_on(self, reckoned: Reckoning) -> None:
-        """Takes over where frames have led."""
-        self.f2f_pose, self.since_node = reckoned.f2f, (reckoned.walked, reckoned.walked_cov)
-        self.filter.world_from_camera, self.filter.cov = reckoned.online, reckoned.cov
-
-    def record(self, times_s: float | Array, f2f: Array, online: Array) -> None:
-        """Notes one frame or more: times () or (n,) [s], poses (4, 4) or (n, 4, 4)."""
-        self.times_s.add(times_s)
-        self.f2f_poses.add(f2f)
-        self.online_poses.add(online)
+        return Estimate(frame.time_s, online, f2f, geometry.log(moved) / interval_s, sigma_m, status)
 
     def align_track(self, track: int) -> None:
-        """Global alignment over the window that ends with this track; the vehicle keeps station meanwhile."""
-        if not self.settings.use_ga or len(self.nodes) < 2:
-            return
-        self.before_ga.append(self._keyframe_poses()[:, :3, 3].copy())
-        self._take_links()
-        first = track - self.settings.window_tracks
-        with self.watch("ga"):
-            aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
-        self._rebase(aligned)
-        self.vision.rebuild_mosaic([k for k in self.keys if k.track >= track])  # the mosaic forgets older ones
-        left = bisect_left(self.nodes, first, key=lambda k: k.track)
-        if left > _START_NODES:
-            self.vision.discard(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
-        self.after_ga.append(self._keyframe_poses()[:, :3, 3].copy())
+        """Global alignment over the window of tracks that ends with this track; moves the online pose along."""
+        node_cov = self.network.align_window(track)
+        if node_cov is not None:
+            self._follow_last_keyframe(node_cov)
 
     def finish(self) -> SurveyResult:
-        """The truly global alignment over all tracks, and the trajectories.
+        """Aligns all keyframes globally.
+
+        Returns:
+            The trajectories, the keyframes with their covariances, and the network.
 
         Raises:
-            SurveyAborted, OSError: the alignment or the measuring of links failed; called again, it goes without.
+            SurveyAborted, OSError: the alignment or the measurement of links failed; a second call skips them.
         """
-        self._forget_unfinished()
-        cov = np.tile(self.filter.cov, (len(self.keys), 1, 1))
-        if self.settings.use_ga and self.alignable and len(self.nodes) >= 2:
-            with self.watch("ga"):
-                aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
-            owner = np.searchsorted([n.number for n in self.nodes], [k.number for k in self.keys], side="right") - 1
-            cov = aligned.covs[owner]
-        times, f2f, online = (rows.array for rows in (self.times_s, self.f2f_poses, self.online_poses))
-        rows = np.array([k.row for k in self.keys], dtype=np.int64)
-        final = interpolate_between_keyframes(f2f, rows, self._keyframe_poses()) if self.settings.use_ga else online
+        self.network.truncate(len(self.log))
+        keyframes, history, log = self.network.keyframes, self.network.history, self.log
+        cov = np.tile(self.filter.cov, (len(keyframes), 1, 1))
+        aligned_cov = self.network.align_all()
+        rows = np.array([k.row for k in keyframes], dtype=np.int64)
+        final = log.online
+        if self.settings.use_ga:
+            final = interpolate_between_keyframes(log.f2f, rows, self.network.poses)
         return SurveyResult(
-            f2f=Trajectory(times, f2f),
-            online=Trajectory(times, online),
-            final=Trajectory(times, final),
+            f2f=Trajectory(log.times_s, log.f2f),
+            online=Trajectory(log.times_s, log.online),
+            final=Trajectory(log.times_s, final),
             keyframe_rows=rows,
-            track_of_keyframe=np.array([k.track for k in self.keys], dtype=np.int64),
-            node_cov=cov,
-            links=self.links,
-            alignments=self.alignments,
-            before_ga=self.before_ga,
-            after_ga=self.after_ga,
-            stereo_observations=[look for look in self.vision.stereo_observations if look.row < len(times)],
+            track_of_keyframe=np.array([k.track for k in keyframes], dtype=np.int64),
+            node_cov=cov if aligned_cov is None else aligned_cov,
+            keyframe_depth_m=np.array([k.depth_m for k in keyframes], dtype=np.float64),
+            links=self.network.links,
+            alignments=history.alignments,
+            before_ga=history.before_ga,
+            after_ga=history.after_ga,
+            stereo_observations=[pair for pair in self.vision.stereo_observations if pair.row < len(log)],
         )
 
-    def _forget_unfinished(self) -> None:
-        """Drops a keyframe whose frame was interrupted before it was recorded."""
-        self._take_links()
-        n_frames = len(self.times_s)
-        self.keys = [k for k in self.keys if k.row < n_frames]
-        self.nodes = [k for k in self.nodes if k.row < n_frames]
-        self.links = self.links.kept(self.links.j < len(self.keys))
+    def build_map(
+        self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
+    ) -> ElevationMap | None:
+        """Builds the elevation map along the final trajectory.
 
-    def _visit_keyframe(self, frame: Frame, track: int, status: str) -> str:
-        """Stereo, F2M, mosaic and network at a keyframe; fresh points for F2F."""
-        points = self.vision.observe_stereo(frame, len(self.times_s))
+        Args:
+            grid: cells of the map, in x and y of the world; by default all that the keyframes show.
+            progress: called with the fraction done.
+
+        Returns:
+            The map, or None where there is no keyframe.
+        """
+        n_keyframes = len(result.keyframe_rows)
+        if n_keyframes == 0:
+            return None
+        report = progress or (lambda _: None)
+        cells = grid or footprint_grid(result, self.rig)
+        return self.vision.build_map(result, cells, result.step_cov, lambda done: report(done / n_keyframes))
+
+    @property
+    def dead_reckoning(self) -> DeadReckoningState:
+        """State that every frame advances."""
+        online = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
+        return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
+
+    def aiding(self, interval_s: float) -> FrameAiding:
+        """Returns the models of the sensors that read at every frame, for an interval between frames [s]."""
+        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
+
+    def adopt(self, state: DeadReckoningState) -> None:
+        """Takes over the dead reckoning state after a frame."""
+        self.f2f_pose = state.f2f
+        self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
+        self.filter.world_from_camera, self.filter.cov = state.online, state.cov
+
+    def _image_vision(self, folder: Path | None) -> StereoVision:
+        """Creates vision from images; what it creates is released by `close`."""
+        if folder is None:
+            folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
+        return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
+
+    def _interval_s(self, time_s: float) -> float:
+        """Returns the time since the last frame [s]: the nominal interval where timestamps differ by rounding only."""
+        nominal_s = 1 / self.rig.frame_rate_hz
+        interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
+        return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
+
+    def _is_keyframe(self, frame: Frame, status: str) -> bool:
+        if frame.right is None or frame.keyframe is not None:
+            return bool(frame.keyframe) and frame.right is not None
+        if status != "ok" or not self.network.keyframes:
+            return True
+        return self.network.overlap_with_last(self.filter.world_from_camera) < self.settings.keyframe_overlap
+
+    def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
+        """Processes a keyframe: stereo, chain, F2M, mosaic, network; F2F tracking restarts from it."""
+        row = len(self.log)
+        points = self.vision.observe_stereo(frame, row)
         if points is None:
-            self.filter.fix(frame.readings)
+            self.filter.fuse_position_fixes(frame.readings)
             return "too few points in stereo"
-        key = Keyframe(len(self.keys), len(self.times_s), track, self.filter.world_from_camera, points, frame.readings)
-        self.keys.append(key)
-        is_node = key.number % self.settings.node_stride == 0
-        chain = self._follow_chain(key) if is_node else None
-        self.filter.fix(frame.readings)  # after the chain, so that it corrects what the chain leaves
-        with self.watch("f2m"):
-            self._register_with_mosaic(key, chain)
-            key.world_from_camera = self.filter.world_from_camera
-            self.vision.add_to_mosaic(key.number, key.world_from_camera)
+        pose = self.filter.world_from_camera
+        depth_m = float(np.median(points.xyz[:, 2]))
+        number = len(self.network.keyframes)
+        keyframe = Keyframe(number, row, track, pose, points, frame.readings, depth_m=depth_m)
+        self.network.add(keyframe)
+        is_node = self.network.is_node(keyframe)
+        chain = self._follow_chain(keyframe) if is_node else None
+        self.filter.fuse_position_fixes(frame.readings)  # after the chain, whose error they correct
+        with self.stopwatch("f2m"):
+            self._register_with_mosaic(keyframe, chain)
+            keyframe.world_from_camera = self.filter.world_from_camera
+            self.vision.add_to_mosaic(keyframe.number, keyframe.world_from_camera)
         if is_node:
-            self._connect(key, chain)
+            self._connect(keyframe, chain)
         self.vision.restart_tracking()
-        key.points = None  # links start from the new node's points: memory need not hold the old ones
         return status
 
-    def _register_with_mosaic(self, key: Keyframe, chain: Link | None) -> None:
-        """Corrects the position by the mosaic (F2M), as far as the motion since that was laid is less sure."""
-        pose, step_cov = self.filter.world_from_camera, self.since_node[1] if chain is None else chain.cov
-        to_world, from_world = geometry.adjoint(pose), geometry.adjoint(geometry.inverse(pose))
-        if self.nodes:
-            key.walked_cov = self.nodes[-1].walked_cov + to_world @ step_cov @ to_world.T
-        found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
-        if found is not None:
-            walked_cov = from_world @ (key.walked_cov - self.keys[found.laid_by].walked_cov) @ from_world.T
-            since = clipped(walked_cov, step_cov, least=1.0) if self.nodes else walked_cov
-            cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
-            learnt = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
-            if learnt is not None:
-                key.walked_cov = key.walked_cov - to_world @ learnt @ to_world.T
-
     def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion since the last node, and lets it take the place of the F2F motion in the online position.
+        """Measures the motion since the last node and replaces the F2F motion in the online pose by it.
 
-        Two stereo pairs tell the motion better than the frames between them do (the paper's better start values
-        for GA, section IV-5); what the navigation sensors corrected meanwhile is kept.
+        Two stereo pairs determine the motion more accurately than the frames between them (the paper's better start
+        values for GA, section IV-5). Corrections by navigation sensors since the last node are kept.
         """
-        if not self.nodes:
+        link = self.network.link_to_last_node(node)
+        if link is None:
             return None
-        last, (walked, _) = self.nodes[-1], self.since_node
-        pose = last.world_from_camera[None]
-        share = float(network.overlaps(node, pose, self.rig, self.settings.patch_px)[0])
-        links = self._measure(node, [(last, share)])
-        if not links:
-            return None
-        link = links[0]
-        aided = geometry.inverse(last.world_from_camera @ walked) @ self.filter.world_from_camera
-        cov = carried(self.cov_at_node, link.i_from_j) + link.cov
-        self.filter.reset(last.world_from_camera @ link.i_from_j @ aided, cov)
+        last = self.network.nodes[-1]
+        correction = geometry.inverse(last.world_from_camera @ self.since_node.motion) @ self.filter.world_from_camera
+        cov = transport_covariance(self.since_node.cov_at_node, link.i_from_j) + link.cov
+        self.filter.reset(last.world_from_camera @ link.i_from_j @ correction, cov)
         node.world_from_camera = self.filter.world_from_camera
         return link
 
-    def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Links a new node to earlier ones by measured motions; to the last one by F2F where that failed."""
-        s = self.settings
-        with self.watch("network"):
-            first = bisect_left(self.nodes, node.track - s.window_tracks, key=lambda k: k.track)
-            oldest, n = min(_START_NODES, first), len(self.nodes)
-            window = self.nodes[:oldest] + self.nodes[first:]
-            poses = np.concatenate([self.node_poses[:oldest], self.node_poses[first:n]])
-            chosen = network.choose_links(node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px)
-        others = [(k, share) for k, share in chosen if k is not self.nodes[-1]]
-        bridge = self._bridge(node) if self.nodes and chain is None else None
-        measure = partial(self._links_of, replace(node), others, chain, bridge)  # its points are given up below
-        self.measuring.append(self.behind.submit(measure).result if self.behind else measure)
-        self._take_links(all_but=_MOST_BEHIND)
-        walked = self.velocity_log.at_node(node.number)
-        node.walked = walked if chain else None  # without a chain, the F2F motion has it in
-        self.nodes.append(node)
-        if len(self.nodes) > len(self.node_poses):
-            self.node_poses = np.concatenate([self.node_poses, np.empty_like(self.node_poses)])
-        self.node_poses[len(self.nodes) - 1] = node.world_from_camera
-        self.cov_at_node = self.filter.cov
-        self.since_node = (np.eye(4), np.zeros((6, 6)))
+    def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
+        """Corrects the online pose by the mosaic (F2M).
 
-    def _bridge(self, node: Keyframe) -> Link:
-        """The F2F motion since the last node, where the two stereo pairs do not tell it."""
-        relative, cov = self.since_node
-        return Link(self.nodes[-1].number, node.number, relative, cov + np.eye(6) * 1e-10, 0.0, 0)
-
-    def _links_of(
-        self, node: Keyframe, others: list[tuple[Keyframe, float]], chain: Link | None, bridge: Link | None
-    ) -> list[Link]:
-        """All links of one new node."""
-        measured = self._measure(node, others)
-        return network.share_noise([*measured, chain] if chain else measured) + ([bridge] if bridge else [])
-
-    def _take_links(self, all_but: int = 0) -> None:
-        """Takes over the links that were measured while the survey went on; only the alignment needs them.
-
-        Raises:
-            OSError: images could not be read or written; what is left then is no network to align.
+        The mosaic carries the pose error of the keyframe that was added to it, so the correction is weighted by the
+        covariance of the motion since then only.
         """
-        while len(self.measuring) > all_but:
-            try:
-                self.links.add(self.measuring[0]())
-            except OSError:
-                self.measuring.clear()
-                self.alignable = False
-                raise
-            self.measuring.popleft()
+        nodes, keyframes = self.network.nodes, self.network.keyframes
+        pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
+        to_world, from_world = geometry.adjoint(pose), geometry.adjoint(geometry.inverse(pose))
+        if nodes:
+            keyframe.accumulated_cov = nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
+        found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
+        if found is not None:
+            source = keyframes[found.reference_keyframe]
+            accumulated = from_world @ (keyframe.accumulated_cov - source.accumulated_cov) @ from_world.T
+            since = clip_covariance(accumulated, step_cov, lower=1.0) if nodes else accumulated
+            cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
+            reduction = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
+            if reduction is not None:
+                keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
-    def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """The links from earlier nodes (with the share of the node that they see) that could be measured."""
-        motions = self.vision.measure_motions(node, [other for other, _ in others])
-        links = [
-            network.to_link(node, other, share, motion)
-            for (other, share), motion in zip(others, motions, strict=True)
-            if motion is not None
-        ]
-        return links
+    def _connect(self, node: Keyframe, chain: Link | None) -> None:
+        """Links a new node to earlier nodes; to the last node by F2F motion where the measurement failed."""
+        bridge = None
+        if self.network.nodes and chain is None:
+            cov = self.since_node.cov + np.eye(6) * 1e-10
+            bridge = Link(self.network.nodes[-1].number, node.number, self.since_node.motion, cov, 0.0, 0)
+        self.network.connect(node, chain, bridge, self.dvl.displacement_at_node(node.number))
+        self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
-    def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> Aligned:
-        """Aligns the last nodes (with those older ones that they are linked to, held); all keyframes move along."""
-        first = nodes[0].number
-        links = self.links.kept(self.links.j >= first)
-        held = set(links.i[links.i < first].tolist())
-        everyone = [k for k in self.nodes if k.number in held] + nodes
-        anchors = dict.fromkeys(held, _HELD_COV) | {0: _REFERENCE_COV}
-        begun = time.perf_counter()
-        try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
-        except np.linalg.LinAlgError as error:
-            self.alignable = False
-            raise SurveyAborted(f"global alignment failed: {error}") from None
-        ms = (time.perf_counter() - begun) * 1e3
-        self.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
-        self.dropped += aligned.dropped
-        if aligned.dropped:
-            dropped = {link[:2] for link in aligned.dropped}
-            ends = zip(self.links.i.tolist(), self.links.j.tolist(), strict=True)
-            self.links = self.links.kept(np.array([pair not in dropped for pair in ends]))
-        poses = {k.number: pose for k, pose in zip(everyone, aligned.poses, strict=True)}
-        self._move_keyframes({number: pose for number, pose in poses.items() if number >= first})
-        return aligned
-
-    def _move_keyframes(self, poses: dict[int, Array]) -> None:
-        """Gives nodes their new poses; keyframes between them move along with the node before, if that moved."""
-        moving = self.keys[min(poses) :]
-        old = np.array([key.world_from_camera for key in moving])
-        numbers = {node.number for node in self.nodes}
-        owner = np.maximum.accumulate([k if key.number in numbers else 0 for k, key in enumerate(moving)])
-        new = np.array([poses.get(key.number, pose) for key, pose in zip(moving, old, strict=True)])
-        shift = new[owner] @ np.linalg.inv(old[owner])
-        for key, pose in zip(moving, geometry.rigid(shift @ old), strict=True):  # else errors treble
-            key.world_from_camera = pose
-        for k, node in enumerate(self.nodes):
-            self.node_poses[k] = node.world_from_camera
-
-    def _rebase(self, aligned: Aligned) -> None:
-        """Moves the online position along with the last keyframe."""
-        last = self.keys[-1]
-        last_from_now = geometry.inverse(self.online_poses.array[last.row]) @ self.filter.world_from_camera
-        self.filter.reset(last.world_from_camera @ last_from_now, carried(aligned.covs[-1], last_from_now))
-        self.cov_at_node = aligned.covs[-1]
-
-    def _keyframe_poses(self) -> Array:
-        return np.array([k.world_from_camera for k in self.keys]).reshape(-1, 4, 4)
+    def _follow_last_keyframe(self, node_cov: Array) -> None:
+        """Moves the online pose with the last keyframe after an alignment; (6, 6) covariance of its node."""
+        last = self.network.keyframes[-1]
+        last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
+        self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))
+        self.since_node = self.since_node._replace(cov_at_node=node_cov)

@@ -1,23 +1,21 @@
-"""What the method asks of the stereo camera: motion, points, corrections, links and a map; and how images answer.
-
-`pipeline.Navigator` knows the questions only, so whoever else answers them (a model of the errors, say) flies the same
-survey.
-"""
+"""Visual measurements from stereo images: the implementation of `Vision` on recorded or rendered frames."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
-from twin.estimate.mapping.map_builder import KeyframeImages, build_map
-from twin.estimate.network import PairMatch
+from twin.core.settings import EstimatorSettings
+from twin.core.timing import StageTimer, Stopwatch
+from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
+from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision import disparity, image_scale, matching, stereo
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
@@ -25,124 +23,98 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.scenario.model import EstimateConfig
 
 _LEAST_POINTS = 12  # of a keyframe
 
 
-class Vision(Protocol):
-    """The stereo camera as the method uses it. Poses are (4, 4) of the left camera, motions as of `Motion`.
-
-    Args:
-        stereo_observations: so far, with both cameras.
-    """
-
-    stereo_observations: list[StereoObservation]
-
-    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        """F2F: the motion since the last frame, and "ok" or why it failed."""
-        ...
-
-    def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
-        """Stereo at a keyframe, which is row `row` of the trajectory; None where too few points are found."""
-        ...
-
-    def restart_tracking(self) -> None:
-        """F2F goes on from the keyframe just looked at."""
-        ...
-
-    def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        """F2M: correction of the predicted pose of the keyframe; None where the mosaic does not tell."""
-        ...
-
-    def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        """Lays the keyframe into the mosaic."""
-        ...
-
-    def rebuild_mosaic(self, keys: Sequence[Keyframe]) -> None:
-        """Lays the mosaic anew with these keyframes alone, the last ones of the path."""
-        ...
-
-    def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Motion from each of other nodes to this one; None where images do not tell. Safe to call from a thread."""
-        ...
-
-    def discard(self, numbers: range) -> None:
-        """No motion from these keyframes will be asked for any more."""
-        ...
-
-    def build_map(
-        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
-    ) -> ElevationMap:
-        """The elevation map along the final trajectory."""
-        ...
-
-
 class StereoVision:
-    """Vision by the images themselves, at the scale that the first keyframe asks for.
+    """Visual measurements from images, at the image scale that suits the texture of the first keyframe.
+
+    Use as a context manager, or call `close`.
 
     Args:
-        rig: calibration as believed.
-        settings: the scenario's [estimate].
-        cell_m: cell of the mosaic at full size, about a pixel's footprint.
-        folder: where the keyframes' images and the mosaic's tiles are spooled.
-        watch: context manager per stage name.
+        rig: believed calibration.
+        settings: settings of the estimators.
+        folder: where images of keyframes and tiles of the mosaic are kept.
+        cell_m: cell of the mosaic at full image size [m]; by default the ground sample distance of the first keyframe.
+        stopwatch: context manager per stage name.
     """
+
+    runs_in_background = True  # matching takes long enough for a thread of its own
 
     def __init__(
         self,
         rig: StereoRig,
-        settings: EstimateConfig,
-        cell_m: float,
+        settings: EstimatorSettings,
         folder: Path,
-        watch: Callable[[str], AbstractContextManager[None]],
+        cell_m: float | None = None,
+        stopwatch: StageTimer | None = None,
     ):
-        self.full_rig, self.settings, self.watch = rig, settings, watch
+        self.full_rig, self.settings, self.stopwatch = rig, settings, stopwatch or Stopwatch()
         self._cell_m, self._folder = cell_m, folder
-        self._use(binning=1)
+        self._times_s: tuple[float, float] = (np.nan, np.nan)  # of the last two frames
+        self._configure(binning=1)
         self.stereo_observations: list[StereoObservation] = []
         self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
         self._points: StereoPoints | None = None
 
-    def _use(self, binning: int) -> None:
-        """Makes the tools for images of this scale."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self.spool.close()
+        self.matcher.close()
+
+    def _configure(self, binning: int) -> None:
+        """Creates the tools for images of this scale."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
-        self.mosaic = Mosaic(self._cell_m * binning, self._folder / "mosaic")
-        self.matcher = PairMatch(self.rig, self.spool, self.settings.patch_px)
-        self.reach = disparity.Reach(self.rig)
+        self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
+        self.search_range = disparity.SearchRange(self.rig)
         self._gray = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
         self._image = np.zeros((self.rig.height_px, self.rig.width_px), np.uint8)
         self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
 
-    def _settle_scale(self, left: Image, right: Image) -> None:
-        """Goes on at the scale that this pair asks for; nothing has been laid or kept yet."""
-        binning = image_scale.binning(left, right, self.full_rig, self.settings)
+    @cached_property
+    def mosaic(self) -> Mosaic:
+        """The mosaic; exists from the first keyframe on."""
+        assert self._points is not None
+        cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
+        return Mosaic(cell_m * self.binning, self._folder / "mosaic")
+
+    def _choose_scale(self, left: Image, right: Image) -> None:
+        """Chooses the image scale by the first stereo pair, before anything is stored."""
+        binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
-            self._use(binning)
-            self._take(left)
+            self.close()
+            self._configure(binning)
+            self._set_image(left)
             self.f2f.step(self._image)
 
-    def _take(self, left: Image) -> None:
-        """Makes the image of the left camera the one of now."""
+    def _set_image(self, left: Image) -> None:
+        """Sets the present left image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        with self.watch("f2f"):
-            self._take(frame.left)
+        with self.stopwatch("f2f"):
+            self._set_image(frame.left)
             return self.f2f.step(self._image)
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None
-        with self.watch("stereo"):
+        with self.stopwatch("stereo"):
             if self._points is None:
-                self._settle_scale(frame.left, frame.right)
+                self._choose_scale(frame.left, frame.right)
             right = matching.gray(frame.right, self.binning)
-            dense_px = disparity.search(self._image, matching.normalise(right), self.reach.max_disparity_px)
-            self.reach.see(dense_px)
-            points = stereo.points_of_pair(
+            dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
+            self.search_range.update(dense_px)
+            points = stereo.match_stereo_points(
                 self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
         self.stereo_observations.append(StereoObservation(row, len(points.xyz), matching.contrast(self._gray)))
@@ -165,37 +137,35 @@ class StereoVision:
         self.mosaic.add(number, self._image, self._depth_m, world_from_camera, self.rig)
         self._depth_of_keyframe[number] = self._depth_m.astype(np.float16)
 
-    def rebuild_mosaic(self, keys: Sequence[Keyframe]) -> None:
+    def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
         self.mosaic.clear()
-        self._depth_of_keyframe = {k.number: self._depth_of_keyframe[k.number] for k in keys}
-        for key in keys:
+        self._depth_of_keyframe = {k.number: self._depth_of_keyframe[k.number] for k in keyframes}
+        for key in keyframes:
             image = matching.normalise(self.spool.gray(key.row)[0])
             depth_m = self._depth_of_keyframe[key.number].astype(np.float32)
             self.mosaic.add(key.number, image, depth_m, key.world_from_camera, self.rig)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        with self.watch("flow"):
-            matches = self.matcher.flows(node, others)
+        with self.stopwatch("flow"):
+            matches = self.matcher.match(node, others)
         motions: list[Motion | None] = []
         for other, matched in zip(others, matches, strict=True):
-            with self.watch("network"):
+            with self.stopwatch("network"):
                 motions.append(None if matched is None else self.matcher.motion(node, other, matched))
         return motions
 
     def discard(self, numbers: range) -> None:
-        """Nothing to do: their images are on disk."""
+        """Does nothing: images are on disk."""
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         return build_map(
             (self._pair(int(row)) for row in result.keyframe_rows),
-            result.final.world_from_camera[result.keyframe_rows],
-            result.node_cov,
+            KeyframePath(result.final.world_from_camera[result.keyframe_rows], result.node_cov, step_cov),
             self.rig,
             grid,
-            progress=progress,
-            step_cov=step_cov,
+            progress,
         )
 
     def _pair(self, row: int) -> KeyframeImages:
@@ -204,14 +174,14 @@ class StereoVision:
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
-    """Half the side of the mosaic to register with: the view, and a fifth, at a depth that nine of ten points keep to.
+    """Returns half the side of the mosaic window for registration [m]: 1.2 times the view at the 90th percentile of depth.
 
-    A mismatch may lie at any depth: by the farthest point one of 0.5 px asked for 20 GB of mosaic.
+    The largest depth is no measure: one mismatch of 0.5 px of disparity would demand 20 GB of mosaic.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 
 
 def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Depth (height, width) [m], NaN where the disparity is unknown or below one pixel."""
+    """Returns the depth (H, W) [m]; NaN where the disparity is unknown or below one pixel."""
     usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
     return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)

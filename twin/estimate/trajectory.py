@@ -1,4 +1,4 @@
-"""Poses of all frames from those of the keyframes."""
+"""Poses of all frames, interpolated between the poses of the keyframes."""
 
 from __future__ import annotations
 
@@ -11,35 +11,42 @@ from twin.core.geometry import Array
 
 
 def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
-    """Follows frame-to-frame motion from each keyframe and spreads what is left at the next evenly over the way.
+    """Interpolates between keyframes along the frame-to-frame motion.
+
+    The misclosure between the frame-to-frame motion and the next keyframe is distributed linearly over the frames.
 
     Args:
         f2f: (n, 4, 4) poses by frame-to-frame motion alone.
-        rows: (m,) frames that are keyframes, ascending.
+        rows: (m,) indices of the frames that are keyframes, ascending.
         keyframe_poses: (m, 4, 4) their aligned poses.
 
     Returns:
-        (n, 4, 4), equal to `keyframe_poses` at the keyframes; frame-to-frame motion before the first and after the last.
+        (n, 4, 4), equal to `keyframe_poses` at the keyframes. Before the first and after the last keyframe the
+        frame-to-frame motion is followed without correction.
     """
     if len(rows) == 0:
         return f2f.copy()
     result = np.empty_like(f2f)
-    first = keyframe_poses[0] @ geometry.inverse(f2f[rows[0]])
-    result[: rows[0]] = first @ f2f[: rows[0]]
+    world_from_start = keyframe_poses[0] @ geometry.inverse(f2f[rows[0]])
+    result[: rows[0]] = world_from_start @ f2f[: rows[0]]
     for k, row in enumerate(rows):
         end = rows[k + 1] if k + 1 < len(rows) else len(f2f)
-        there = keyframe_poses[k] @ geometry.inverse(f2f[row])
+        world_from_start = keyframe_poses[k] @ geometry.inverse(f2f[row])
         if k + 1 < len(rows):
-            gap = geometry.log(geometry.inverse(there @ f2f[end]) @ keyframe_poses[k + 1])
-            _spread(there, f2f[row:end], gap, result[row:end])
+            misclosure = geometry.log(geometry.inverse(world_from_start @ f2f[end]) @ keyframe_poses[k + 1])
+            _distribute(world_from_start, f2f[row:end], misclosure, result[row:end])
         else:
-            result[row:] = there @ f2f[row:]
+            result[row:] = world_from_start @ f2f[row:]
     return result
 
 
 @njit(cache=True, nogil=True)
-def _spread(there, f2f, gap, out):
-    """Poses (n, 4, 4) moved by `there`, each with its even share of the gap (6,) behind the last."""
+def _distribute(world_from_start, f2f, misclosure, out):
+    """Fills `out` (n, 4, 4) with the poses f2f moved by `world_from_start`, each with its share of the misclosure (6,).
+
+    The share of pose k is k / n: the frame after the last one would have the whole misclosure.
+    """
     step = 1 / len(f2f)
     for k in range(len(f2f)):
-        geometry.put(out[k], geometry.compose(geometry.compose(there, f2f[k]), geometry.exp(gap * (k * step))))
+        pose = geometry.compose(world_from_start, f2f[k])
+        geometry.put(out[k], geometry.compose(pose, geometry.exp(misclosure * (k * step))))

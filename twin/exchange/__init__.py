@@ -1,1 +1,1 @@
-"""Reading recorded data, writing what other tools open."""
+"""File formats shared with other tools: GeoTIFF, GLB, and g2o and TORO pose graphs."""

@@ -1,4 +1,4 @@
-"""GeoTIFF in local metres: what any GIS opens. Row 0 is north; NaN is "not seen"."""
+"""GeoTIFF files in local metric coordinates. Row 0 is the northernmost; NaN means "no data"."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rasterio.transform import Affine
 
 from twin.core.records import ElevationMap, Image, MapGrid
 
-Map = NDArray[np.float32]
+Layer = NDArray[np.float32]
 
 #: Metres east and north of the survey's own origin.
 LOCAL_METRES = CRS.from_wkt(
@@ -28,20 +28,21 @@ def write_map(folder: Path, elevation_map: ElevationMap) -> None:
     write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, elevation_map.grid)
 
 
-def write_layer(path: Path, values: Map, grid: MapGrid, description: str) -> None:
-    """Writes one (rows, cols) layer as float32 with NaN for no data."""
+def write_layer(path: Path, values: Layer, grid: MapGrid, description: str) -> None:
+    """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
     with rasterio.open(path, "w", **_profile(grid, 1, "float32"), nodata=np.nan, predictor=3) as file:
         file.write(values.astype(np.float32), 1)
         file.set_band_description(1, description)
 
 
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid) -> None:
-    """Writes the photo mosaic (rows, cols, 3) as RGB; black is no data."""
+    """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
     with rasterio.open(path, "w", **_profile(grid, 3, "uint8"), nodata=0, photometric="RGB") as file:
         file.write(np.moveaxis(mosaic, 2, 0))
 
 
 def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
+    """Returns the rasterio profile of a file with the cells of `grid`."""
     return {
         "driver": "GTiff",
         "width": grid.cols,

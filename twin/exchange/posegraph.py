@@ -1,7 +1,7 @@
-"""Pose graphs on disk: the keyframe network as a g2o file, and g2o and TORO files of others as links.
+"""Pose graph files: writes the keyframe network as g2o, reads g2o and TORO files as links.
 
-Information on rotation is taken per radian, as gtsam takes it. A g2o file made by g2o itself has it per vector part of
-a quaternion, which is half an angle: four times the number.
+Rotational information is taken per radian squared of the rotation vector, as GTSAM reads g2o files. g2o itself
+defines it for the vector part of the quaternion (half the angle), which gives four times the value.
 """
 
 from __future__ import annotations
@@ -23,78 +23,92 @@ _UPPER = np.triu_indices(6)
 
 
 class PoseGraph(NamedTuple):
-    """Poses (4, 4) by number, where the file has any, and the motions between them; overlap and points are unknown."""
+    """Contents of a pose graph file.
+
+    Args:
+        poses: pose (4, 4) of each vertex, by its number; empty if the file has only edges.
+        links: motion of each edge, with overlap NaN and 0 matched points because the formats have neither.
+    """
 
     poses: dict[int, Array]
     links: list[Link]
 
 
 def write(path: Path, result: SurveyResult) -> None:
-    """Writes VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines: quaternions xyzw, upper triangle of the information matrix."""
+    """Writes the final keyframe poses and the links as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o).
+
+    Quaternions are ordered xyzw. The information matrices are written as upper triangles.
+    """
     poses = result.final.world_from_camera[result.keyframe_rows]
-    vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_texts(poses)))
+    vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_pose_texts(poses)))
     links = result.links
     upper = links.information[:, _ROTATION_LAST][:, :, _ROTATION_LAST][:, *_UPPER]
+    motions, informations = _pose_texts(links.i_from_j), _row_texts(upper, "%.9g")
     edges = "".join(
-        f"EDGE_SE3:QUAT {i} {j} {motion} {known}\n"
-        for i, j, motion, known in zip(links.i, links.j, _texts(links.i_from_j), _lines(upper, "%.9g"), strict=True)
+        f"EDGE_SE3:QUAT {i} {j} {motion} {information}\n"
+        for i, j, motion, information in zip(links.i, links.j, motions, informations, strict=True)
     )
     path.write_text(vertices + edges)
 
 
 def read(path: Path) -> PoseGraph:
-    """Reads VERTEX_SE3:QUAT and EDGE_SE3:QUAT (g2o), or VERTEX3 and EDGE3 (TORO: x y z roll pitch yaw) lines.
+    """Reads VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o) or VERTEX3 and EDGE3 lines (TORO: x y z roll pitch yaw).
+
+    Lines with other tags are skipped.
 
     Raises:
-        TwinError: a line of these has too few or too many numbers.
+        TwinError: a line has the wrong number of values, or a value that is not a number.
     """
     poses, links = {}, []
     for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         tag, *words = line.split() or [""]
-        if tag not in _READERS:
+        if tag not in _POSE_FORMATS:
             continue
-        size, motion = _READERS[tag]
+        size, parse = _POSE_FORMATS[tag]
         try:
             if tag.startswith("VERTEX"):
                 (number, *values) = words
-                poses[int(number)] = motion(_numbers(values, size))[0]
+                poses[int(number)] = parse(_floats(values, size))[0]
             else:
                 i, j, *values = words
-                links.append(_link(int(i), int(j), *motion(_numbers(values[:size], size)), _numbers(values[size:], 21)))
+                links.append(_link(int(i), int(j), *parse(_floats(values[:size], size)), _floats(values[size:], 21)))
         except ValueError as error:
-            raise TwinError(f"{path}:{count}", str(error), f"{tag} with its numbers") from None
+            raise TwinError(f"{path}:{count}", str(error), f"{tag} followed by its values") from None
     return PoseGraph(poses, links)
 
 
-def _numbers(words: Sequence[str], size: int) -> Array:
+def _floats(words: Sequence[str], size: int) -> Array:
+    """Returns the words as (size,) floats. Raises ValueError if their number differs."""
     if len(words) != size:
-        raise ValueError(f"has {len(words)} numbers where {size} belong")
+        raise ValueError(f"has {len(words)} values instead of {size}")
     return np.array([float(word) for word in words])
 
 
-def _link(i: int, j: int, i_from_j: Array, per_rotation: Array, upper: Array) -> Link:
-    """A link from the upper triangle of an information matrix over [translation, the file's own three of rotation].
+def _link(i: int, j: int, i_from_j: Array, rotation_jacobian: Array, upper: Array) -> Link:
+    """Returns a link with the covariance of [rotation vector, translation] in j.
 
     Args:
-        per_rotation: (3, 3) derivative of the file's own three by the rotation vector in j.
+        rotation_jacobian: (3, 3) derivative of the file's rotation parameters with respect to the rotation vector in j.
+        upper: (21,) upper triangle of the information matrix of [translation, rotation parameters of the file].
     """
     information = np.zeros((6, 6))
     information[_UPPER] = upper
     information += np.triu(information, 1).T
-    own_from_motion = np.zeros((6, 6))
-    own_from_motion[:3, 3:], own_from_motion[3:, :3] = np.eye(3), per_rotation
-    cov = np.asarray(np.linalg.inv(own_from_motion.T @ information @ own_from_motion), np.float64)
+    file_from_motion = np.zeros((6, 6))
+    file_from_motion[:3, 3:], file_from_motion[3:, :3] = np.eye(3), rotation_jacobian
+    cov = np.asarray(np.linalg.inv(file_from_motion.T @ information @ file_from_motion), np.float64)
     return Link(i, j, i_from_j, cov, np.nan, 0)
 
 
-def _by_quaternion(values: Array) -> tuple[Array, Array]:
+def _pose_of_quaternion(values: Array) -> tuple[Array, Array]:
+    """Returns the pose of x y z qx qy qz qw, and the identity as the Jacobian of its rotation parameters."""
     return geometry.pose(geometry.rotation_from_wxyz(values[[6, 3, 4, 5]]), values[:3]), np.eye(3)
 
 
-def _by_euler(values: Array) -> tuple[Array, Array]:
-    """The pose of x y z roll pitch yaw, and the derivative of roll, pitch, yaw by the rotation vector."""
+def _pose_of_euler_angles(values: Array) -> tuple[Array, Array]:
+    """Returns the pose of x y z roll pitch yaw, and the Jacobian of the angles with respect to the rotation vector."""
     roll, pitch = values[3:5]
-    # the rotation vector in the body by roll, pitch, yaw: Goldstein's rates
+    # rotation vector in the body from the rates of roll, pitch and yaw (Goldstein, Classical Mechanics)
     rates = np.array(
         [
             [1, 0, -np.sin(pitch)],
@@ -105,20 +119,21 @@ def _by_euler(values: Array) -> tuple[Array, Array]:
     return geometry.pose(geometry.rotation_from_rpy(*values[3:]), values[:3]), np.linalg.inv(rates)
 
 
-_READERS = {
-    "VERTEX_SE3:QUAT": (7, _by_quaternion),
-    "EDGE_SE3:QUAT": (7, _by_quaternion),
-    "VERTEX3": (6, _by_euler),
-    "EDGE3": (6, _by_euler),
+#: Number of values of the pose of each tag, and the function that parses them.
+_POSE_FORMATS = {
+    "VERTEX_SE3:QUAT": (7, _pose_of_quaternion),
+    "EDGE_SE3:QUAT": (7, _pose_of_quaternion),
+    "VERTEX3": (6, _pose_of_euler_angles),
+    "EDGE3": (6, _pose_of_euler_angles),
 }
 
 
-def _texts(poses: Array) -> list[str]:
-    """x y z qx qy qz qw of each pose (n, 4, 4)."""
-    return _lines(np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])]), "%.12g")
+def _pose_texts(poses: Array) -> list[str]:
+    """Returns "x y z qx qy qz qw" of each pose (n, 4, 4)."""
+    return _row_texts(np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])]), "%.12g")
 
 
-def _lines(rows: Array, number: str) -> list[str]:
-    """The numbers of each row (n, k) as a line."""
-    line = " ".join([number] * rows.shape[1]) + "\n"
+def _row_texts(rows: Array, number_format: str) -> list[str]:
+    """Returns each row of numbers (n, k) as text, separated by blanks."""
+    line = " ".join([number_format] * rows.shape[1]) + "\n"
     return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()

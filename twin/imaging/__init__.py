@@ -1,1 +1,1 @@
-"""From albedo and range to what the camera sees."""
+"""Image formation: from albedo and range of the floor to the digital image of a camera."""

@@ -1,10 +1,8 @@
-"""The stereo camera: a pose in, two images out."""
+"""Stereo camera of the simulation: renders, lights and exposes the images of a pose."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,11 +10,12 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import Image
-from twin.imaging.light import Layers, Light, Moment
+from twin.core.timing import StageTimer
+from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
 from twin.imaging.photo_sensor import PhotoSensor, sensor_of
 from twin.imaging.pixels import Raw
-from twin.imaging.sensor import Setting
-from twin.imaging.true_cameras import View, make_view
+from twin.imaging.sensor import ExposureSetting
+from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
 if TYPE_CHECKING:
@@ -28,8 +27,11 @@ Depth = NDArray[np.float32]
 AT_REST: Array = np.zeros(6)
 
 
-class Shot(NamedTuple):
-    """What one release of the shutter gives: images (H, W, 3) uint8 RGB, and true depth (H, W) [m] for the judge."""
+class StereoCapture(NamedTuple):
+    """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depth (H, W) [m] for the evaluation.
+
+    The right image and its depth are None where only the left camera was used.
+    """
 
     left: Image
     right: Image | None
@@ -37,24 +39,24 @@ class Shot(NamedTuple):
     depth_right: Depth | None
 
 
-class Anatomy(NamedTuple):
-    """The left image taken apart.
+class DecomposedImage(NamedTuple):
+    """The left image with the quantities that it is computed from.
 
     Args:
         albedo: (H, W, 3) uint8.
         depth: (H, W) along the optical axis [m].
-        layers: the light by its origin.
-        setting: how it was exposed, metered on this image.
-        clean: the image without noise.
-        raw: digital numbers of a physical sensor, with the noise of the next shot: (H, W) behind a Bayer filter, else
-            (H, W, 3); None of a plain one.
+        components: radiance by origin.
+        setting: exposure, metered on this image.
+        noise_free: the image without noise.
+        raw: digital numbers of a physical sensor with the noise of the next capture, (H, W) behind a Bayer filter, else
+            (H, W, 3); None for the plain sensor.
     """
 
     albedo: Image
     depth: Depth
-    layers: Layers
-    setting: Setting
-    clean: Image
+    components: RadianceComponents
+    setting: ExposureSetting
+    noise_free: Image
     raw: Raw | None
 
     @property
@@ -64,73 +66,89 @@ class Anatomy(NamedTuple):
 
 
 class StereoCamera:
-    """Two cameras that share one auto-exposure; the noise of the left one is independent of the right one."""
+    """Two cameras that share one auto-exposure; the noise of the left one is independent of the right one.
+
+    Args:
+        renderer: renders albedo and depth of the floor.
+        image_formation: computes the radiance in the water.
+        scenario: sensor settings.
+        left_rng, right_rng: random streams of the image noise.
+        stopwatch: measures the time of rendering and optics.
+        true_cameras: geometry of the true cameras; that of the scenario where None.
+    """
 
     def __init__(
         self,
         renderer: Renderer,
-        light: Light,
+        image_formation: ImageFormation,
         scenario: Scenario,
         left_rng: np.random.Generator,
         right_rng: np.random.Generator,
-        watch: Callable[[str], AbstractContextManager[None]],
-        view: View | None = None,
+        stopwatch: StageTimer,
+        true_cameras: TrueCameras | None = None,
     ):
-        self._view = make_view(scenario) if view is None else view
-        rig = self._view.rig
-        self._renderer, self._light, self._scenario, self._watch = renderer, light, scenario, watch
+        self._cameras = make_true_cameras(scenario) if true_cameras is None else true_cameras
+        rig = self._cameras.rendered_rig
+        self._renderer, self._image_formation = renderer, image_formation
+        self._scenario, self._stopwatch = scenario, stopwatch
         self._left_from_right, self._frame_rate_hz = rig.left_from_right, rig.frame_rate_hz
-        eyes = rig.body_from_camera, rig.body_from_camera @ rig.left_from_right
-        self._eye_from_body_twist = [geometry.adjoint(geometry.inverse(body_from_eye)) for body_from_eye in eyes]
-        self._sensor = sensor_of(scenario, self._view.sensor)
+        body_from_cameras = rig.body_from_camera, rig.body_from_camera @ rig.left_from_right
+        self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
+        self._sensor = sensor_of(scenario, self._cameras.raw_rig)
         self._rngs = (left_rng, right_rng)
-        self._shots = 0
+        self._n_captures = 0
 
-    def shoot(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> Shot:
-        """Images of the left camera and, where `stereo`, of the right one at the same instant.
+    def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
+        """Returns the image of the left camera and, where `stereo`, the simultaneous one of the right camera.
+
+        Each call advances the time by one frame.
 
         Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            stereo: whether the right camera is used.
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
         """
-        moment = Moment(world_from_left, self._shots / self._frame_rate_hz)
-        self._shots += 1
-        left, depth_left, setting = self._see(moment, 0, twist_body, None)
+        pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
+        self._n_captures += 1
+        left, depth_left, setting = self._expose(pose, 0, twist_body, None)
         if not stereo:
-            return Shot(left, None, depth_left, None)
-        right, depth_right, _ = self._see(moment, 1, twist_body, setting)
-        return Shot(left, right, depth_left, depth_right)
+            return StereoCapture(left, None, depth_left, None)
+        right, depth_right, _ = self._expose(pose, 1, twist_body, setting)
+        return StereoCapture(left, right, depth_left, depth_right)
 
-    def twist_of_eye(self, eye: int, twist_body: Array) -> Array:
-        """(6,) [angular, linear] velocity of an eye (0 left, 1 right) in its own axes [rad/s, m/s]."""
-        return self._eye_from_body_twist[eye] @ twist_body
+    def twist_of_camera(self, camera: int, twist_body: Array) -> Array:
+        """Returns the [angular, linear] velocity (6,) of a camera (0 left, 1 right) in its own axes [rad/s, m/s]."""
+        return self._camera_from_body_twist[camera] @ twist_body
 
-    def dissect(self, world_from_left: Array) -> Anatomy:
-        """What the left image would consist of, as the first of a survey; changes nothing of the camera."""
+    def decompose(self, world_from_left: Array) -> DecomposedImage:
+        """Returns the left image at a pose and time 0 with its components; does not change the state of the camera."""
         albedo, depth = self._renderer.render(world_from_left)
-        layers = self._light.layers(albedo, depth, 0, Moment(world_from_left, 0.0))
-        sensor, view = sensor_of(self._scenario, self._view.sensor), self._view
-        light = view.raw(layers.total, depth, 0)
+        components = self._image_formation.components(albedo, depth, 0, StampedPose(world_from_left, 0.0))
+        cameras = self._cameras
+        sensor = sensor_of(self._scenario, cameras.raw_rig)
+        light = cameras.sample(components.total, depth, 0)
         setting = sensor.meter(light)
-        clean = view.frame(sensor.image(light, setting, None))
+        noise_free = cameras.rectify(sensor.image(light, setting, None))
         next_rng = copy.deepcopy(self._rngs[0])
         raw = sensor.raw(light, setting, next_rng) if isinstance(sensor, PhotoSensor) else None
-        layers = layers._replace(**{k: view.crop(layer) for k, layer in layers._asdict().items() if layer is not None})
-        return Anatomy(view.crop(albedo), view.crop(depth), layers, setting, clean, raw)
+        cropped = {name: cameras.crop(part) for name, part in components._asdict().items() if part is not None}
+        components = components._replace(**cropped)
+        return DecomposedImage(cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw)
 
-    def _see(
-        self, moment: Moment, eye: int, twist_body: Array, setting: Setting | None
-    ) -> tuple[Image, Depth, Setting]:
-        """Image and true depth of an eye, and how it was exposed: as metered here, or as the other eye."""
-        world_from_eye = moment.world_from_left @ self._left_from_right if eye else moment.world_from_left
-        with self._watch("render"):
-            albedo, depth = self._renderer.render(world_from_eye)
-        with self._watch("optics"):
-            light = self._light.radiance(albedo, depth, eye, moment)
+    def _expose(
+        self, pose: StampedPose, camera: int, twist_body: Array, setting: ExposureSetting | None
+    ) -> tuple[Image, Depth, ExposureSetting]:
+        """Returns image, true depth and exposure of a camera; the exposure is metered here where `setting` is None."""
+        world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
+        with self._stopwatch("render"):
+            albedo, depth = self._renderer.render(world_from_camera)
+        with self._stopwatch("optics"):
+            light = self._image_formation.radiance(albedo, depth, camera, pose)
             raw = None
             if setting is None:
-                raw = self._view.raw(light, depth, eye)
+                raw = self._cameras.sample(light, depth, camera)
                 setting = self._sensor.meter(raw)
-            moved = self._sensor.gather(light, depth, self.twist_of_eye(eye, twist_body), setting)
-            raw = self._view.raw(moved, depth, eye) if raw is None or moved is not light else raw
-            image = self._view.frame(self._sensor.image(raw, setting, self._rngs[eye]))
-            return image, self._view.crop(depth), setting
+            integrated = self._sensor.integrate(light, depth, self.twist_of_camera(camera, twist_body), setting)
+            raw = self._cameras.sample(integrated, depth, camera) if raw is None or integrated is not light else raw
+            image = self._cameras.rectify(self._sensor.image(raw, setting, self._rngs[camera]))
+            return image, self._cameras.crop(depth), setting

@@ -1,9 +1,10 @@
-"""Caustics: sunlight that waves of the surface gather into bright lines, which run over the floor.
+"""Caustics: bright moving lines on the floor where the waves of the surface focus the sunlight.
 
-The surface is a sum of waves that fit into a square, which repeats itself. A ray from the zenith meets the surface
-where its slope is s, is bent by (1 - 1/n) s for small slopes, and reaches the floor (1 - 1/n) s D away. Every ray keeps
-its light and lands somewhere in the square: none is lost, and the mean is one. The sun's disc and scattering on the way
-down spread it (Wells' small angles, as in `forward_scatter`): deep down the lines fade.
+The surface is a sum of waves that are periodic in a square tile. A ray from the zenith meets the surface where its
+slope is s, is refracted by (1 - 1/n) s for small slopes, and reaches the floor at a horizontal distance of
+(1 - 1/n) s D. Every ray keeps its light and lands in the tile, so that the mean of the pattern is one. The pattern is
+blurred by the angular size of the sun and by scattering in the water (small-angle theory of Wells, as in
+`forward_scatter`), so that it fades with depth.
 """
 
 from __future__ import annotations
@@ -14,82 +15,91 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from twin.imaging.forward_scatter import forward_lobe
+from twin.imaging.illumination import Illumination
 from twin.imaging.water import Medium
 
 Array = NDArray[np.float64]
 
-TILE_M, CELLS = 4.0, 128  # side of the square; a power of two
-RAYS = 2  # along each side of a cell
+TILE_M, CELLS = 4.0, 128  # side of the tile [m] and [cells]; the latter is a power of two
+RAYS = 2  # per side of a cell
 WAVELENGTHS_M = (0.3, 3.0)
 SLOPE_RMS = 0.08  # of a surface under a light breeze
 WATER_INDEX, GRAVITY_MPS2 = 1.339, 9.81
-SUN_RAD = 0.0047 / 2 / WATER_INDEX  # deviation of the directions within the sun's disc, along one axis, in water
-STREAM = 1 << 16  # of the seed's randomness: of the waves alone
+SUN_RAD = 0.0047 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
+STREAM = 1 << 16  # key of the random stream of the waves
 
 
 class Caustics:
-    """The pattern on the floor of one survey.
+    """Caustics of one survey, on a horizontal plane at the depth of the reference plane.
 
     Args:
-        depth_m: of the reference plane below the surface.
-        share: of the light that is focused; the rest comes from all the sky and is even.
+        illumination: water, depth of the reference plane, and the share of the daylight that is focused; the rest is
+            diffuse light of the sky and uniform.
+        seed: seed of the scenario.
     """
 
-    def __init__(self, depth_m: float, share: float, water: Medium, seed: int):
+    def __init__(self, illumination: Illumination, seed: int):
+        water, daylight = illumination
+        depth_m = daylight.reference_depth_m
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
         per_m = 2 * np.pi * fft.fftfreq(CELLS, TILE_M / CELLS)
         kx, ky = np.meshgrid(per_m, per_m)
         k = np.hypot(kx, ky)
-        among = (k >= 2 * np.pi / WAVELENGTHS_M[1]) & (k <= 2 * np.pi / WAVELENGTHS_M[0])
-        # equal slope in each octave of waves, most of it along the wind (east), none against it
-        weight = np.where(among & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
+        in_band = (k >= 2 * np.pi / WAVELENGTHS_M[1]) & (k <= 2 * np.pi / WAVELENGTHS_M[0])
+        # equal slope variance in each octave; most of it downwind (east), none upwind
+        weight = np.where(in_band & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
         height = np.sqrt(weight) * (rng.normal(size=k.shape) + 1j * rng.normal(size=k.shape))
-        height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # half of a wave's square is its mean
-        some = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))  # no waves beyond
-        self._omega = np.sqrt(GRAVITY_MPS2 * k[:, some])
-        # of a real surface half the waves tell the others
-        self._slope = [(0.5j * along * height)[:, some].astype(np.complex64) for along in (kx, ky)]
-        self._throw = np.float32((1 - 1 / WATER_INDEX) * depth_m * CELLS / TILE_M)
+        height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # the mean square of a wave is 1/2
+        # columns beyond the shortest wave are zero
+        columns = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))
+        self._omega = np.sqrt(GRAVITY_MPS2 * k[:, columns])
+        # 0.5: the spectrum of a real surface is Hermitian, and only one half of it is stored
+        self._slope = [(0.5j * along * height)[:, columns].astype(np.complex64) for along in (kx, ky)]
+        self._cells_per_slope = np.float32((1 - 1 / WATER_INDEX) * depth_m * CELLS / TILE_M)
         self._blur = _blur(k[:, : CELLS // 2 + 1], depth_m, water).astype(np.float32)
-        self._share = np.float32(share)
-        self._now: tuple[float, NDArray[np.float32]] | None = None
+        self._share = np.float32(daylight.focused_share)
+        self._cached: tuple[float, NDArray[np.float32]] | None = None
 
     def pattern(self, time_s: float) -> NDArray[np.float32]:
-        """(CELLS, CELLS) light against the mean, 1; row = north, column = east from the world's origin."""
-        if self._now is None or self._now[0] != time_s:
-            self._now = time_s, self._at(time_s)
-        return self._now[1]
+        """Returns the illuminance (CELLS, CELLS) relative to its mean of 1; row = north, column = east of the origin.
+
+        The last pattern is kept, so that both cameras share it.
+        """
+        if self._cached is None or self._cached[0] != time_s:
+            self._cached = time_s, self._compute(time_s)
+        return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(CELLS, CELLS) slopes of the surface to the east and to the north."""
-        turned = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # waves on deep water
+        """Returns the slopes (CELLS, CELLS) of the surface to the east and to the north."""
+        phase = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # deep-water dispersion
         size = CELLS, CELLS
-        east, north = (np.asarray(fft.irfft2(slope * turned, s=size, norm="forward")) for slope in self._slope)
+        east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
         return east, north
 
-    def _at(self, time_s: float) -> NDArray[np.float32]:
+    def _compute(self, time_s: float) -> NDArray[np.float32]:
         light = np.zeros((CELLS, CELLS), np.float32)
-        _land(*self.slopes(time_s), self._throw, light)
-        spread = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))
-        return 1 + self._share * (spread - 1)
+        _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
+        blurred = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))
+        return 1 + self._share * (blurred - 1)
 
 
 def _blur(k: Array, depth_m: float, water: Medium) -> Array:
-    """What is left of a pattern's waves of number k [1/m] by the sun's disc and by scattering, as green light finds it.
+    """Returns the modulation transfer at wave numbers k [1/m] by the solar disc and by scattering of green light.
 
-    exp(-t) of the light was never scattered forward; the rest was so n = t / (1 - exp(-t)) times.
+    A share exp(-t) of the light, t the optical thickness of forward scattering, is not scattered; the rest is scattered
+    n = t / (1 - exp(-t)) times on average.
     """
     lobe = forward_lobe(water.mean_cosine)
     thickness = lobe.share * float(water.scattering_per_m[1]) * depth_m
-    straight = np.exp(-thickness)
-    times = thickness / (1 - straight) if thickness > 1e-9 else 1.0
-    scattered = np.exp(-0.5 * (k * depth_m) ** 2 * lobe.variance_rad2 * times / 3)
-    return np.exp(-0.5 * (k * depth_m * SUN_RAD) ** 2) * (straight + (1 - straight) * scattered)
+    unscattered = np.exp(-thickness)
+    n_scatterings = thickness / (1 - unscattered) if thickness > 1e-9 else 1.0
+    scattered = np.exp(-0.5 * (k * depth_m) ** 2 * lobe.variance_rad2 * n_scatterings / 3)
+    return np.exp(-0.5 * (k * depth_m * SUN_RAD) ** 2) * (unscattered + (1 - unscattered) * scattered)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _land(east, north, throw, light):
-    """Adds to `light` (n, n) rays from all over the surface, each shared among the four cells it lands between."""
+def _trace_rays(east, north, cells_per_slope, light):
+    """Adds to `light` (n, n) evenly spaced rays through the surface, each shared bilinearly among four cells."""
     n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
     for i in range(n):
         i1 = (i + 1) & (n - 1)
@@ -101,7 +111,7 @@ def _land(east, north, throw, light):
                 to_east += a * ((one - b) * east[i1, j] + b * east[i1, j1])
                 to_north = (one - a) * ((one - b) * north[i, j] + b * north[i, j1])
                 to_north += a * ((one - b) * north[i1, j] + b * north[i1, j1])
-                col, row = np.float32(j) + b - throw * to_east, np.float32(i) + a - throw * to_north
+                col, row = np.float32(j) + b - cells_per_slope * to_east, np.float32(i) + a - cells_per_slope * to_north
                 left, low = np.floor(col), np.floor(row)
                 w, h = col - left, row - low
                 k, m = int(left) & (n - 1), int(low) & (n - 1)

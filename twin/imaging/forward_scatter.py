@@ -1,16 +1,16 @@
-"""Light that the water scatters forward on its way from the floor to the eye: a blur that grows with range.
+"""Forward scatter: light from the floor that the water scatters by small angles blurs the image, more with range.
 
-Of the scattering b, the share whose angle stays below a limit, b_f, keeps the light in the image. A floor at range r
-that sends the radiance L to an eye then arrives as L exp(-(c - b_f) r), of which exp(-b_f r) was never scattered (the
-direct signal, L exp(-c r), as before) and 1 - exp(-b_f r) is spread over the image. This is McGlamery's form (1979;
-Jaffe 1990), direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f, which is a + 0.26 b here.
+The share of the scattering b with an angle below a limit, b_f, keeps the light in the image. The radiance L of a floor
+at range r then arrives as L exp(-(c - b_f) r): exp(-b_f r) of it is the direct signal, L exp(-c r), and 1 - exp(-b_f r)
+of it is blurred. This is the form of McGlamery (1979) and Jaffe (1990), direct + (exp(-G r) - exp(-c r)) blurred, with
+G = c - b_f, which is a + 0.26 b here.
 
-Width, by the theory of small angles (Wells 1969, 1973): light scattered once, at an even place of the way, by an angle
-of variance s^2 (along each axis), is seen off by s^2 / 3; the number of scatterings is Poisson's of mean b_f r, which
-of the scattered light is n = b_f r / (1 - exp(-b_f r)). The spread is drawn as a Gaussian of that variance, n s^2 / 3.
-What `water.kept_share` keeps in the light already is not spread a second time: b_f is less by that share of b.
-Nothing is lost: the borders of the image reflect, as if the floor went on beyond. The way from the lamps to the floor
-is left as it is: all that is scattered there counts as lost.
+The width follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly distributed position
+along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance s^2 / 3. The number of
+scatterings is Poisson distributed with mean b_f r; its mean over the scattered light is n = b_f r / (1 - exp(-b_f r)).
+The point spread function is a Gaussian of variance n s^2 / 3. The share of b that `water.kept_share` does not count as
+lost is subtracted from b_f, so that it is not counted twice. No light is lost at the image borders, which reflect, as
+if the floor continued. On the path from the lamps to the floor all scattered light counts as lost.
 """
 
 from __future__ import annotations
@@ -27,117 +27,117 @@ from twin.imaging.optics import Depth, Radiance
 from twin.imaging.powers import LOG2_E, two_to
 from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import FAR_M, PATH_MAX_M
-from twin.imaging.water import FORWARDNESS, Medium, phase_function
+from twin.imaging.water import SEA_WATER_MEAN_COSINE, Medium, phase_function
 
 Array = NDArray[np.float64]
 
-FORWARD_DEG = 15.0  # scattering by more takes light out of the image
-LEVELS = 4  # of the variance: 1, 2, 4, 8 times the least; between two levels light is shared
-STEP_M = 0.02  # of the table of levels over range
-MAX_LOG_GAIN = 60.0  # where that much is scattered forward, nothing arrives
+FORWARD_DEG = 15.0  # light scattered by a larger angle is lost from the image
+LEVELS = 4  # of the variance: 1, 2, 4, 8 times the smallest; light in between is shared by two levels
+STEP_M = 0.02  # range step of the table of levels
+MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
 
 
 class Lobe(NamedTuple):
-    """The forward part of scattering: its share of all, and the variance of its angle along one axis [rad2]."""
+    """Forward part of the scattering: its share of b, and the variance of its angle along one axis [rad2]."""
 
     share: float
     variance_rad2: float
 
 
-def forward_lobe(mean_cosine: float = FORWARDNESS) -> Lobe:
-    """Scattering by less than `FORWARD_DEG`, by numbers from the phase function."""
+def forward_lobe(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> Lobe:
+    """Returns the scattering by less than `FORWARD_DEG`, integrated numerically over the phase function."""
     angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
     density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
     return Lobe(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
 
 
 class ForwardScatter:
-    """Makes the blurred part of a floor's light from the direct part."""
+    """Computes the forward-scattered radiance of the floor from its direct signal."""
 
     def __init__(self, rig: StereoRig, water: Medium):
         lobe = forward_lobe(water.mean_cosine)
         scattered_per_m = max(lobe.share - water.kept_share, 0.0) * water.scattering_per_m
         thickness = scattered_per_m * np.arange(0.0, PATH_MAX_M, STEP_M)[:, None]
-        times = np.where(thickness > 1e-9, thickness / -np.expm1(-np.maximum(thickness, 1e-9)), 1.0)
+        n_scatterings = np.where(thickness > 1e-9, thickness / -np.expm1(-np.maximum(thickness, 1e-9)), 1.0)
         self._scattered_per_m = scattered_per_m.astype(np.float32)
-        self._level = _level_of(times).astype(np.float32)
+        self._level = _level_of(n_scatterings).astype(np.float32)
         self._focal_px = rig.focal_px
         self._variance_px2 = rig.focal_px**2 * lobe.variance_rad2 / 3 * 2.0 ** np.arange(LEVELS)
-        self._whole = np.empty((rig.height_px, rig.width_px, 3), np.float32)
+        self._blurred = np.empty((rig.height_px, rig.width_px, 3), np.float32)
         self._bin_px = _bin_px(rig.width_px, rig.height_px, float(np.sqrt(self._variance_px2[0])))
 
     def spread(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Radiance that arrives scattered forward.
+        """Returns the forward-scattered radiance (H, W, 3) [cd/m2].
 
         Args:
-            direct: (H, W, 3) what arrives unscattered [cd/m2].
+            direct: (H, W, 3) direct signal [cd/m2].
             depth: (H, W) along the optical axis [m].
         """
-        return self._draw(direct, depth).copy()
+        return self._blur(direct, depth).copy()
 
     def add(self, direct: Radiance, depth: Depth, light: Radiance) -> None:
-        """Adds to `light` (H, W, 3) what arrives from the floor, scattered forward or not."""
-        spread = self._draw(direct, depth)
+        """Adds the direct signal and the forward-scattered radiance of the floor to `light` (H, W, 3), in place."""
+        spread = self._blur(direct, depth)
         parts = light.reshape(len(light), -1), spread.reshape(len(light), -1), direct.reshape(len(light), -1)
         in_row_bands(lambda first, end: _add(*parts, first, end), len(light))
 
-    def _draw(self, direct: Radiance, depth: Depth) -> Radiance:
-        """The same as `spread`, in memory of its own until the next call: to get fresh one takes as long as to fill."""
+    def _blur(self, direct: Radiance, depth: Depth) -> Radiance:
+        """Same as `spread`, in an array that the next call overwrites: allocation takes as long as the computation."""
         size, (height, width) = self._bin_px, depth.shape
         bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
         scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
         in_row_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
-        # what lies in a bin has its variance already, and drawing straight lines between bins adds to it
+        # binning and bilinear interpolation between bins add a variance of their own, which is subtracted here
         sigma = np.sqrt(np.maximum(self._variance_px2 / size**2 - (0.25 - 1 / (4 * size**2)), 1e-3))
         pairs = zip(bins, sigma, strict=True)
         blurred = np.zeros_like(bins[0])
-        for level, deviation in pairs:
+        for level, level_sigma in pairs:
             if level.any():
-                blurred += cv2.GaussianBlur(level, (0, 0), deviation, borderType=cv2.BORDER_REFLECT)
-        cv2.resize(blurred / np.float32(size**2), (width, height), dst=self._whole, interpolation=cv2.INTER_LINEAR)
-        return self._whole
+                blurred += cv2.GaussianBlur(level, (0, 0), level_sigma, borderType=cv2.BORDER_REFLECT)
+        cv2.resize(blurred / np.float32(size**2), (width, height), dst=self._blurred, interpolation=cv2.INTER_LINEAR)
+        return self._blurred
 
 
-def _level_of(times: Array) -> Array:
-    """Where variances of `times` the least lie among levels that double: whole at a level, straight between."""
-    below = np.minimum(np.floor(np.log2(times)), LEVELS - 2)
-    return np.minimum(below + times / 2**below - 1, LEVELS - 1)
+def _level_of(ratio: Array) -> Array:
+    """Returns the fractional level of variances of `ratio` times the smallest: levels double, linear in between."""
+    below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
+    return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 
 
 def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
-    """Side of the bins in which the blur is made: the largest that divides the image and is finer than the blur."""
+    """Returns the side of the bins for the blur [px]: the largest that divides the image and is below 0.8 sigma."""
     sides = [n for n in (8, 4, 2) if width_px % n == height_px % n == 0 and n < 0.8 * sigma_px]
     return sides[0] if sides else 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, end):
-    """Puts the light that is scattered forward of each pixel into its bin, shared between the two levels of its range.
+    """Adds the forward-scattered light of each pixel to its bin, shared between the two levels of its range.
 
-    Of the bins' rows from `first` to `end`. Light is counted pixel by pixel; its width is that of a bin's mean range.
+    Fills rows `first` to `end` of the bins. Light is computed for each pixel, its level for the mean range of a bin.
     """
     levels, _, cols, _ = bins.shape
     width, last = depth.shape[1], level.shape[0] - 1
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     red, green, blue = np.float32(LOG2_E) * scattered_per_m
     most = np.float32(LOG2_E * MAX_LOG_GAIN)
-    # light of each band, range, and number of pixels with a floor
-    found, of_bins = np.empty((5, width), np.float32), np.empty((5, cols), np.float32)
+    # rows: light of each band, range, number of pixels with a floor
+    of_columns, of_bins = np.empty((5, width), np.float32), np.empty((5, cols), np.float32)
     for row in range(first, end):
-        found[:] = zero
+        of_columns[:] = zero
         for v in range(row * size, (row + 1) * size):
             y = (np.float32(v) - half * np.float32(depth.shape[0] - 1)) / focal
             here, light = depth[v], direct[v].reshape(-1)
             for u in range(width):
                 x = (np.float32(u) - half * np.float32(width - 1)) / focal
-                way = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else zero
-                found[0, u] += light[3 * u] * (two_to(min(red * way, most)) - one)
-                found[1, u] += light[3 * u + 1] * (two_to(min(green * way, most)) - one)
-                found[2, u] += light[3 * u + 2] * (two_to(min(blue * way, most)) - one)
-                found[3, u] += way
-                found[4, u] += one if way > zero else zero
+                range_m = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else zero
+                of_columns[0, u] += light[3 * u] * (two_to(min(red * range_m, most)) - one)
+                of_columns[1, u] += light[3 * u + 1] * (two_to(min(green * range_m, most)) - one)
+                of_columns[2, u] += light[3 * u + 2] * (two_to(min(blue * range_m, most)) - one)
+                of_columns[3, u] += range_m
+                of_columns[4, u] += one if range_m > zero else zero
         for k in range(5):
-            of_pixels = found[k]
+            of_pixels = of_columns[k]
             for col in range(cols):
                 total = zero
                 for u in range(size):
@@ -154,7 +154,7 @@ def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, en
 
 @njit(cache=True, nogil=True)
 def _add(light, one, other, first, end):
-    """Adds two images to a third (H, 3 W), in its rows from `first` to `end`."""
+    """Adds two images to `light` (H, 3 W) in rows `first` to `end`."""
     for v in range(first, end):
         for k in range(light.shape[1]):
             light[v, k] = light[v, k] + one[v, k] + other[v, k]

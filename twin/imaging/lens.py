@@ -1,6 +1,6 @@
-"""Distortion of a lens by Brown and Conrady, in the form and order of OpenCV (Brown 1971, Close-range calibration).
+"""Lens distortion by Brown and Conrady, in the form and order of OpenCV (Brown 1971, Close-range calibration).
 
-With x, y the tangents of a ray before the lens and r^2 = x^2 + y^2, the ray is seen at
+A ray in front of the lens has the tangents x, y; with r^2 = x^2 + y^2 its image lies at
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -21,7 +21,7 @@ STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; in tangents, a millionth of 
 
 
 class Distortion(NamedTuple):
-    """Coefficients of a lens; all zero = a pinhole."""
+    """Distortion coefficients of a lens; all zero = a pinhole."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -31,17 +31,17 @@ class Distortion(NamedTuple):
 
 
 def true_lens(lens: LensConfig) -> Distortion:
-    """The lens that the sea is seen through."""
+    """Returns the true distortion of the lens."""
     return Distortion(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2)
 
 
 def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Distortion:
-    """The lens by which frames are rectified: the true one less the errors of calibration."""
+    """Returns the distortion with which frames are rectified: the true one minus the calibration errors."""
     return true_lens(lens)._replace(k1=lens.k1 - calibration.k1_error, k2=lens.k2 - calibration.k2_error)
 
 
 def distort(tangents: Array, lens: Distortion) -> Array:
-    """Where rays (..., 2) are seen, by the formula of the module."""
+    """Returns the distorted image coordinates (..., 2) of rays with tangents (..., 2), by the formula of the module."""
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
@@ -54,37 +54,40 @@ def distort(tangents: Array, lens: Distortion) -> Array:
     )
 
 
-def undistort(seen: Array, lens: Distortion) -> Array:
-    """The rays (..., 2) seen there: the inverse of `distort`, by Newton; NaN where the lens folds the image."""
-    tangents = seen
+def undistort(distorted: Array, lens: Distortion) -> Array:
+    """Returns the tangents (..., 2) of the rays seen at distorted coordinates (..., 2); NaN where the lens folds.
+
+    Inverse of `distort` by Newton's method.
+    """
+    tangents = distorted
     for _ in range(STEPS):
-        off = distort(tangents, lens) - seen
-        if np.nanmax(np.abs(off), initial=0.0) < TOLERANCE:
+        residual = distort(tangents, lens) - distorted
+        if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
             break
-        tangents = tangents - solve(_slopes(tangents, lens), off)
-    whole = np.abs(distort(tangents, lens) - seen).max(axis=-1) < 1e3 * TOLERANCE
-    whole &= np.hypot(tangents[..., 0], tangents[..., 1]) < fold(lens)
-    return np.where(whole[..., None], tangents, np.nan)
+        tangents = tangents - solve(_jacobian(tangents, lens), residual)
+    converged = np.abs(distort(tangents, lens) - distorted).max(axis=-1) < 1e3 * TOLERANCE
+    converged &= np.hypot(tangents[..., 0], tangents[..., 1]) < fold(lens)
+    return np.where(converged[..., None], tangents, np.nan)
 
 
 def fold(lens: Distortion) -> float:
-    """Tangent of the angle from the axis beyond which the radial part runs backwards; inf where it never does."""
-    # By 1 / r^2, where a coefficient that vanishes is no division: the slope of r (1 + k1 r^2 + ...) times 1 / r^6.
+    """Returns the tangent of the angle from the axis at which the radial distortion stops increasing; inf if never."""
+    # In 1 / r^2, a coefficient of zero is no division: the slope of r (1 + k1 r^2 + ...) times 1 / r^6.
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(real.max())) if real.size else np.inf
 
 
-def solve(slopes: Array, wrong: Array) -> Array:
-    """slopes^-1 wrong for (..., 2, 2) and (..., 2): a step of Newton's; not finite where there is none."""
-    (a, b), (c, d) = (slopes[..., 0, 0], slopes[..., 0, 1]), (slopes[..., 1, 0], slopes[..., 1, 1])
+def solve(jacobian: Array, residual: Array) -> Array:
+    """Returns jacobian^-1 residual for (..., 2, 2) and (..., 2), a Newton step; not finite where it is singular."""
+    (a, b), (c, d) = (jacobian[..., 0, 0], jacobian[..., 0, 1]), (jacobian[..., 1, 0], jacobian[..., 1, 1])
     with np.errstate(all="ignore"):
-        x, y = d * wrong[..., 0] - b * wrong[..., 1], a * wrong[..., 1] - c * wrong[..., 0]
+        x, y = d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]
         return np.stack([x, y], axis=-1) / (a * d - b * c)[..., None]
 
 
-def _slopes(tangents: Array, lens: Distortion) -> Array:
-    """(..., 2, 2) derivatives of `distort`."""
+def _jacobian(tangents: Array, lens: Distortion) -> Array:
+    """Returns the Jacobian (..., 2, 2) of `distort`."""
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))

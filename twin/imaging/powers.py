@@ -1,4 +1,4 @@
-"""Powers of two inside a compiled loop, in steps that a processor does for many numbers at once."""
+"""Powers of two for compiled loops, written so that the compiler can vectorize them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 from numba import njit
 
 LOG2_E = 1.4426950408889634
-LEAST = -126.0  # of exponents: smaller ones count as this, which single precision just holds in full
+LEAST = -126.0  # smallest exponent, that of the smallest normal number in single precision; others are clipped to it
 
 
 @njit(cache=True, nogil=True, inline="always")
 def two_to(t):
-    """2^t for t up to 127, to 2e-7 of itself; exactly 1 at 0.
+    """Returns 2^t for t up to 127 with a relative error of 2e-7; exactly 1 at 0.
 
-    2^t = 2^n 2^f, n whole and f within 1/2 of 0; of 2^f - 1 the minimax polynomial, of 2^n the bits of a float32.
+    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 by a minimax polynomial, 2^n by the bits of a float32.
     """
     one, t = np.float32(1.0), max(t, np.float32(LEAST))
     n = np.floor(t + np.float32(0.5))

@@ -1,4 +1,4 @@
-"""What a camera would see in perfectly clear, evenly lit water: albedo and depth of the floor, in one MuJoCo pass."""
+"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without water and without lamps."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ from numpy.typing import NDArray
 
 from scenes.builder import SceneModel
 from scenes.floor import FLOOR_GROUP
-from scenes.gl import GlMissing, MjModel, MjvScene, mujoco, offscreen_context
+from scenes.gl import MjModel, MjvScene, mujoco, offscreen_context
 from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
-NEAR_M = 0.05  #: nothing nearer is drawn
+NEAR_M = 0.05  #: near clipping plane
 
 
 class Renderer:
-    """Draws a world's floor from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
+    """Renders the floor of a scene from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
 
-    Holds an OpenGL context: make one per process and thread, and `close` it.
+    Owns an OpenGL context: create one per process and thread, and `close` it.
 
     Args:
-        width_px, height_px, vfov_deg: the camera; square pixels, its axis through the middle of the image.
-        znear_m, zfar_m: nothing nearer or farther is drawn.
+        scene: MuJoCo model of the scene.
+        width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
+        znear_m, zfar_m: clipping planes.
     Raises:
-        TwinError: no OpenGL on this machine.
+        TwinError: OpenGL is not available.
     """
 
     def __init__(
@@ -49,19 +50,19 @@ class Renderer:
         self._scene = _floor_scene(scene.model)
         self._set_projection()
         order = {geom: k for k, geom in enumerate(scene.tile_geom_ids)}
-        drawn = [self._scene.geoms[k] for k in range(self._scene.ngeom)]
-        self._tiles = sorted(drawn, key=lambda geom: order[geom.objid])
+        geoms = [self._scene.geoms[k] for k in range(self._scene.ngeom)]
+        self._tiles = sorted(geoms, key=lambda geom: order[geom.objid])
         self._meshes = [tile.dataid for tile in self._tiles]
         self._shown = np.ones(len(self._tiles), dtype=bool)
 
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Albedo (h, w, 3) uint8 RGB and depth (h, w) float32 [m] along the optical axis, inf where no floor is.
+        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m], inf without floor.
 
         Args:
             world_from_camera: (4, 4) pose of the camera.
         """
         self._gl.make_current()
-        self._place(world_from_camera)
+        self._set_pose(world_from_camera)
         self._show(visible_tiles(self._scene_model, world_from_camera, self._tan))
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         mujoco.mjr_render(self._rect, self._scene, self._context)
@@ -69,7 +70,7 @@ class Renderer:
         return self._rgb[::-1].copy(), linear_depth(self._z[::-1], self._near, self._far)  # OpenGL's rows run upwards
 
     def close(self) -> None:
-        """Gives the OpenGL context back; closing twice does no harm."""
+        """Releases the OpenGL context; closing twice has no effect."""
         if self._gl is not None:
             self._gl.make_current()
             self._context.free()
@@ -83,41 +84,39 @@ class Renderer:
         self.close()
 
     def _set_projection(self) -> None:
-        for camera in self._scene.camera:  # two cameras, of which MuJoCo takes the mean
+        for camera in self._scene.camera:  # MuJoCo averages its two cameras
             camera.frustum_near, camera.frustum_far = self._near, self._far
             camera.frustum_center, camera.frustum_width = 0.0, self._near * self._tan[0]
             camera.frustum_top, camera.frustum_bottom = self._near * self._tan[1], -self._near * self._tan[1]
             camera.orthographic = 0
 
-    def _place(self, world_from_camera: Array) -> None:
+    def _set_pose(self, world_from_camera: Array) -> None:
         for camera in self._scene.camera:
             camera.pos[:] = world_from_camera[:3, 3]
             camera.forward[:] = world_from_camera[:3, 2]
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Hides tiles by taking their mesh away: a geom without one costs next to nothing."""
+        """Shows only the visible tiles; hidden ones lose their mesh, as a geom without a mesh costs almost nothing."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible
 
 
 def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
-    """A current OpenGL context, and MuJoCo's in it with the model uploaded."""
+    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded."""
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    except GlMissing as error:
-        raise TwinError(error.field, error.problem, error.allowed) from error
     except mujoco.FatalError as error:
-        raise TwinError("rendering", f"OpenGL fails: {error}", "OpenGL 1.5 with frame buffer objects") from error
+        raise TwinError("rendering", f"OpenGL error: {error}", "OpenGL 1.5 with frame buffer objects") from error
     mujoco.mjr_resizeOffscreen(width_px, height_px, context)
-    context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR  # keeps all digits: 32-bit floats are densest at zero
+    context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR  # 32-bit floats have the highest resolution near zero
     return gl, context
 
 
 def _floor_scene(model: MjModel) -> MjvScene:
-    """The floor's tiles, and no effect that changes a colour."""
+    """Returns a scene with the tiles of the floor, and without effects that change colours."""
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
     option = mujoco.MjvOption()
     option.geomgroup[:] = 0
@@ -132,20 +131,25 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Which tiles' boxes reach into the camera's pyramid of view: a box is out if it lies beyond one of the four sides.
+    """Returns which tiles (n,) bool intersect the view frustum: those whose bounding box is not outside of one side.
 
     Args:
+        scene: MuJoCo model of the scene.
+        world_from_camera: (4, 4) pose of the camera.
         half_tangents: (2,) tangents of half the horizontal and vertical field of view.
     """
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
     low, high = scene.tile_low_m - world_from_camera[:3, 3], scene.tile_high_m - world_from_camera[:3, 3]
-    # the corner of a box that lies farthest inwards of a side takes, along each axis, the end the normal points to
+    # the innermost corner of a box relative to a side: along each axis the end that the normal points to
     farthest = high @ np.maximum(inward, 0).T + low @ np.minimum(inward, 0).T
     return np.all(farthest >= 0, axis=1)
 
 
 def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.float32) -> NDArray[np.float32]:
-    """Depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far): 1 / depth = z (1/near - 1/far) + 1/far."""
+    """Returns the depth [m] of OpenGL's reversed depth buffer (1 at near, 0 at far); inf where nothing is drawn.
+
+    1 / depth = z (1/near - 1/far) + 1/far.
+    """
     inverse = z_buffer * np.float32(1 / near_m - 1 / far_m) + np.float32(1 / far_m)
     return np.where(z_buffer > 0, np.reciprocal(inverse), np.float32(np.inf))

@@ -1,8 +1,8 @@
-"""Images at other places than their pixels, by cubic B-splines in single precision.
+"""Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps round places to 1/32 px. Here light is gathered with the spline itself as the response of a pixel: what
-a rendering holds beyond half a cycle a pixel would else beat with the places. Pictures of a sensor are interpolated:
-filtered first so that the spline passes through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
+OpenCV's warps round positions to 1/32 px. Radiance is resampled with the B-spline itself as the response of a pixel,
+which suppresses detail of the rendering beyond half a cycle per pixel that would alias. Images of a sensor are
+interpolated: filtered first so that the spline passes through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations
@@ -14,55 +14,58 @@ from numpy.typing import NDArray
 from twin.core.records import Image
 from twin.imaging.row_parallel import in_row_bands
 
-Light = NDArray[np.float32]
-Places = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
+Radiance = NDArray[np.float32]
+Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
 
-REACH_PX = 2  # a spline's, to each side
-POLE, MIRRORED = 3**0.5 - 2, 16  # of a spline's coefficients; POLE^16 is lost in single precision
-MEETINGS = 4  # of a ray with the depth map; each leaves of the error p / z times the floor's slope, p = ray's offset
-MET_PX = 1e-3  # a last step of which some percent are left
-
-
-def gather(light: Light, places: Places) -> Light:
-    """(h, w, 3) light (H, W, 3) as pixels at these places gather it; beyond its border the border goes on."""
-    return _gathered(np.ascontiguousarray(light).reshape(len(light), -1), places)
+REACH_PX = 2  # support of the spline to each side
+POLE, MIRRORED = 3**0.5 - 2, 16  # of the spline's prefilter; POLE^16 is negligible in single precision
+INTERSECTION_STEPS = 4  # each multiplies the error by p / z times the floor's slope, p the ray's offset
+INTERSECTION_PX = 1e-3  # size of the last step; the remaining error is a few percent of it
 
 
-def interpolate(image: Image, places: Places) -> Image:
-    """An image (H, W, 3) between its pixels, exact at them."""
+def sample(light: Radiance, positions: Positions) -> Radiance:
+    """Returns the radiance (h, w, 3) that pixels at these positions collect from radiance (H, W, 3).
+
+    Beyond its border the last row or column is repeated.
+    """
+    return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
+
+
+def interpolate(image: Image, positions: Positions) -> Image:
+    """Returns an image (H, W, 3) interpolated at positions (h, w, 2); exact at the pixels."""
     spline = image.reshape(len(image), -1).astype(np.float32)
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
-    between, out = _gathered(spline, places), np.empty((*places.shape[:2], 3), np.uint8)
-    in_row_bands(lambda first, end: _round(between, out, first, end), len(places))
+    between, out = _sampled(spline, positions), np.empty((*positions.shape[:2], 3), np.uint8)
+    in_row_bands(lambda first, end: _round(between, out, first, end), len(positions))
     return out
 
 
-def _gathered(source: NDArray[np.float32], places: Places) -> Light:
-    out = np.empty((*places.shape[:2], 3), np.float32)
-    in_row_bands(lambda first, end: _gather(source, places, out, first, end), len(places))
+def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
+    out = np.empty((*positions.shape[:2], 3), np.float32)
+    in_row_bands(lambda first, end: _sample(source, positions, out, first, end), len(positions))
     return out
 
 
-def meet(depth: NDArray[np.float32], places: Places, shift_px_m: Places) -> Places:
-    """Where rays that do not pass through the eye meet the floor, in its image.
+def intersect(depth: NDArray[np.float32], positions: Positions, parallax_px_m: Positions) -> Positions:
+    """Returns the image positions where rays that do not pass through the camera centre intersect the floor.
 
-    A ray that lies off the eye by p [m] at depth zero is seen f p / z beside its end, z the depth of the floor that is
-    seen there. 1 / z of a plane is even in the image: between pixels it is taken straight.
+    A ray at distance p [m] from the camera centre at depth zero is imaged f p / z away from its vanishing point, z the
+    depth of the floor at that position. 1 / z of a plane is linear in the image and is interpolated linearly.
 
     Args:
-        depth: (H, W) [m]; inf where no floor is.
-        places: ends of the rays, infinitely far.
-        shift_px_m: f p.
+        depth: (H, W) [m]; inf where there is no floor.
+        positions: (h, w, 2) vanishing points of the rays.
+        parallax_px_m: (h, w, 2) f p.
     """
-    out, nearness = np.empty_like(places), np.reciprocal(depth)
-    in_row_bands(lambda first, end: _meet(nearness, places, shift_px_m, out, first, end), len(places))
+    out, near = np.empty_like(positions), np.reciprocal(depth)
+    in_row_bands(lambda first, end: _intersect(near, positions, parallax_px_m, out, first, end), len(positions))
     return out
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _weights(t):
-    """Of the four pixels around a place that lies t behind the second."""
+    """Returns the B-spline weights of four pixels for a position at a distance t in [0, 1] from the second."""
     s, sixth = np.float32(1.0) - t, np.float32(1 / 6)
     four, three = np.float32(4.0), np.float32(3.0)
     a, d = s * s * s * sixth, t * t * t * sixth
@@ -71,12 +74,12 @@ def _weights(t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gather(source, places, out, first, end):
+def _sample(source, positions, out, first, end):
     """Fills rows `first` to `end` of `out` (h, w, 3) from `source` (H, 3 W)."""
     rows, cols = source.shape[0], source.shape[1] // 3
     for v in range(first, end):
         for u in range(out.shape[1]):
-            x, y = places[v, u, 0], places[v, u, 1]
+            x, y = positions[v, u, 0], positions[v, u, 1]
             col, row = int(np.floor(x)), int(np.floor(y))
             wx, wy = _weights(x - np.float32(col)), _weights(y - np.float32(row))
             a, b = 3 * min(max(col - 1, 0), cols - 1), 3 * min(max(col, 0), cols - 1)
@@ -92,7 +95,7 @@ def _gather(source, places, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _round(numbers, out, first, end):
-    """Fills rows `first` to `end` of `out` with whole numbers of a byte."""
+    """Fills rows `first` to `end` of `out` with numbers rounded and clipped to 8 bits."""
     least, most = np.float32(0.0), np.float32(255.0)
     for v in range(first, end):
         row, filled = numbers[v].reshape(-1), out[v].reshape(-1)
@@ -102,9 +105,9 @@ def _round(numbers, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _filter_columns(image, first, end):
-    """Turns columns `first` to `end` of an image (H, n) into a cubic spline's coefficients, mirrored at its ends.
+    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored ends.
 
-    With the pole p they are 6 times those of 1 / (1 - p z^-1), then of -p / (1 - p z) (Unser et al. 1993).
+    With the pole p: 6 times the filter 1 / (1 - p z^-1), followed by -p / (1 - p z) (Unser et al. 1993).
     """
     pole, rows = np.float32(POLE), image.shape[0]
     for k in range(first, end):
@@ -128,28 +131,29 @@ def _filter_columns(image, first, end):
 
 @njit(cache=True, nogil=True)
 def _filter_rows(image, first, end):
-    """The same along rows `first` to `end` of an image (H, 3 W)."""
+    """Same as `_filter_columns` along rows `first` to `end` of an image (H, 3 W)."""
     for v in range(first, end):
         _filter_columns(image[v].reshape(-1, 3), 0, 3)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meet(inverse, places, shift, out, first, end):
-    rows, cols = inverse.shape
+def _intersect(near, positions, parallax, out, first, end):
+    """Fills rows `first` to `end` of `out` by fixed-point iteration; `near` is 1 / depth."""
+    rows, cols = near.shape
     for v in range(first, end):
         for u in range(out.shape[1]):
-            x, y = places[v, u, 0], places[v, u, 1]
-            for _ in range(MEETINGS):
+            x, y = positions[v, u, 0], positions[v, u, 1]
+            for _ in range(INTERSECTION_STEPS):
                 col = min(max(int(np.floor(x)), 0), cols - 2)
                 row = min(max(int(np.floor(y)), 0), rows - 2)
                 s = min(max(x - np.float32(col), np.float32(0.0)), np.float32(1.0))
                 t = min(max(y - np.float32(row), np.float32(0.0)), np.float32(1.0))
-                above = inverse[row, col] + s * (inverse[row, col + 1] - inverse[row, col])
-                below = inverse[row + 1, col] + s * (inverse[row + 1, col + 1] - inverse[row + 1, col])
-                nearness = above + t * (below - above)
+                above = near[row, col] + s * (near[row, col + 1] - near[row, col])
+                below = near[row + 1, col] + s * (near[row + 1, col + 1] - near[row + 1, col])
+                inverse = above + t * (below - above)
                 was_x, was_y = x, y
-                x = places[v, u, 0] + shift[v, u, 0] * nearness
-                y = places[v, u, 1] + shift[v, u, 1] * nearness
-                if abs(x - was_x) + abs(y - was_y) < np.float32(MET_PX):
+                x = positions[v, u, 0] + parallax[v, u, 0] * inverse
+                y = positions[v, u, 1] + parallax[v, u, 1] * inverse
+                if abs(x - was_x) + abs(y - was_y) < np.float32(INTERSECTION_PX):
                     break
             out[v, u, 0], out[v, u, 1] = x, y

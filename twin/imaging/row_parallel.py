@@ -1,4 +1,4 @@
-"""An image in bands of rows, one to each of two processors: a band's pixels do not depend on how the image is cut."""
+"""Parallel processing of an image in bands of rows; the result does not depend on the number of bands."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
-THREADS = 2  # more of them wait for one another: the work of an image takes milliseconds
-LEAST_ROWS = 32  # of a band; for less, waking a thread costs more than it does
+THREADS = 2  # with more threads, synchronization costs more than it gains: an image takes milliseconds
+LEAST_ROWS = 32  # of a band; for fewer rows, waking a thread costs more than the work
 
 
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1) -> None:
-    """Runs `work(first_row, end_row)` over all rows, side by side where there are processors; its kernels free the GIL.
+    """Runs `work(first_row, end_row)` over all rows, in parallel where processors are free.
 
     Args:
-        pixels: rows of the image that each of these stands for.
+        work: processes rows first_row to end_row - 1; its kernels release the GIL.
+        n_rows: number of rows.
+        pixels: image rows that each of these rows stands for.
     Raises:
-        Exception: what `work` raised in any band.
+        Exception: any exception that `work` raises in any band.
     """
-    if n_rows * pixels < THREADS * LEAST_ROWS or _processors() < THREADS:
+    if n_rows * pixels < THREADS * LEAST_ROWS or _n_processors() < THREADS:
         work(0, n_rows)
         return
     cuts = [n_rows * k // THREADS for k in range(THREADS + 1)]
-    others = [_helpers(os.getpid()).submit(work, *band) for band in zip(cuts[1:], cuts[2:], strict=False)]
+    others = [_thread_pool(os.getpid()).submit(work, *band) for band in zip(cuts[1:], cuts[2:], strict=False)]
     try:
         work(cuts[0], cuts[1])
     finally:
@@ -32,12 +34,12 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1)
 
 
 @cache
-def _helpers(process: int) -> ThreadPoolExecutor:
-    """Threads beside the caller's own; a process that was forked off has none of its parent's."""
+def _thread_pool(process: int) -> ThreadPoolExecutor:
+    """Returns the threads in addition to the calling one; a forked process gets a pool of its own."""
     return ThreadPoolExecutor(THREADS - 1, thread_name_prefix=f"bands-{process}")
 
 
 @cache
-def _processors() -> int:
-    """How many processors this process may run on."""
+def _n_processors() -> int:
+    """Returns the number of processors that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

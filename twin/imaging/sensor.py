@@ -1,6 +1,6 @@
-"""From radiance to numbers: exposure, shot noise, read noise, saturation, 8 bits.
+"""Sensor model by shares of full scale: auto-exposure, shot noise, read noise, saturation, 8 bits.
 
-The sensor of a scenario without a [sensor]: a gain without limits, noise by shares of full scale, no time of exposure.
+Used for a scenario without [sensor]: unlimited gain, and no exposure time.
 """
 
 from __future__ import annotations
@@ -21,16 +21,22 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-EXPOSURE_LAG_S = 0.5  # time in which auto-exposure makes up for all but 1/e of a change of light
+EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
 
-DARK_CD_M2 = 1e-6  # the gain is that of this light where there is less
+DARK_CD_M2 = 1e-6  # lower limit of the metered light
 
 
-class Exposure:
-    """Auto-exposure: the gain that brings the mean of the brightest channel to `imaging.gray_level`, with a lag.
+class AutoExposure:
+    """Auto-exposure: sets the gain that brings the mean of the brightest channel to `gray_level`, with a lag.
 
-    Water takes colours away: by the mean of all channels the one that is left would saturate. The gain of a frame
-    follows from the frames before it, as in a real camera; the first frame is metered.
+    The brightest channel is used because water absorbs colours: with the mean of all channels the remaining one would
+    saturate. The gain of a frame follows from the frames before it, as in a real camera; the first frame is metered.
+
+    Args:
+        gray_level: target mean as a share of full scale.
+        frame_rate_hz: frames per second.
+        lag_s: time constant; 0 = the gain follows within one frame.
+        limits: smallest and largest gain [1 / (cd/m2)].
     """
 
     def __init__(
@@ -38,20 +44,20 @@ class Exposure:
         gray_level: float,
         frame_rate_hz: float,
         lag_s: float = EXPOSURE_LAG_S,
-        reach: tuple[float, float] = (0.0, math.inf),
+        limits: tuple[float, float] = (0.0, math.inf),
     ):
         self._gray_level = gray_level
         self._share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
-        self._reach = reach
+        self._limits = limits
         self._log_gain: float | None = None
 
     def gain(self, radiance: Radiance) -> float:
-        """Gain of this frame [1 / (cd/m2)]; the light of this frame counts for the next ones."""
+        """Returns the gain of this frame [1 / (cd/m2)]; its radiance (H, W, 3) affects the next frames."""
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
-        """The same for a mean of the brightest channel [cd/m2]; what is out of reach is not waited for."""
-        least, most = self._reach
+        """Same as `gain` for the mean of the brightest channel [cd/m2]; the target is clipped to the limits."""
+        least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
         metered = float(np.log(wanted))
         log_gain = metered if self._log_gain is None else self._log_gain
@@ -59,13 +65,13 @@ class Exposure:
         return float(np.exp(log_gain))
 
 
-class Setting(NamedTuple):
-    """How a frame is exposed.
+class ExposureSetting(NamedTuple):
+    """Exposure of one frame.
 
     Args:
-        gain: signal of 1 cd/m2 on the axis; a signal of 1 saturates.
-        exposure_s: time that the shutter is open; 0 takes none.
-        analogue_gain: factor before digitising.
+        gain: signal per radiance on the axis [1 / (cd/m2)]; a signal of 1 saturates.
+        exposure_s: exposure time; 0 for a sensor without motion blur.
+        analogue_gain: amplification before digitization.
     """
 
     gain: float
@@ -74,22 +80,22 @@ class Setting(NamedTuple):
 
 
 class PlainSensor:
-    """Sensor of both cameras: exposes at once, to any gain, with the noise of `[imaging]`."""
+    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`."""
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
-        self._exposure = Exposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
+        self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
-    def meter(self, light: Radiance) -> Setting:
-        """Setting of a frame, by the light of those before."""
-        return Setting(self._exposure.gain(light))
+    def meter(self, light: Radiance) -> ExposureSetting:
+        """Returns the exposure of a frame, metered on the frames before it."""
+        return ExposureSetting(self._exposure.gain(light))
 
-    def gather(self, light: Radiance, depth: Depth, twist: Array, setting: Setting) -> Radiance:
-        """The light while the shutter is open, for no time."""
+    def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
+        """Returns `light` unchanged, as the exposure time is zero."""
         return light
 
-    def image(self, light: Radiance, setting: Setting, rng: np.random.Generator | None) -> Image:
-        """An image, without noise where `rng` is None."""
+    def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
+        """Returns an 8-bit image (H, W, 3), without noise where `rng` is None."""
         if rng is not None:
             return expose(light, setting.gain, self._imaging, rng)
         noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
@@ -97,13 +103,13 @@ class PlainSensor:
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """An 8-bit image of the light: variance of the noise is read^2 + shot^2 * signal, all as shares of full scale.
+    """Returns the 8-bit image (H, W, 3) of a radiance; the noise variance is read^2 + shot^2 * signal.
 
     Args:
         radiance: (H, W, 3) [cd/m2].
-        gain: signal per radiance; a signal of 1 saturates.
-        imaging: noise.
-        rng: stream of this camera; gives one number an image.
+        gain: signal per radiance [1 / (cd/m2)]; a signal of 1 saturates.
+        imaging: standard deviation of read noise and shot noise as shares of full scale.
+        rng: random stream of this camera; one number is noise per image.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)
@@ -116,7 +122,7 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
 
 @njit(cache=True, nogil=True)
 def _mean(light):
-    """(3,) mean of each band of an image (H, 3 W): of its columns, then of these."""
+    """Returns the mean (3,) of each band of an image (H, 3 W): first over rows, then over columns."""
     columns, total = np.zeros(light.shape[1]), np.zeros(3)
     for v in range(light.shape[0]):
         row = light[v]
@@ -129,18 +135,18 @@ def _mean(light):
 
 @njit(cache=True, nogil=True)
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` of `image` (H, 3 W); four draws come from each 64 random bits."""
+    """Fills rows `first` to `end` of `image` (H, 3 W); each 64 random bits yield four normal numbers."""
     n = light.shape[1]
     n_words = (n + 3) // 4
     full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)
-    drawn = np.empty(4 * n_words, np.float32)
+    noise = np.empty(4 * n_words, np.float32)
     for v in range(first, end):
         for w in range(n_words):
             bits = random_bits(seed, np.uint64(v * n_words + w))
             for k in range(4):
-                drawn[4 * w + k] = normal[(bits >> np.uint64(16 * k)) & np.uint64(NORMAL_MASK)]
+                noise[4 * w + k] = normal[(bits >> np.uint64(16 * k)) & np.uint64(NORMAL_MASK)]
         row, out = light[v], image[v]
         for k in range(n):
             signal = gain * row[k]
-            level = signal + drawn[k] * np.sqrt(read_variance + shot_variance * signal)
+            level = signal + noise[k] * np.sqrt(read_variance + shot_variance * signal)
             out[k] = np.uint8(min(max(level * full + half, zero), full))

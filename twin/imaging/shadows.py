@@ -1,9 +1,9 @@
-"""Shadows that the floor throws in the light of lamps, which do not stand where the eye is.
+"""Shadows that the floor casts in the light of the lamps, which are mounted away from the cameras.
 
-A point of the floor is in the shadow where the straight way to the lamp passes below the floor. The floor is the very
-surface that is drawn: triangles over a grid of heights. Along the way a triangle is highest where the way crosses its
-edges, so that only crossings are looked at, and of those only where a block of cells reaches up to the way: a way that
-starts on the floor and rises more steeply than any triangle so far is still above it.
+A point of the floor is in shadow where the straight ray to the lamp passes below the floor. The floor is the rendered
+surface itself: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses its edges, so
+that only edge crossings are tested, and only in blocks of cells that are high enough to reach the ray. A ray that
+starts on the floor and rises more steeply than all triangles so far is still above it.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 
-BLOCK_CELLS = 8  # whose highest point is kept
-STRIDE_PX = 4  # between pixels that are looked at first; between four that agree, none is
-BIAS_M = 1e-4  # by how much the floor must stand above the way: depth is single precision
+BLOCK_CELLS = 8  # side of the blocks whose highest point is stored
+STRIDE_PX = 4  # spacing of the pixels tested first; between four equal results no more are tested
+BIAS_M = 1e-4  # height of the floor above the ray that counts as a hit: depth is single precision
 
 
 class Heights(Protocol):
-    """A floor as the terrain's grid of heights has it; row 0 = south, column 0 = west."""
+    """Grid of floor heights; row 0 = south, column 0 = west."""
 
     @property
     def height_m(self) -> NDArray[np.float32]: ...
@@ -40,7 +40,7 @@ class Heights(Protocol):
 
 
 class _Grid(NamedTuple):
-    """Heights of nodes (ny, nx); highest node and steepest slope [m a cell] of each block; place and spacing."""
+    """Heights of nodes (ny, nx); highest node and steepest slope [m per cell] of each block; origin and spacing."""
 
     height_m: NDArray[np.float32]
     block_top_m: NDArray[np.float32]
@@ -51,10 +51,12 @@ class _Grid(NamedTuple):
 
 
 class Shadows:
-    """Which pixels each lamp lights: those whose floor it can see.
+    """Computes which pixels each lamp illuminates.
 
     Args:
-        lamp_positions_m: for each eye, (lamps, 3) in its axes.
+        floor: heights of the floor.
+        rig: the rendered cameras.
+        lamp_positions_m: for each camera (0 left, 1 right), (lamps, 3) in its axes.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array]):
@@ -62,22 +64,28 @@ class Shadows:
         self._grid = _Grid(height, *_blocks(height), floor.west_m, floor.south_m, floor.spacing_m)
         self._rig, self._lamps = rig, lamp_positions_m
 
-    def lit(self, depth: Depth, world_from_eye: Array, eye: int) -> Lit:
-        """(lamps, H, W) uint8: 0 where the floor stands between lamp and pixel, 1 elsewhere and where no floor is."""
-        lamps = geometry.transform(world_from_eye, self._lamps[eye])
+    def lit(self, depth: Depth, world_from_camera: Array, camera: int) -> Lit:
+        """Returns (lamps, H, W) uint8: 0 where the floor occludes the lamp, 1 elsewhere and where there is no floor.
+
+        Args:
+            depth: (H, W) along the optical axis [m].
+            world_from_camera: (4, 4) pose of this camera.
+            camera: 0 left, 1 right.
+        """
+        lamps = geometry.transform(world_from_camera, self._lamps[camera])
         rows, cols = (-(-n // STRIDE_PX) for n in depth.shape)
         lattice = np.empty((len(lamps), rows + 1, cols + 1), np.uint8)
         out = np.empty((len(lamps), *depth.shape), np.uint8)
         floor, west, south, spacing = self._grid[:3], *self._grid[3:]
-        pose = np.ascontiguousarray(world_from_eye)
+        pose = np.ascontiguousarray(world_from_camera)
         scene = *floor, west, south, spacing, depth, self._rig.focal_px, pose, lamps, lattice
-        in_row_bands(lambda first, end: _look_at_lattice(*scene, first, end), rows + 1)
-        in_row_bands(lambda first, end: _look_between(*scene, out, first, end), rows)
+        in_row_bands(lambda first, end: _test_lattice(*scene, first, end), rows + 1)
+        in_row_bands(lambda first, end: _fill_between(*scene, out, first, end), rows)
         return out
 
 
 def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The highest node [m] and the steepest slope of a triangle [m a cell] of every block, its borders included."""
+    """Returns the highest node [m] and the steepest triangle slope [m per cell] of each block, borders included."""
     along_x, along_y = np.diff(height, axis=1), np.diff(height, axis=0)
     south_east = np.hypot(along_x[:-1], along_y[:, 1:])
     north_west = np.hypot(along_x[1:], along_y[:, :-1])
@@ -85,7 +93,7 @@ def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
-    """Largest value of every block of cells and the nodes on its far border."""
+    """Returns the largest value of each block of cells, including the nodes on its far borders."""
     starts = [np.arange(0, n - border, BLOCK_CELLS) for n in values.shape]
     inner = np.maximum.reduceat(np.maximum.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     if not border:
@@ -97,29 +105,29 @@ def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look_at_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, first, end):
-    """Fills rows of `lattice` (lamps, rows, cols) with what every fourth pixel, and the last, sees of each lamp."""
+def _test_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, first, end):
+    """Fills rows of `lattice` (lamps, rows, cols), 1 = lit, for every fourth pixel of the image and the last one."""
     for k in range(lamps.shape[0]):
-        place = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
+        lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
             v = min(i * STRIDE_PX, depth.shape[0] - 1)
             for j in range(lattice.shape[2]):
                 u = min(j * STRIDE_PX, depth.shape[1] - 1)
-                lattice[k, i, j] = _sees(height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u)
+                lattice[k, i, j] = _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _look_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, out, first, end):
-    """Fills `out` (lamps, H, W) between rows of the lattice: where four that enclose a pixel agree, with that."""
+def _fill_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, out, first, end):
+    """Fills `out` (lamps, H, W) between rows of the lattice; tests a pixel where its four corners differ."""
     for k in range(lamps.shape[0]):
-        place = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
+        lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
             low, high = i * STRIDE_PX, min((i + 1) * STRIDE_PX, depth.shape[0])
             out[k, low:high] = lattice[k, i, 0]
             for j in range(lattice.shape[2] - 1):
                 known = lattice[k, i, j]
-                seen = known + lattice[k, i, j + 1] + lattice[k, i + 1, j] + lattice[k, i + 1, j + 1]
-                agree = seen == 0 or seen == 4
+                n_lit = known + lattice[k, i, j + 1] + lattice[k, i + 1, j] + lattice[k, i + 1, j + 1]
+                agree = n_lit == 0 or n_lit == 4
                 if agree and known == lattice[k, i, 0]:
                     continue
                 for v in range(low, high):
@@ -127,14 +135,14 @@ def _look_between(height, tops, rises, west, south, spacing, depth, focal, pose,
                         if agree:
                             out[k, v, u] = known
                         else:
-                            out[k, v, u] = _sees(
-                                height, tops, rises, west, south, spacing, depth, focal, pose, place, v, u
+                            out[k, v, u] = _is_lit(
+                                height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u
                             )
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _sees(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u):
-    """Whether a lamp at (column, row, height) sees the floor of a pixel."""
+def _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u):
+    """Returns 0 where the floor occludes the ray from a pixel's floor to a lamp at (column, row, height), else 1."""
     z = np.float64(depth[v, u])
     if not np.isfinite(z):
         return np.uint8(1)
@@ -145,15 +153,16 @@ def _sees(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v
     up = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     per_m = 1 / spacing
     col, row = (east - west) * per_m, (north - south) * per_m
-    return np.uint8(0 if _blocked(height, tops, rises, col, row, up, lamp[0] - col, lamp[1] - row, lamp[2] - up) else 1)
+    to_col, to_row, to_up = lamp[0] - col, lamp[1] - row, lamp[2] - up
+    return np.uint8(0 if _occluded(height, tops, rises, col, row, up, to_col, to_row, to_up) else 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _lines(at, along, cell, size):
-    """Of a way at + t along, in a cell of a lattice of lines `size` apart.
+def _grid_steps(at, along, cell, size):
+    """Returns the grid traversal of a ray at + t along, in a cell of a grid with lines `size` apart.
 
     Returns:
-        Step of its cells; t where it meets the next line, and from line to line.
+        Step of the cell index; t at the next grid line, and increment of t from line to line.
     """
     if along == 0:
         return 0, np.inf, np.inf
@@ -163,20 +172,20 @@ def _lines(at, along, cell, size):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _blocked(height, tops, rises, x, y, z, dx, dy, dz):
-    """Whether the floor stands above the way from (x, y, z) to (x + dx, y + dy, z + dz); x, y in cells, z [m]."""
+def _occluded(height, tops, rises, x, y, z, dx, dy, dz):
+    """Returns whether the floor is above the ray from (x, y, z) to (x + dx, y + dy, z + dz); x, y in cells, z [m]."""
     rows, cols = tops.shape
     r = min(max(int(np.floor(y / BLOCK_CELLS)), 0), rows - 1)
     c = min(max(int(np.floor(x / BLOCK_CELLS)), 0), cols - 1)
     size = float(BLOCK_CELLS)
-    step_c, at_c, per_c = _lines(x, dx, c, size)
-    step_r, at_r, per_r = _lines(y, dy, r, size)
+    step_c, at_c, per_c = _grid_steps(x, dx, c, size)
+    step_r, at_r, per_r = _grid_steps(y, dy, r, size)
     t, clear = 0.0, dz > 0
     while t < 1 and 0 <= r < rows and 0 <= c < cols:
         leave = min(at_c, at_r, 1.0)
         clear = clear and rises[r, c] ** 2 * (dx * dx + dy * dy) < dz * dz
         if not clear and tops[r, c] > z + min(dz * t, dz * leave) + BIAS_M:
-            if _blocked_in(height, x, y, z, dx, dy, dz, t, leave, r, c):
+            if _occluded_in_block(height, x, y, z, dx, dy, dz, t, leave, r, c):
                 return True
         t = leave
         if at_c < at_r:
@@ -187,15 +196,15 @@ def _blocked(height, tops, rises, x, y, z, dx, dy, dz):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blocked_in(height, x, y, z, dx, dy, dz, t, end, block_r, block_c):
-    """The same for the part of the way from t to `end`, which lies in one block."""
+def _occluded_in_block(height, x, y, z, dx, dy, dz, t, end, block_r, block_c):
+    """Same as `_occluded`, for the part of the ray from t to `end`, which lies in one block."""
     first_r, first_c = block_r * BLOCK_CELLS, block_c * BLOCK_CELLS
     last_r = min(first_r + BLOCK_CELLS, height.shape[0] - 1) - 1
     last_c = min(first_c + BLOCK_CELLS, height.shape[1] - 1) - 1
     r = min(max(int(np.floor(y + dy * t)), first_r), last_r)
     c = min(max(int(np.floor(x + dx * t)), first_c), last_c)
-    step_c, at_c, per_c = _lines(x, dx, c, 1.0)
-    step_r, at_r, per_r = _lines(y, dy, r, 1.0)
+    step_c, at_c, per_c = _grid_steps(x, dx, c, 1.0)
+    step_r, at_r, per_r = _grid_steps(y, dy, r, 1.0)
     while first_r <= r <= last_r and first_c <= c <= last_c:
         across = dx - dy
         if across != 0.0:  # the cell's diagonal, from south-west to north-east

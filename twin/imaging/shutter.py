@@ -1,19 +1,20 @@
-"""The time that an exposure takes: what moves meanwhile is smeared, and a rolling shutter sees its rows at other times.
+"""Finite exposure time: motion blur, and the row delays of a rolling shutter.
 
-A point of the floor at depth Z moves through the image of an eye with twist (w, v) by (Longuet-Higgins & Prazdny 1980;
-x, y from the axis, by the focal length f)
+A point of the floor at depth Z moves through the image of a camera with twist (w, v) by (Longuet-Higgins & Prazdny
+1980; x, y relative to the principal point, divided by the focal length f)
 
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
 
-Each pixel gathers light along its own path through the image of the middle of the exposure: the mean over the time that
-it is open, and behind a rolling shutter the light of the place where it was, or will be, by the delay of its row. Pose
-and true depth of a frame are those of the middle of the exposure of its middle row.
+Each pixel collects light along its own path through the image of mid-exposure: the mean over the exposure, and with a
+rolling shutter the light at its position at the time of its row. Pose and true depth of a frame are those of
+mid-exposure of the middle row.
 
-Limits: path and flow are straight and even over the exposure (a path's bend is below f (w T)^2 / 8, vibration is not
-seen). A pixel takes its neighbours on the path to move like itself: an edge in depth keeps its place, marine snow is
-smeared as the floor is, and so are the veil and the lamps' pattern, which move with the camera but are smooth over a
-few pixels. Light is kept where the flow is even. Beyond the border of the image its last pixel goes on.
+Limits: paths are straight and the flow is constant during the exposure (the curvature of a path is below
+f (w T)^2 / 8; vibration is not modelled). A pixel takes the depth of its neighbours on the path to be its own: depth
+edges stay sharp, and marine snow, backscatter and the lamp pattern are blurred as the floor is; the latter two move
+with the camera but are smooth over a few pixels. Light is conserved where the flow is uniform. Beyond the image border
+the last pixel is repeated.
 """
 
 from __future__ import annotations
@@ -28,39 +29,42 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-SHORT_PX = 2.8  # a path that reaches no farther than the next pixels: for up to sqrt(8), three samples do
+SHORT_PX = 2.8  # longest path for the 3 x 3 kernel, which is valid for up to sqrt(8)
 
 
-def smear(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
-    """The light (H, W, 3) that a moving eye gathers while its shutter is open.
+def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
+    """Returns the radiance (H, W, 3) with motion blur.
 
     Args:
-        light: (H, W, 3) at the middle of the exposure.
-        depth: (H, W) along the optical axis [m]; inf moves by rotation alone.
-        twist: (6,) [angular, linear] velocity of the eye in its own axes [rad/s, m/s].
-        exposure_s: how long each row is open.
+        light: (H, W, 3) radiance at mid-exposure.
+        depth: (H, W) along the optical axis [m]; points at inf move by rotation alone.
+        focal_px: focal length.
+        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        exposure_s: exposure time of each row.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
-    in_row_bands(lambda first, end: _smear(flat, depth, focal, motion, open_s, out, first, end), len(light))
+    in_row_bands(lambda first, end: _blur_by_motion(flat, depth, focal, motion, open_s, out, first, end), len(light))
     return out
 
 
-def roll(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
-    """The light (H, W, 3) as a moving eye sees it whose rows follow one another; arguments as of `smear`.
+def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
+    """Returns the radiance (H, W, 3) as seen by a rolling shutter.
 
     Args:
-        readout_s: from the first row to the last.
+        light, depth, focal_px, twist: as for `blur_by_motion`.
+        readout_s: time from the first row to the last.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     focal, whole_s = np.float32(focal_px), np.float32(readout_s)
-    in_row_bands(lambda first, end: _roll(light, depth, focal, motion, whole_s, out, first, end), len(light))
+    scene = light, depth, focal, motion, whole_s, out
+    in_row_bands(lambda first, end: _apply_rolling_shutter(*scene, first, end), len(light))
     return out
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _flow(x, y, near, scale, twist):
-    """Velocity in the image [px/s] at tangents x, y for 1 / depth, or, scaled by a time too, a path [px]."""
+    """Returns the optical flow at tangents x, y for 1 / depth: [px/s] for scale f, a path [px] for f times a time."""
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
@@ -69,7 +73,7 @@ def _flow(x, y, near, scale, twist):
 
 @njit(cache=True, nogil=True, inline="always")
 def _cubic(t):
-    """Weights of four neighbours at -1, 0, 1, 2 for a place t between the middle two (Keys 1981, a = -1/2)."""
+    """Returns the weights of four neighbours at -1, 0, 1, 2 for a position t in [0, 1] (Keys 1981, a = -1/2)."""
     half, one, steep = np.float32(0.5), np.float32(1.0), np.float32(1.5)
     s = one - t
     return (
@@ -79,8 +83,8 @@ def _cubic(t):
 
 
 @njit(cache=True, nogil=True)
-def _smear(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Fills rows `first` to `end` of `out`; `flat` is the light (H W, 3)."""
+def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
+    """Fills rows `first` to `end` of `out`; `flat` is the radiance (H W, 3)."""
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, near = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
@@ -91,25 +95,25 @@ def _smear(flat, depth, focal, twist, exposure_s, out, first, end):
         for u in range(width):
             near[3 * u] = near[3 * u + 1] = near[3 * u + 2] = np.float32(1.0) / depth[v, u]
         rows = values[max(v - 1, 0)], values[v], values[min(v + 1, height - 1)]
-        short = _smear_row(rows[0], rows[1], rows[2], near, x, y, focal * exposure_s, twist, filled[v])
+        short = _blur_row(rows[0], rows[1], rows[2], near, x, y, focal * exposure_s, twist, filled[v])
         for u in range(0, width, max(width - 1, 1) if short else 1):
             du, dv = _flow(x[3 * u], y, near[3 * u], focal * exposure_s, twist)
             if abs(dv) >= abs(du):
-                _gather(flat, dv, du, v, u, height, width, width, 1, out[v, u])
+                _average_along_path(flat, dv, du, v, u, height, width, width, 1, out[v, u])
             else:
-                _gather(flat, du, dv, u, v, width, height, 1, width, out[v, u])
+                _average_along_path(flat, du, dv, u, v, width, height, 1, width, out[v, u])
 
 
 @njit(cache=True, nogil=True)
-def _smear_row(above, here, below, near, x, y, scale, twist, out):
-    """Fills a row but for its ends, each (3 W,), where all paths in it are short; tells whether they are.
+def _blur_row(above, here, below, near, x, y, scale, twist, out):
+    """Fills a row without its ends, each (3 W,), for short paths; returns whether all paths are short.
 
-    The nine samples have the moments of an even path: a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
+    The nine samples have the moments of a uniform path: a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
     """
-    beside, middle, beyond = slice(0, -6), slice(3, -3), slice(6, None)
-    a0, a1, a2 = above[beside], above[middle], above[beyond]
-    b0, b1, b2 = here[beside], here[middle], here[beyond]
-    c0, c1, c2 = below[beside], below[middle], below[beyond]
+    before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
+    a0, a1, a2 = above[before], above[middle], above[after]
+    b0, b1, b2 = here[before], here[middle], here[after]
+    c0, c1, c2 = below[before], below[middle], below[after]
     x, near, out = x[middle], near[middle], out[middle]
     half, quarter, two, n_long = np.float32(0.5), np.float32(0.25), np.float32(2.0), 0
     for k in range(out.size):
@@ -124,11 +128,11 @@ def _smear_row(above, here, below, near, x, y, scale, twist, out):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _gather(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
-    """The mean of the light over a path around a pixel, from samples one pixel apart along its longer side a.
+def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
+    """Computes the mean radiance over a path centred on a pixel, from samples one pixel apart along its longer axis a.
 
-    All 2 m + 1 samples weigh the same but the two at the ends, and these so that the variance of the path is that of an
-    even one, length^2 / 12: one formula from the shortest path to the longest. Interpolation across adds none.
+    All 2 m + 1 samples have equal weight except the two at the ends, whose weight makes the variance of the path that
+    of a uniform one, length^2 / 12, for every length. Interpolation across the path does not change the variance.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]
@@ -156,8 +160,8 @@ def _gather(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
 
 
 @njit(cache=True, nogil=True)
-def _roll(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` of `out`."""
+def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
+    """Fills rows `first` to `end` of `out`; see `apply_rolling_shutter`."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     for v in range(first, end):

@@ -1,4 +1,4 @@
-"""What water does to light: absorption, scattering, and the direction light is scattered to."""
+"""Inherent optical properties of water: absorption, scattering, and the phase function of scattering."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from twin.scenario.model import WaterConfig
 
 Array = NDArray[np.float64]
 
-#: Absorption a and scattering b of Jerlov's water types for R, G, B [1/m] (the table of the Stonefish simulator).
+#: Absorption a and scattering b of Jerlov's water types for R, G, B [1/m] (table of the Stonefish simulator).
 JERLOV_PER_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "clear": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     "I": ((0.4601, 0.0620, 0.0176), (0.0008, 0.0017, 0.0042)),
@@ -31,52 +31,52 @@ JERLOV_PER_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, fl
 
 #: Bands R, G, B [nm] over which a spectrum is averaged.
 BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
-#: Mean cosine of scattering in sea water, for the phase function of Henyey and Greenstein.
-FORWARDNESS = 0.924
+#: Mean cosine of the scattering angle in sea water, g of the Henyey-Greenstein phase function.
+SEA_WATER_MEAN_COSINE = 0.924
 
 
 class Medium(NamedTuple):
     """Optical properties for R, G, B.
 
     Args:
-        absorption_per_m, scattering_per_m: (3,) a and b, inherent [1/m].
+        absorption_per_m, scattering_per_m: (3,) absorption a and scattering b [1/m].
         mean_cosine: g of the phase function.
-        kept_share: k, of scattered light that stays in the light on its way.
+        kept_share: share k of the scattered light that is not counted as lost.
     """
 
     absorption_per_m: Array
     scattering_per_m: Array
-    mean_cosine: float = FORWARDNESS
+    mean_cosine: float = SEA_WATER_MEAN_COSINE
     kept_share: float = 0.0
 
     @property
     def attenuation_per_m(self) -> Array:
         """Effective attenuation (3,) [1/m]: a + (1 - k) b.
 
-        With k = 0 it is the beam's c = a + b, where all scattered light counts as lost. In truth most of it goes on
-        close to its old direction, so that the light of far floors is underrated in turbid water; with k the share of
-        scattering by small angles it is a + 0.26 b, as with the constant G = a + 0.3 b found for range-gated images.
+        With k = 0 this is the beam attenuation c = a + b, where all scattered light counts as lost. Most of it keeps
+        almost its direction, however, so that c underestimates the light of distant floors in turbid water. With k the
+        share of scattering by small angles it is a + 0.26 b, close to G = a + 0.3 b measured for range-gated images.
         """
         return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
 
 def medium(water: WaterConfig) -> Medium:
-    """The water of a scenario; `turbidity` multiplies its scattering.
+    """Returns the optical properties of a scenario's water; `turbidity` multiplies its scattering.
 
     Raises:
-        TwinError: a spectrum of which a part is missing, or which cannot be read.
+        TwinError: absorption or scattering is missing or given twice, or the spectrum cannot be read.
     """
     absorption, scattering = _spectrum(water)
     return Medium(absorption, scattering * water.turbidity, water.mean_cosine, water.kept_share)
 
 
 def _spectrum(water: WaterConfig) -> tuple[Array, Array]:
-    """Absorption and scattering (3,) [1/m]."""
+    """Returns absorption and scattering (3,) [1/m] of the given values, the spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if water.spectrum_file is not None:
         if given:
-            raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of both")
+            raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of them")
         return read_spectrum(Path(water.spectrum_file))
     if len(given) == 1:
         missing = next(key for key in own if key not in given)
@@ -86,12 +86,13 @@ def _spectrum(water: WaterConfig) -> tuple[Array, Array]:
 
 
 def read_spectrum(file: Path) -> tuple[Array, Array]:
-    """Means over `BANDS_NM` of absorption and scattering (3,) [1/m], straight between the rows of a file.
+    """Returns absorption and scattering (3,) [1/m], averaged over `BANDS_NM` with linear interpolation between rows.
 
     Args:
-        file: lines of wavelength [nm], absorption, scattering [1/m], parted by commas; # begins a remark.
+        file: comma-separated rows of wavelength [nm], absorption, scattering [1/m]; # starts a comment.
     Raises:
-        TwinError: it cannot be read, wavelengths do not rise or do not reach over all bands, or a value is negative.
+        TwinError: the file cannot be read, its wavelengths do not increase or do not cover all bands, or a value is
+            negative.
     """
     key = "water.spectrum_file"
     try:
@@ -99,16 +100,16 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
             warnings.simplefilter("ignore", UserWarning)  # an empty file
             table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
     except (OSError, ValueError) as error:
-        wanted = "lines of wavelength [nm], absorption, scattering [1/m]"
+        wanted = "rows of wavelength [nm], absorption, scattering [1/m]"
         raise TwinError(key, f"{file} cannot be read: {error}", wanted) from None
     if table.shape[1] != 3 or len(table) < 2:
         raise TwinError(key, f"{file} has {table.shape[1]} columns and {len(table)} rows", "3 columns, 2 rows or more")
     nm = table[:, 0]
     if not (np.diff(nm) > 0).all():
-        raise TwinError(key, f"{file}: wavelengths do not rise", "each longer than the one before [nm]")
+        raise TwinError(key, f"{file}: wavelengths do not increase", "strictly increasing [nm]")
     low, high = min(BANDS_NM)[0], max(BANDS_NM)[1]
     if nm[0] > low or nm[-1] < high:
-        raise TwinError(key, f"{file} reaches from {nm[0]:g} to {nm[-1]:g} nm", f"from {low:g} to {high:g} or more")
+        raise TwinError(key, f"{file} covers {nm[0]:g} to {nm[-1]:g} nm", f"{low:g} to {high:g} or more")
     if not (np.isfinite(table).all() and (table[:, 1:] >= 0).all()):
         row = int(np.argmin((np.isfinite(table) & (table >= 0)).all(axis=1)))
         raise TwinError(key, f"{file}: negative or not finite at {nm[row]:g} nm", "0 or more [1/m]")
@@ -116,27 +117,27 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
     return absorption, scattering
 
 
-def _mean(at: Array, value: Array, low: float, high: float) -> float:
-    """Of a polyline between two places."""
-    nodes = np.concatenate([[low], at[(at > low) & (at < high)], [high]])
-    return float(np.trapezoid(np.interp(nodes, at, value), nodes) / (high - low))
+def _mean(nm: Array, value: Array, low: float, high: float) -> float:
+    """Returns the mean of a piecewise linear function between two wavelengths."""
+    nodes = np.concatenate([[low], nm[(nm > low) & (nm < high)], [high]])
+    return float(np.trapezoid(np.interp(nodes, nm, value), nodes) / (high - low))
 
 
 def downwelling_per_m(water: Medium) -> Array:
-    """Attenuation of daylight with depth, Kd (3,) [1/m], for a sun in the zenith.
+    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a sun in the zenith.
 
-    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; from simulations
-    of light that is scattered many times, so that the direction-averaged loss lies between a and c.
+    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; a fit to
+    Monte Carlo simulations of multiple scattering, so that Kd lies between a and c.
     """
     a, b = water.absorption_per_m, water.scattering_per_m
     return np.sqrt(a**2 + 0.235 * a * b)
 
 
-def phase_function(cos_angle: Array, mean_cosine: float = FORWARDNESS) -> Array:
-    """Share of scattered light per solid angle [1/sr] by Henyey & Greenstein (1941); integrates to 1 over the sphere.
+def phase_function(cos_angle: Array, mean_cosine: float = SEA_WATER_MEAN_COSINE) -> Array:
+    """Returns the Henyey-Greenstein (1941) phase function [1/sr]; it integrates to 1 over the sphere.
 
     Args:
-        cos_angle: cosine of the angle between the light before and after; 1 goes straight on.
+        cos_angle: cosine of the scattering angle; 1 is straight ahead.
         mean_cosine: g.
     """
     g = mean_cosine

@@ -1,1 +1,1 @@
-"""The estimate against the truth."""
+"""Comparison of the estimates with the truth: numbers only, no figures and no text."""

@@ -1,4 +1,4 @@
-"""What each global alignment gained, and how far off each track is at its far end."""
+"""Keyframe errors before and after each global alignment, and the final error at the far end of each track."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import Alignment, Array, SurveyResult, Truth
-from twin.judge.summary_statistics import number, rms
+from twin.judge.summary_statistics import finite_float, rms
 from twin.judge.trajectory import anchor, path_errors
 
-#: The far end of a track: as planned, at least this share of its greatest distance from the survey's start.
+#: The far end of a track: frames whose planned position has at least this share of the track's greatest distance
+#: from the start of the survey.
 FAR_SHARE = 0.9
 
 
 def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
-    """`tracks[]` of metrics.json, a row for each alignment at the end of a track.
+    """Returns `tracks[]` of metrics.json: one row for each alignment at the end of a track.
 
-    `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`; an alignment beyond them (the truly global one at the
-    end) has no row. Their n positions are those of the last n keyframes up to the end of the track (all of
-    them, or those of the moving window), anchored at the first true pose like the trajectories.
+    `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`. The alignment of the whole survey at the end has no
+    such entry and no row. The n positions of an entry are those of the last n keyframes up to the end of the track
+    (all keyframes, or those of the moving window). They are anchored at the first true pose, as the trajectories are.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
     error_m = path_errors(result.final, truth.trajectory).distance_m
@@ -31,23 +32,33 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
 def _row(
     alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth, error_m: Array
 ) -> dict[str, Any]:
+    """Returns the row of one alignment.
+
+    Args:
+        before, after: (n, 3) keyframe positions before and after the alignment [m].
+        error_m: (n_frames,) position error of the final trajectory [m].
+    """
     frames = result.keyframe_rows[result.track_of_keyframe <= alignment.track]
     return {
         "track": int(alignment.track),
         "before_ga_rmse_m": _keyframe_rmse(before, frames, result, truth),
         "after_ga_rmse_m": _keyframe_rmse(after, frames, result, truth),
         "farthest_error_m": farthest_error_m(alignment.track, error_m, truth),
-        "ga_ms": number(alignment.ms),
+        "ga_ms": finite_float(alignment.ms),
         "nodes": int(alignment.nodes),
         "edges": int(alignment.edges),
     }
 
 
 def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
-    """RMS of the final errors (n,) at a track's far end [m]: the last tenth of its distance from the start.
+    """Returns the RMS position error at the far end of a track [m].
 
-    There drift is greatest (Negahdaripour & Madjidi 2003, section III). A single frame would tell the noise of its
-    frame-to-frame motion instead.
+    The far end is the last tenth of the track's distance from the start, where drift is greatest (Negahdaripour &
+    Madjidi 2003, section III). The error of a single frame would be dominated by its frame-to-frame noise.
+
+    Args:
+        track: number of the track, from 1.
+        error_m: (n,) position error of each frame [m].
     """
     frames = np.flatnonzero(truth.track[: len(error_m)] == track)
     if len(frames) == 0:
@@ -57,10 +68,10 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """RMSE of the last keyframes of `frames` whose positions (n, 3) are given [m]."""
+    """Returns the RMSE [m] of positions (n, 3) of the last n keyframes in `frames`."""
     n = min(len(positions), len(frames))
     if n == 0:
         return None
     true_from_estimated = anchor(result.online.world_from_camera[0], truth.trajectory.world_from_camera[0])
-    moved = geometry.transform(true_from_estimated, positions[-n:])
-    return rms(np.linalg.norm(moved - truth.trajectory.positions[frames[-n:]], axis=1))
+    anchored = geometry.transform(true_from_estimated, positions[-n:])
+    return rms(np.linalg.norm(anchored - truth.trajectory.positions[frames[-n:]], axis=1))

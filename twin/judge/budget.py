@@ -1,30 +1,32 @@
-"""The paper's processing budget: frame-to-frame within a frame, keyframe work within N frames (P26)."""
+"""Computing time of each stage against the real-time budget of Negahdaripour & Madjidi (2003).
+
+Frame-to-frame motion has to finish within one frame, all keyframe work within the N frames up to the next keyframe,
+and global alignment while the vehicle keeps station.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-#: Stages of the estimators at a keyframe; the others are the simulator's or come after the survey.
-KEY_POINT_STAGES = ("stereo", "f2m", "network", "flow")
-STAGE_LABELS = {
-    "physics": "simulator: physics",
-    "render": "simulator: rendering",
-    "optics": "simulator: water and sensor",
-    "f2f": "frame to frame",
-    "f2m": "frame to mosaic",
-    "stereo": "stereo",
-    "flow": "flow between keyframes",
-    "network": "network",
-    "ga": "global alignment",
-    "map": "elevation map",
-}
+#: Stages of the estimators that run at a keyframe. The other stages belong to the simulator or follow the survey.
+KEYFRAME_STAGES = ("stereo", "f2m", "network", "flow")
+#: Key of the row that sums `KEYFRAME_STAGES`.
+KEYFRAME_WORK = "keyframe"
 
 
-class BudgetRow(NamedTuple):
-    """Time of a stage or of all keyframe work: mean and p95 of a call [ms], total [s], what it may take [ms]."""
+class StageTime(NamedTuple):
+    """Computing time of one stage.
 
-    what: str
+    Args:
+        stage: key of the stage in metrics.json, or `KEYFRAME_WORK`.
+        n_calls: number of calls.
+        mean_ms, p95_ms: mean and 95th percentile of one call [ms].
+        total_s: sum over all calls [s].
+        budget_ms: largest allowed mean [ms]; None if the stage has no budget.
+    """
+
+    stage: str
     n_calls: int
     mean_ms: float | None
     p95_ms: float | None
@@ -32,35 +34,38 @@ class BudgetRow(NamedTuple):
     budget_ms: float | None
 
     @property
-    def within(self) -> bool | None:
+    def within_budget(self) -> bool | None:
+        """Returns whether the mean is within the budget; None without a mean or a budget."""
         return None if self.mean_ms is None or self.budget_ms is None else self.mean_ms <= self.budget_ms
 
 
-def budget(
+def stage_times(
     metrics: Mapping[str, Any], scenario: Mapping[str, Any], n_frames_per_keyframe: int | None
-) -> list[BudgetRow]:
-    """Stages with the paper's budget: F2F 1 / frame rate, keyframe work N / frame rate, GA the station keeping."""
+) -> list[StageTime]:
+    """Returns the time of every stage and, last, of all keyframe work.
+
+    Args:
+        metrics: contents of metrics.json.
+        scenario: contents of the scenario file; read are rig.frame_rate_hz and control.hold_s.
+        n_frames_per_keyframe: frames from one keyframe to the next; None if unknown.
+    """
     timing = metrics.get("timing") or {}
     stages = timing.get("stages") or {}
     rate_hz = scenario.get("rig", {}).get("frame_rate_hz")
     hold_s = scenario.get("control", {}).get("hold_s")
-    limits = {"f2f": 1e3 / rate_hz if rate_hz else None, "ga": 1e3 * hold_s if hold_s else None}
-    rows = [_row(STAGE_LABELS[name], row, limits.get(name)) for name, row in stages.items()]
+    budgets_ms = {"f2f": 1e3 / rate_hz if rate_hz else None, "ga": 1e3 * hold_s if hold_s else None}
+    rows = [_stage_time(name, row, budgets_ms.get(name)) for name, row in stages.items()]
     keyframe_ms = 1e3 * n_frames_per_keyframe / rate_hz if n_frames_per_keyframe and rate_hz else None
     return [*rows, _keyframe_work(stages, timing.get("keyframes") or 0, keyframe_ms)]
 
 
-def _row(label: str, row: Mapping[str, Any], limit_ms: float | None) -> BudgetRow:
-    return BudgetRow(label, row["count"], row["mean_ms"], row["p95_ms"], row["total_s"], limit_ms)
+def _stage_time(stage: str, row: Mapping[str, Any], budget_ms: float | None) -> StageTime:
+    """Returns one stage of `timing.stages` of metrics.json with its budget."""
+    return StageTime(stage, row["count"], row["mean_ms"], row["p95_ms"], row["total_s"], budget_ms)
 
 
-def _keyframe_work(stages: Mapping[str, Any], n_keyframes: int, limit_ms: float | None) -> BudgetRow:
-    total_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEY_POINT_STAGES)
-    return BudgetRow(
-        "all work at a keyframe",
-        n_keyframes,
-        1e3 * total_s / n_keyframes if n_keyframes else None,
-        None,
-        total_s,
-        limit_ms,
-    )
+def _keyframe_work(stages: Mapping[str, Any], n_keyframes: int, budget_ms: float | None) -> StageTime:
+    """Returns the sum of `KEYFRAME_STAGES`, with the mean per keyframe."""
+    total_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEYFRAME_STAGES)
+    mean_ms = 1e3 * total_s / n_keyframes if n_keyframes else None
+    return StageTime(KEYFRAME_WORK, n_keyframes, mean_ms, None, total_s, budget_ms)

@@ -1,4 +1,4 @@
-"""Do the estimates know how good they are? Errors against their own covariance."""
+"""Consistency of the estimated covariances: errors normalised by their own covariance (NEES, two-sigma shares)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from twin.judge.trajectory import anchor
 
 
 def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
-    """`consistency.*` of metrics.json: mean NEES of positions (3 if right), shares within two sigma (0.954 if normal).
+    """Returns `consistency.*` of metrics.json.
 
-    `within_2sigma_position` counts every camera axis of every keyframe, `within_2sigma_map` every estimated cell.
+    For consistent covariances and normal errors the mean NEES of the positions is 3 and the share of errors within
+    two sigma is 0.954. `within_2sigma_position` counts each camera axis of each keyframe, `within_2sigma_map` each
+    estimated cell.
     """
     error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -26,30 +28,37 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 
 
 def keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
-    """Position errors (n, 3) [m] of the final keyframes and their covariances (n, 3, 3) [m2], both in camera axes.
+    """Returns the position errors of the final keyframes and their covariances, both in camera axes.
 
-    The first keyframe is anchored at the truth and left out, as is one without a positive definite covariance.
+    The first keyframe is left out because it is anchored at the truth. Keyframes without a positive definite
+    covariance are left out as well.
+
+    Returns:
+        (n, 3) errors [m]; (n, 3, 3) covariances [m2].
     """
     n = min(len(result.keyframe_rows), len(result.node_cov))
     frames = result.keyframe_rows[1:n]
     if len(frames) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3, 3))
     final, true = result.final.world_from_camera, truth.trajectory.world_from_camera
-    moved = anchor(final[0], true[0]) @ final[frames]
-    in_world = moved[:, :3, 3] - true[frames, :3, 3]
-    in_camera = np.einsum("nji,nj->ni", moved[:, :3, :3], in_world)
+    anchored = anchor(final[0], true[0]) @ final[frames]
+    in_world = anchored[:, :3, 3] - true[frames, :3, 3]
+    in_camera = np.einsum("nji,nj->ni", anchored[:, :3, :3], in_world)
     cov = np.asarray(result.node_cov)[1:n, 3:, 3:]
     usable = _positive_definite(cov)
     return in_camera[usable], cov[usable]
 
 
 def nees(error: Array, cov: Array) -> Array:
-    """Normalised estimation error squared e' C^-1 e of errors (n, d) with covariances (n, d, d)."""
+    """Returns the normalised estimation error squared e' C^-1 e (n,) of errors (n, d) with covariances (n, d, d).
+
+    Its expectation is d for consistent covariances (Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2).
+    """
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0])
 
 
 def _positive_definite(cov: Array) -> np.ndarray:
-    """(n,) bool."""
+    """Returns (n,) bool: which matrices (n, d, d) are finite and positive definite."""
     finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0]
     return np.asarray(smallest > 0)

@@ -1,4 +1,4 @@
-"""How well the vehicle flew its plan: true positions against the reference."""
+"""Control errors of the vehicle: true positions against the reference path."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from twin.judge.swaths import travel_direction
 
 
 def control_metrics(truth: Truth) -> dict[str, float | None]:
-    """`control.*` of metrics.json: cross-track while flying, altitude always, distance in 3-D while holding station."""
+    """Returns `control.*` of metrics.json.
+
+    The cross-track error covers the frames in which the vehicle travels, the altitude error all frames, the 3-D
+    station-keeping error the frames in which it keeps station.
+    """
     n = min(len(truth.trajectory), len(truth.reference))
     offset = truth.trajectory.positions[:n] - truth.reference[:n]
     holding = truth.holding[:n]
@@ -22,5 +26,10 @@ def control_metrics(truth: Truth) -> dict[str, float | None]:
 
 
 def cross_track(offset: Array, direction: Array) -> Array:
-    """(n,) part of offsets (n, 3) horizontally across the direction of travel (n, 2), positive to port [m]."""
+    """Returns the horizontal component of offsets across the direction of travel (n,), positive to port [m].
+
+    Args:
+        offset: (n, 3) position minus reference [m].
+        direction: (n, 2) horizontal unit vectors of travel.
+    """
     return direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0]

@@ -1,4 +1,4 @@
-"""The measured motions between keyframes against the truth, beside the closed form that each started from."""
+"""Errors of the measured motions between keyframes, and of the closed-form motion that each of them started from."""
 
 from __future__ import annotations
 
@@ -14,38 +14,45 @@ from twin.core.records import Array, SurveyResult, Truth
 from twin.judge.consistency import nees
 from twin.judge.summary_statistics import mean, rms
 
-#: A link "along" reaches back to one of the two nodes before (the paper's), one "across" farther: to the longest base
-#: on the same swath, to neighbouring swaths, to where loops began.
+#: A link is "along" if it connects a node to one of the two nodes before it, as in the paper. All other links are
+#: "across": to earlier nodes of the same swath, to neighbouring swaths, to the start of a loop.
 ALONG_NODES = 2
 
 
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
-    """`links` of metrics.json: errors of the motions along and across, and how many frame-to-frame motions stand in."""
-    measured = result.links.kept(result.links.n_points > 0)
-    near = steps_back(measured, node_numbers(result.links)) <= ALONG_NODES
+    """Returns `links` of metrics.json: errors of the links along and across.
+
+    `bridged` is the number of links that frame-to-frame motion replaces because no points were matched. Their errors
+    are not evaluated.
+    """
+    measured = result.links.select(result.links.n_points > 0)
+    near = node_distance(measured, linked_nodes(result.links)) <= ALONG_NODES
     true = truth.trajectory.world_from_camera[result.keyframe_rows]
     return {
-        "along": _figures(measured.kept(near), true),
-        "across": _figures(measured.kept(~near), true),
+        "along": _link_errors(measured.select(near), true),
+        "across": _link_errors(measured.select(~near), true),
         "bridged": len(result.links) - len(measured),
     }
 
 
-def node_numbers(links: Links) -> NDArray[np.int64]:
-    """Numbers of the keyframes that links join, in their order."""
+def linked_nodes(links: Links) -> NDArray[np.int64]:
+    """Returns the numbers of the keyframes that any link connects, in increasing order."""
     return np.unique(np.concatenate([links.i, links.j]))
 
 
-def steps_back(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) nodes from the earlier to the later end of each link."""
+def node_distance(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns (n,) number of nodes from keyframe i to keyframe j of each link: 1 for consecutive nodes."""
     return np.searchsorted(nodes, links.j) - np.searchsorted(nodes, links.i)
 
 
 def motion_errors(links: Links, estimates: Array, world_from_keyframe: Array) -> Array:
-    """(n, 6) twist [rotation, translation] (rad, m) in j from the true to the estimated pose of j in i.
+    """Returns the errors (n, 6) of motions as twists [rotation, translation] in camera j (rad, m).
+
+    The error is log(T^-1 E) of the true motion T and the estimated motion E, both poses of camera j in camera i.
 
     Args:
-        estimates: (n, 4, 4) of each link.
+        links: n links, of which only i and j are read.
+        estimates: (n, 4, 4) motion of each link.
         world_from_keyframe: (n_keyframes, 4, 4) true poses of the keyframes.
     """
     return _motion_errors(world_from_keyframe[links.i], world_from_keyframe[links.j], np.ascontiguousarray(estimates))
@@ -53,6 +60,7 @@ def motion_errors(links: Links, estimates: Array, world_from_keyframe: Array) ->
 
 @njit(cache=True, nogil=True)
 def _motion_errors(true_i, true_j, estimates):
+    """Compiled kernel of `motion_errors`."""
     errors = np.empty((len(true_i), 6))
     for k in range(len(true_i)):
         j_from_i = geometry.compose(geometry.inverse(true_j[k]), true_i[k])
@@ -60,11 +68,14 @@ def _motion_errors(true_i, true_j, estimates):
     return errors
 
 
-def _figures(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
-    """Count, RMS errors and mean NEES (6 if right) of links; RMS errors of the closed form of those that have one."""
+def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
+    """Returns count, RMS errors and mean NEES of links, and the RMS errors of their closed forms where they have one.
+
+    The mean NEES is 6 for consistent covariances.
+    """
     errors = motion_errors(links, links.i_from_j, world_from_keyframe)
-    closed, motions = links.by_closed_form
-    closed_errors = motion_errors(links.kept(closed), motions, world_from_keyframe)
+    has_closed_form, closed_forms = links.by_closed_form
+    closed_errors = motion_errors(links.select(has_closed_form), closed_forms, world_from_keyframe)
     return {
         "count": len(links),
         **_rmse(errors),
@@ -74,7 +85,7 @@ def _figures(links: Links, world_from_keyframe: Array) -> dict[str, float | int 
 
 
 def _rmse(errors: Array) -> dict[str, float | None]:
-    """Of the lengths of both halves of twists (n, 6)."""
+    """Returns the RMS angle [deg] and RMS translation [m] of twists (n, 6)."""
     return {
         "rotation_rmse_deg": rms(np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))),
         "translation_rmse_m": rms(np.linalg.norm(errors[:, 3:], axis=1)),

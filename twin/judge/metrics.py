@@ -1,9 +1,9 @@
-"""metrics.json: every figure of a survey, complete also where the survey is not."""
+"""metrics.json: all metrics of a survey, with the same keys for complete and aborted surveys."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,46 +16,54 @@ from twin.judge.control import control_metrics
 from twin.judge.links import link_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.overlap import overlap_metrics
-from twin.judge.require import check_names, judge_requirements
+from twin.judge.require import check_metric_names, judge_requirements
 from twin.judge.stages import stage_metrics
 from twin.judge.stereo_quality import stereo_quality
-from twin.judge.summary_statistics import finite_tree, number
+from twin.judge.summary_statistics import finite_float, finite_tree
 from twin.judge.trajectory import path_errors, trajectory_metrics
 
-SCHEMA = "twin.metrics/1"
+SCHEMA = "twin.metrics/2"
+_IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason", "warning")
 
 
-def evaluate(
-    result: SurveyResult,
-    elevation: ElevationMap | None,
-    truth: Truth,
-    rig: StereoRig,
-    plan_numbers: Mapping[str, Any],
-    timing: Mapping[str, Any],
-    identity: Mapping[str, Any],
-    require: Mapping[str, float] | None = None,
-) -> dict[str, Any]:
-    """All of metrics.json (DESIGN.md), None where there is nothing to judge, never NaN.
+@dataclass(frozen=True)
+class EvaluationInput:
+    """A survey and its truth, as `evaluate` takes them.
 
     Args:
-        plan_numbers: pattern, overlap_along and overlap_across of the plan.
-        timing: wall_s, simulated_s, peak_rss_mb and the stages' summary (`Stopwatch.summary`).
-        identity: name, seed, version, scenario_hash, status ("complete" or "aborted"), reason and
-            warning: what to beware of ("" if nothing).
-        require: limit for each named metric, e.g. {"map.le90_m": 0.05}.
+        result: output of the estimators.
+        elevation: elevation map; None if none was built.
+        truth: true trajectory and floor, and the reference path.
+        rig: nominal stereo rig.
+        plan: pattern, overlap_along and overlap_across of the plan.
+        timing: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
+        identity: name, seed, version, scenario_hash, status ("complete" or "aborted"), reason of an abort, warning;
+            the last two are "" if there is none.
+        require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
+    """
+
+    result: SurveyResult
+    elevation: ElevationMap | None
+    truth: Truth
+    rig: StereoRig
+    plan: Mapping[str, Any] = field(default_factory=dict)
+    timing: Mapping[str, Any] = field(default_factory=dict)
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    require: Mapping[str, float] = field(default_factory=dict)
+
+
+def evaluate(survey: EvaluationInput) -> dict[str, Any]:
+    """Returns the contents of metrics.json. A value that cannot be computed is None, never NaN.
 
     Raises:
         TwinError: `require` names a metric that does not exist.
     """
-    result = _flown(result, truth)
+    result, truth, elevation = _completed(survey.result, survey.truth), survey.truth, survey.elevation
     paths = {"f2f": result.f2f, "online": result.online, "final": result.final}
     grid = elevation.grid if elevation else None
     metrics = {
         "schema": SCHEMA,
-        **{
-            key: identity.get(key)
-            for key in ("name", "seed", "version", "scenario_hash", "status", "reason", "warning")
-        },
+        **{key: survey.identity.get(key) for key in _IDENTITY},
         "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in paths.items()},
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),
@@ -64,51 +72,58 @@ def evaluate(
         "vision": stereo_quality(result),
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth),
-        "overlap": overlap_metrics(result, truth, rig, grid, dict(plan_numbers)),
-        "timing": _timing(timing, len(result.online), len(result.keyframe_rows)),
+        "overlap": overlap_metrics(result, truth, survey.rig, grid, dict(survey.plan)),
+        "timing": _timing(survey.timing, len(result.online), len(result.keyframe_rows)),
     }
     metrics = finite_tree(metrics)
-    return metrics | {"require": judge_requirements(require or {}, metrics)}
+    return metrics | {"require": judge_requirements(survey.require, metrics)}
 
 
-def _flown(result: SurveyResult, truth: Truth) -> SurveyResult:
-    """Without a keyframe whose frame an interruption left unrecorded."""
+def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
+    """Returns the result without keyframes whose frame was not recorded because the survey was interrupted."""
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
+    observations = [observation for observation in result.stereo_observations if observation.row < n_frames]
     return replace(
         result,
         keyframe_rows=result.keyframe_rows[:n],
         track_of_keyframe=result.track_of_keyframe[:n],
         node_cov=result.node_cov[:n],
-        links=result.links.kept(result.links.j < n),
-        stereo_observations=[look for look in result.stereo_observations if look.row < n_frames],
+        keyframe_depth_m=result.keyframe_depth_m[:n],
+        links=result.links.select(result.links.j < n),
+        stereo_observations=observations,
     )
 
 
 def check_require(names: Mapping[str, float]) -> None:
-    """Refuses unknown metrics in `[require]` before the survey is flown. Raises TwinError."""
-    check_names(names, unflown())
+    """Checks the metric names of `[require]` before the survey is flown.
+
+    Raises:
+        TwinError: a name is not a metric.
+    """
+    check_metric_names(names, empty_metrics())
 
 
-def unflown() -> dict[str, Any]:
-    """metrics.json of a survey that never began: all keys, no figures."""
+def empty_metrics() -> dict[str, Any]:
+    """Returns the metrics of a survey without frames: every key, every value None or 0."""
     none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     no_keyframes = np.zeros(0, dtype=np.int64)
     result = SurveyResult(none, none, none, no_keyframes, no_keyframes, np.zeros((0, 6, 6)))
     empty = np.zeros((0, 0))
     truth = Truth(none, np.zeros((0, 3)), np.zeros(0, bool), no_keyframes, empty.astype(np.float32), empty.astype(bool))
     rig = StereoRig(1, 1, 1.0, 1.0, 1.0, np.eye(4))
-    return evaluate(result, None, truth, rig, {}, {"stages": Stopwatch().summary()}, {})
+    return evaluate(EvaluationInput(result, None, truth, rig, timing={"stages": Stopwatch().summary()}))
 
 
 def _timing(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
+    """Returns `timing` of metrics.json."""
     wall, simulated = timing.get("wall_s"), timing.get("simulated_s")
     return {
-        "wall_s": number(wall),
-        "simulated_s": number(simulated),
-        "real_time_factor": number(simulated / wall) if wall and simulated is not None else None,
+        "wall_s": finite_float(wall),
+        "simulated_s": finite_float(simulated),
+        "real_time_factor": finite_float(simulated / wall) if wall and simulated is not None else None,
         "frames": n_frames,
         "keyframes": n_keyframes,
-        "peak_rss_mb": number(timing.get("peak_rss_mb")),
+        "peak_rss_mb": finite_float(timing.get("peak_rss_mb")),
         "stages": {name: dict(row) for name, row in timing.get("stages", {}).items()},
     }

@@ -1,4 +1,4 @@
-"""What the scenario demands of the survey."""
+"""Requirements of the scenario: limits for metrics, and whether a survey meets them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from twin.errors import TwinError
 
-#: Metrics of which more is better: their limit is a lower bound. All others are errors, times or sizes.
+#: Prefixes of metrics whose limit is a lower bound. The limit of every other metric is an upper bound.
 MORE_IS_BETTER = (
     "map.completeness",
     "timing.real_time_factor",
@@ -20,28 +20,34 @@ MORE_IS_BETTER = (
 
 
 def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """`require` of metrics.json: value, limit and verdict of each named metric; a metric without value has not passed.
+    """Returns `require` of metrics.json: value, limit and verdict of each required metric.
+
+    A metric without a value does not pass.
 
     Raises:
-        TwinError: a name is no number of metrics.json.
+        TwinError: a name is not a number of metrics.json.
     """
-    check_names(limits, metrics)
-    return {name: _verdict(name, _find(metrics, name), limit) for name, limit in limits.items()}
+    check_metric_names(limits, metrics)
+    return {name: _verdict(name, _value(metrics, name), limit) for name, limit in limits.items()}
 
 
-def check_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None:
-    """Refuses names that are no number of `metrics` (dotted path), before a survey is flown in vain."""
+def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None:
+    """Checks that every name is the dotted path of a number in `metrics`.
+
+    Raises:
+        TwinError: a name is not; the message suggests similar names.
+    """
     known = list(number_paths(metrics))
     for name in names:
         if name not in known:
-            begun = [k for k in known if k.startswith(name)]
-            near = (begun or difflib.get_close_matches(name, known, cutoff=0.5))[:3]
-            hint = f", did you mean {' or '.join(near)}?" if near else ""
+            completions = [k for k in known if k.startswith(name)]
+            similar = (completions or difflib.get_close_matches(name, known, cutoff=0.5))[:3]
+            hint = f", did you mean {' or '.join(similar)}?" if similar else ""
             raise TwinError(f"require.{name}", f"no such metric{hint}", "a dotted name of metrics.json")
 
 
 def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    """Dotted names of every number (or missing number) in the sections of metrics."""
+    """Yields the dotted path of every number, or missing number, in the sections of `metrics`."""
     for key, value in metrics.items():
         if isinstance(value, Mapping):
             yield from number_paths(value, f"{prefix}{key}.")
@@ -50,10 +56,12 @@ def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
 
 
 def more_is_better(name: str) -> bool:
+    """Returns whether larger values of a metric are better, so that its limit is a lower bound."""
     return name.startswith(MORE_IS_BETTER)
 
 
-def _find(metrics: Mapping[str, Any], name: str) -> float | None:
+def _value(metrics: Mapping[str, Any], name: str) -> float | None:
+    """Returns the metric with a dotted name."""
     value: Any = metrics
     for key in name.split("."):
         value = value[key]
@@ -61,5 +69,6 @@ def _find(metrics: Mapping[str, Any], name: str) -> float | None:
 
 
 def _verdict(name: str, value: float | None, limit: float) -> dict[str, Any]:
-    met = value is not None and (value >= limit if more_is_better(name) else value <= limit)
-    return {"value": value, "limit": limit, "passed": met}
+    """Returns value, limit and whether the value meets the limit."""
+    passed = value is not None and (value >= limit if more_is_better(name) else value <= limit)
+    return {"value": value, "limit": limit, "passed": passed}

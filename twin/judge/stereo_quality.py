@@ -1,4 +1,4 @@
-"""What the stereo_observations with both cameras had to go by: matched points, and the contrast of the images."""
+"""Image quality of the stereo observations: matched points and contrast."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from twin.judge.summary_statistics import percentile
 
 
 def stereo_quality(result: SurveyResult) -> dict[str, Any]:
-    """`vision` of metrics.json, over all stereo_observations, also those that made no keyframe.
+    """Returns `vision` of metrics.json, over all stereo observations, with or without a keyframe.
 
-    Points: median, and what nine in ten stereo_observations had at least. Contrast: median; None where no image is rendered.
+    points_median and points_p10 are the median and the 10th percentile of the number of matched points.
+    contrast_median is None where no image is rendered. blind_looks is the number of stereo observations with too few
+    points for a keyframe.
     """
-    points = [look.n_points for look in result.stereo_observations]
-    contrast = [look.contrast for look in result.stereo_observations if look.contrast is not None]
+    points = [observation.n_points for observation in result.stereo_observations]
+    contrast = [observation.contrast for observation in result.stereo_observations if observation.contrast is not None]
+    observed, keyframes = {observation.row for observation in result.stereo_observations}, result.keyframe_rows
     return {
         "points_median": percentile(points, 50),
         "points_p10": percentile(points, 10),
         "contrast_median": percentile(contrast, 50),
-        "blind_looks": len(
-            {look.row for look in result.stereo_observations} - {int(row) for row in result.keyframe_rows}
-        ),
+        "blind_looks": len(observed - {int(row) for row in keyframes}),
     }

@@ -1,4 +1,4 @@
-"""Figures for metrics.json: finite numbers, or None where there is nothing to judge."""
+"""Summary statistics for metrics.json: finite numbers, or None if there are no values."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 
-def number(value: Any) -> float | None:
-    """The value as a float; None where it is missing or not finite (JSON knows no NaN)."""
+def finite_float(value: Any) -> float | None:
+    """Returns the value as a float; None if it is missing or not finite (JSON has no NaN)."""
     return None if value is None or not np.isfinite(value) else float(value)
 
 
 def rms(values: ArrayLike) -> float | None:
-    """Root of the mean square over all values; None of none."""
+    """Returns the root mean square of all values; None if there are none."""
     array = np.asarray(values, dtype=float)
-    return number(np.sqrt(np.mean(array**2))) if array.size else None
+    return finite_float(np.sqrt(np.mean(array**2))) if array.size else None
 
 
 def mean(values: ArrayLike) -> float | None:
-    """The mean; None of none."""
+    """Returns the mean of all values; None if there are none."""
     array = np.asarray(values, dtype=float)
-    return number(array.mean()) if array.size else None
+    return finite_float(array.mean()) if array.size else None
 
 
-def percentile(values: ArrayLike, share: float) -> float | None:
-    """The value that `share` percent do not exceed, interpolated linearly; None of none."""
+def percentile(values: ArrayLike, percent: float) -> float | None:
+    """Returns the percentile (0 to 100) of all values with linear interpolation; None if there are none."""
     array = np.asarray(values, dtype=float)
-    return number(np.percentile(array, share)) if array.size else None
+    return finite_float(np.percentile(array, percent)) if array.size else None
 
 
 def finite_tree(tree: Any) -> Any:
-    """The same nested dicts and lists with numpy scalars made plain and non-finite numbers made None."""
+    """Returns nested dicts and lists with numpy scalars converted to Python numbers and non-finite numbers to None."""
     if isinstance(tree, dict):
         return {key: finite_tree(value) for key, value in tree.items()}
     if isinstance(tree, str | bytes) or not isinstance(tree, Iterable):
-        plain = tree.item() if isinstance(tree, np.generic) else tree
-        return number(plain) if isinstance(plain, float) else plain
+        scalar = tree.item() if isinstance(tree, np.generic) else tree
+        return finite_float(scalar) if isinstance(scalar, float) else scalar
     return [finite_tree(value) for value in tree]

@@ -1,4 +1,4 @@
-"""The reference path: its direction of travel, its swaths."""
+"""Direction of travel and swaths (legs or loops) of the reference path."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, Truth
 
-#: A frame is on a leg while the reference travels within this cosine of the legs' axis (26 degrees).
+#: A frame belongs to a leg if |cos| of the angle between its travel and the axis of the legs exceeds this (26 deg).
 ON_LEG_COSINE = 0.9
 
 
 def travel_direction(reference: Array) -> Array:
-    """(n, 2) horizontal unit vector of travel along (n, 3) reference positions; kept while it stands still."""
+    """Returns horizontal unit vectors of travel (n, 2) along reference positions (n, 3).
+
+    Where the reference stands still, the last direction is repeated.
+    """
     n = len(reference)
     if n == 0:
         return np.zeros((0, 2))
@@ -27,14 +30,15 @@ def travel_direction(reference: Array) -> Array:
 
 
 def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
-    """(n,) number of the leg or loop, from 0, that each frame of the reference is on; -1 between legs."""
+    """Returns (n,) number of the leg or loop of each frame, from 0; -1 for frames between legs."""
     return truth.track - 1 if pattern == "loops" else leg_numbers(truth.reference)
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
-    """(n,) number of the leg, from 0, that each frame of the reference is on; -1 on the short segments between.
+    """Returns (n,) number of the leg of each frame, from 0; -1 on the short segments between legs.
 
-    Legs run along the axis that the reference mostly travels; a turn or a short segment ends one.
+    The axis of the legs is the principal axis of the steps between the reference positions (n, 3). A leg ends at a
+    turn or at a short segment.
     """
     direction = travel_direction(reference)
     steps = np.diff(reference[:, :2], axis=0, prepend=reference[:1, :2])

@@ -1,1 +1,1 @@
-"""Everything that draws or words results."""
+"""Presentation of results: run folder, HTML report, figures, 3-D recording."""

@@ -1,4 +1,4 @@
-"""Self-contained pages of one look: templates of any room, in the style and with the words of the survey report."""
+"""HTML pages from Jinja templates, with one style sheet, one set of number filters and one list of terms."""
 
 from __future__ import annotations
 
@@ -10,29 +10,37 @@ import jinja2
 
 from twin.report import wording
 
-_HOME = "twin.report"  # where the style of all pages lies
+_SHARED_TEMPLATES = "twin.report"
 
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
-    """The template of a package as HTML."""
+    """Returns a template as self-contained HTML.
+
+    Args:
+        package: package that holds the template; files included by it may also lie in `twin.report`.
+        template: file name of the template.
+        context: variables of the template.
+    """
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_HOME, name)),
+        loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_SHARED_TEMPLATES, name)),
     )
+    environment.globals["terms"] = wording.TERMS
     environment.filters.update(
         length=wording.length,
         percent=wording.percent,
         plain=wording.plain,
         ms=wording.milliseconds,
         angle=wording.angle,
-        small_angle=wording.small_angle,
-        factor=wording.factor,
+        milliradians=wording.milliradians,
+        ratio=wording.ratio,
     )
     return environment.get_template(template).render(**context)
 
 
 def _source(package: str, name: str) -> str | None:
+    """Returns the text of a file in a package; None if there is no such file."""
     file = files(package).joinpath(name)
     return file.read_text(encoding="utf-8") if file.is_file() else None

@@ -1,4 +1,4 @@
-"""Photographs made small."""
+"""Reading image files and encoding reduced JPEG copies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ JPEG_QUALITY = 78
 
 
 def jpeg_bytes(image: Image, longest_px: int) -> bytes:
-    """An RGB image as JPEG, shrunk so that no side is longer than `longest_px`."""
+    """Returns an RGB image as JPEG, reduced so that no side is longer than `longest_px`."""
     if (scale := longest_px / max(image.shape[:2])) < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -21,6 +21,6 @@ def jpeg_bytes(image: Image, longest_px: int) -> bytes:
 
 
 def read_rgb(file: Path) -> Image | None:
-    """An image file as RGB; None where it is missing or no image."""
+    """Returns an image file as RGB; None if it is missing or not an image."""
     image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
     return None if image is None else np.asarray(image, np.uint8)

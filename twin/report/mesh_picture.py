@@ -1,7 +1,7 @@
-"""The mapped surface as a picture: mesh.glb from an eye above it, drawn by pyrender.
+"""Oblique picture of the mapped surface: mesh.glb rendered with pyrender in a separate process.
 
-pyrender takes MuJoCo's display down with its own, and a broken driver the whole process. So this module is a program
-too: `surface_picture` starts it, and does without a picture where it fails.
+Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver ends the process. Therefore
+`surface_picture` runs this module as a program and returns None if that fails.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ import numpy as np
 from twin.core.records import Array, Image
 from twin.report.images import read_rgb
 
-#: A surface that takes longer is left out of the report.
+#: Time limit of the rendering process; a surface that takes longer is left out of the report.
 LIMIT_S = 15.0
 WIDTH_PX, HEIGHT_PX, VFOV_DEG = 1400, 900, 30.0
-#: The eye looks down by so much, from the south and a little from the east.
-DOWN_DEG, EAST_DEG = 42.0, 20.0
+#: Viewing direction: depression angle, and angle of the camera's position from south towards east.
+DEPRESSION_DEG, EAST_DEG = 42.0, 20.0
 MARGIN = 1.04
-#: Vertices beyond these percentiles may leave the picture: a single wild height must not shrink all others.
+#: Percentiles of the coordinates that have to fit into the picture; outliers of the height may be cut off.
 FRAMED_PERCENT = (0.2, 99.8)
-#: Direction to the light in GLB's axes (east, up, south): the north-west, as in all maps of the report.
+#: Direction to the light in the axes of glTF (east, up, south): north-west, as in all maps of the report.
 LIGHT = np.array([-0.5, 0.7, -0.5])
 WHITE = (1.0, 1.0, 1.0, 0.0)
 
 
 def surface_picture(mesh_file: Path) -> Image | None:
-    """The mesh seen obliquely from the south, (h, w, 3) RGB; None where there is no mesh or nothing draws it."""
+    """Returns an oblique view of the mesh from the south, (h, w, 3) RGB; None without a mesh or if rendering fails."""
     if not mesh_file.is_file():
         return None
     try:
@@ -46,59 +46,75 @@ def surface_picture(mesh_file: Path) -> Image | None:
         return None
 
 
-def draw(mesh: Any) -> Image:
-    """A coloured trimesh in GLB's axes (y up) on white, lit from the north-west, cropped to what is drawn."""
+def render_mesh(mesh: Any) -> Image:
+    """Returns a picture of a coloured trimesh on white, lit from the north-west and cropped to the mesh.
+
+    Args:
+        mesh: trimesh.Trimesh in the axes of glTF (y up); its vertex colours are replaced by shaded ones.
+    """
     import pyglet
 
-    pyglet.options["headless"] = True  # pyrender opens pyglet's windows at import: a bare machine has no X libraries
+    pyglet.options["headless"] = True  # pyrender imports pyglet's windows, which need X libraries
     import pyrender
 
     scene = pyrender.Scene(bg_color=WHITE)
-    mesh.visual.vertex_colors = lit(mesh.visual.vertex_colors[:, :3], mesh.vertex_normals)
+    mesh.visual.vertex_colors = shaded_colours(mesh.visual.vertex_colors[:, :3], mesh.vertex_normals)
     scene.add(pyrender.Mesh.from_trimesh(mesh))
     camera = pyrender.PerspectiveCamera(np.deg2rad(VFOV_DEG), aspectRatio=WIDTH_PX / HEIGHT_PX)
-    scene.add(camera, pose=eye(mesh.vertices))
+    scene.add(camera, pose=camera_pose(mesh.vertices))
     renderer = pyrender.OffscreenRenderer(WIDTH_PX, HEIGHT_PX)
     flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.SKIP_CULL_FACES
-    drawn: Any = renderer.render(scene, flags)
+    rendered: Any = renderer.render(scene, flags)
     renderer.delete()
-    picture, depth = drawn
+    picture, depth = rendered
     rows, cols = np.nonzero(depth)
     return picture[rows.min() : rows.max() + 1, cols.min() : cols.max() + 1]
 
 
-def lit(colours: Image, normals: Array) -> Image:
-    """Vertex colours (n, 3) shaded by Lambert's cosine, with enough even light to keep the mosaic's colours."""
+def shaded_colours(colours: Image, normals: Array) -> Image:
+    """Returns vertex colours (n, 3) with Lambertian shading and enough ambient light to keep the mosaic's colours.
+
+    Args:
+        colours: (n, 3) RGB.
+        normals: (n, 3) unit normals in the axes of glTF.
+    """
     cosine = np.clip(normals @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
     return np.clip(colours * (0.7 + 0.7 * cosine[:, None]), 0, 255).astype(np.uint8)
 
 
-def eye(vertices: Array) -> Array:
-    """(4, 4) pose of an OpenGL camera (looks along -z) that sees all framed vertices (n, 3), as near as can be.
+def camera_pose(vertices: Array) -> Array:
+    """Returns the pose (4, 4) of the nearest OpenGL camera (viewing along -z) that has all framed vertices in view.
 
-    A point q of the camera's axes at distance d lies inside a half-tangent t where |q_x| <= t (d - q_z).
+    Let the camera be at distance d from the centre of the vertices, and q a vertex relative to that centre in the axes
+    of the camera. The vertex is in view if |q_x| <= t (d - q_z) for the tangent t of half the horizontal field of view,
+    and likewise for q_y.
+
+    Args:
+        vertices: (n, 3) in the axes of glTF [m].
     """
     low, high = np.percentile(vertices, FRAMED_PERCENT, axis=0)
-    corners = np.clip(vertices, low, high)
-    rotation = _turn(1, EAST_DEG) @ _turn(0, -DOWN_DEG)
+    framed = np.clip(vertices, low, high)
+    rotation = _axis_rotation(1, EAST_DEG) @ _axis_rotation(0, -DEPRESSION_DEG)
     centre = (low + high) / 2
     tangents = np.tan(np.deg2rad(VFOV_DEG) / 2) * np.array([WIDTH_PX / HEIGHT_PX, 1.0])
-    seen = (corners - centre) @ rotation
-    away = MARGIN * float((seen[:, 2:] + np.abs(seen[:, :2]) / tangents).max())
+    points = (framed - centre) @ rotation
+    distance = MARGIN * float((points[:, 2:] + np.abs(points[:, :2]) / tangents).max())
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, centre + away * rotation[:, 2]
+    pose[:3, :3], pose[:3, 3] = rotation, centre + distance * rotation[:, 2]
     return pose
 
 
-def _turn(axis: int, angle_deg: float) -> Array:
+def _axis_rotation(axis: int, angle_deg: float) -> Array:
+    """Returns the rotation matrix (3, 3) about a coordinate axis (0 to 2)."""
     return np.asarray(cv2.Rodrigues(np.deg2rad(angle_deg) * np.eye(3)[axis])[0])
 
 
 def _main(mesh_file: str, picture_file: str) -> None:
+    """Renders a GLB file to an image file."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # before pyrender is imported
     import trimesh
 
-    picture = draw(trimesh.load_scene(mesh_file).to_mesh())
+    picture = render_mesh(trimesh.load_scene(mesh_file).to_mesh())
     cv2.imwrite(picture_file, np.ascontiguousarray(picture[..., ::-1]))
 
 

@@ -1,4 +1,4 @@
-"""The survey in Rerun: run.rrd, drawn from the run folder, and a live view. The only importer of rerun."""
+"""Rerun recording of a survey (run.rrd) and live viewer. The only module that imports rerun."""
 
 from __future__ import annotations
 
@@ -16,31 +16,35 @@ from twin.core.records import Array, Estimate, Frame, Image, StereoRig, Trajecto
 from twin.judge.trajectory import path_errors
 from twin.report import recording_surfaces, wording
 from twin.report.images import jpeg_bytes, read_rgb
-from twin.report.recording_data import N_STAGES, Moments, sampled, stage_times, stages_of, step_of
+from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
-#: Images are shown of at most so many keyframes, and so large.
+#: Largest number of keyframes with images, and the longest side of their images and of the mosaic [px].
 N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
 
-#: The viewer of this Python; without --bind it would listen to everybody.
+#: Command of the Rerun viewer; --bind restricts it to this machine.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
-#: The true floor lets the map shine through, and is drawn a little lower: a good map would flicker with it.
+#: The true floor is translucent and lowered: coincident surfaces of an accurate map would flicker (z-fighting).
 TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
 
 
 def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
-    """Writes run.rrd into a run folder from what is there, and returns its path.
+    """Writes run.rrd into a run folder and returns its path.
+
+    Args:
+        folder: the run folder.
+        metrics: replaces metrics.json where that is not written yet.
 
     Raises:
-        TwinError: the folder is no run, or one of its files is broken.
+        TwinError: it is not a run folder, or one of its files is damaged.
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
     rig = scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
-    recording.save(file, default_blueprint=blueprint(_view_point(run)))
+    recording.save(file, default_blueprint=blueprint(_overview(run)))
     log_scene(recording, run)
     log_paths(recording, run)
     log_map(recording, run, rig)
@@ -52,15 +56,15 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
 
 
 def open_viewer(folder: Path) -> int:
-    """Opens a run in the Rerun viewer, written first where it is missing; returns the viewer's exit status."""
+    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing."""
     file = Path(folder) / "run.rrd"
     if not file.is_file():
         write_recording(Path(folder))
     return subprocess.run([*VIEWER, str(file)], check=False).returncode
 
 
-def blueprint(eye: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
-    """The survey large on the left; cameras, mosaic and curves on the right."""
+def blueprint(viewpoint: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
+    """Returns the layout of the viewer: 3-D view on the left; cameras, mosaic and curves on the right."""
     cameras = rrb.Horizontal(
         rrb.Spatial2DView(origin="/world/rig/left", name="Left camera"),
         rrb.Spatial2DView(origin="/world/rig/right", name="Right camera"),
@@ -74,7 +78,7 @@ def blueprint(eye: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
         rrb.TimeSeriesView(origin="/error/heading", name="Heading error [deg]"),
     )
     timing = rrb.TimeSeriesView(origin="/timing", name="Time per call [ms]")
-    survey = rrb.Spatial3DView(origin="/world", name="Survey", eye_controls=eye)
+    survey = rrb.Spatial3DView(origin="/world", name="Survey", eye_controls=viewpoint)
     return rrb.Blueprint(
         rrb.Horizontal(survey, rrb.Vertical(cameras, pictures, curves, timing), column_shares=[3, 2]),
         rrb.TimePanel(state="collapsed", timeline="frame"),
@@ -82,23 +86,24 @@ def blueprint(eye: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
     )
 
 
-def _view_point(run: Run) -> rrb.EyeControls3D | None:
-    """From the south and above, far enough to see the whole survey."""
+def _overview(run: Run) -> rrb.EyeControls3D | None:
+    """Returns a viewpoint above and south of the survey that shows all of it; None without a trajectory."""
     paths = [path.positions for path in run.trajectories.values() if len(path)]
     if not paths:
         return None
     low, high = (getattr(np.concatenate(paths), side)(axis=0) for side in ("min", "max"))
     target = np.array([*(low + high)[:2] / 2, low[2] / 2])
-    away = max(1.0, float(np.linalg.norm((high - low)[:2])))
-    return rrb.EyeControls3D(position=target + away * np.array([0.0, -0.75, 0.9]), look_target=target, eye_up=[0, 0, 1])
+    distance = max(1.0, float(np.linalg.norm((high - low)[:2])))
+    position = target + distance * np.array([0.0, -0.75, 0.9])
+    return rrb.EyeControls3D(position=position, look_target=target, eye_up=[0, 0, 1])
 
 
 def log_scene(recording: rr.RecordingStream, run: Run) -> None:
-    """What does not change: axes, true floor, planned path, mosaic, and the survey in words."""
+    """Logs the static entities: axes, true floor, planned path, mosaic and the summary."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     summary = "\n".join(
         [f"# {run.scenario.get('name', run.folder.name)}", wording.headline(run.metrics, run.scenario), ""]
-        + [f"- **{row.what}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
+        + [f"- **{row.label}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
     )
     recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
     if "dem_truth" in run.rasters:
@@ -107,76 +112,77 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
         recording.log("world/true_floor", surface_mesh(floor, alpha=TRUTH_ALPHA), static=True)
     if "reference" in run.trajectories:
         positions = run.trajectories["reference"].positions
-        planned = line(positions[:: step_of(len(positions))], "reference")
+        planned = line(positions[:: stride(len(positions))], "reference")
         recording.log("world/path/reference", planned, static=True)
     if "mosaic" in run.rasters:
         recording.log("mosaic", jpeg(run.rasters["mosaic"].values, MOSAIC_PX), static=True)
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Trajectories and network as they grow, stage by stage."""
+    """Logs trajectories and network as they grow, snapshot by snapshot."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
-        for end in np.unique(np.linspace(1, len(path), min(N_STAGES, len(path))).astype(int)):
+        for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
             _set_time(recording, end - 1, float(path.times_s[end - 1]))
-            recording.log(f"world/path/{name}", line(path.positions[: end : step_of(end)], name))
-    for last, moment in stages_of(run):
+            recording.log(f"world/path/{name}", line(path.positions[: end : stride(end)], name))
+    for last, frame_and_time in snapshots(run):
         edges = run.network.edges[run.network.edges.max(axis=1) <= last]
-        _set_time(recording, *moment)
+        _set_time(recording, *frame_and_time)
         recording.log("world/network", segments(run.network.positions[edges], "link"))
     recording.reset_time()
 
 
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """The elevation map in the mosaic's colours, each piece from the moment that a keyframe first looked at it.
+    """Logs the elevation map in the mosaic's colours, each part at the snapshot that first observes it.
 
-    The heights are those of the finished map.
+    All heights are those of the final map.
     """
     if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
         return
     surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters.get("mosaic"))
-    stages = list(stages_of(run))
+    steps = list(snapshots(run))
     poses = run.trajectories["final"].world_from_camera[run.keyframes.frames]
-    groups = np.split(poses, [last + 1 for last, _ in stages])[:-1]
-    first_seen = recording_surfaces.first_seen(surface.points, groups, rig)
-    for number, (_, moment) in enumerate(stages):
-        piece = recording_surfaces.piece(surface, first_seen, number)
-        if len(piece.triangles):
-            _set_time(recording, *moment)
-            recording.log(f"world/map/{number:02d}", surface_mesh(piece))
+    groups = np.split(poses, [last + 1 for last, _ in steps])[:-1]
+    first_observed = recording_surfaces.first_observed(surface.points, groups, rig)
+    for number, (_, frame_and_time) in enumerate(steps):
+        part = recording_surfaces.submesh(surface, first_observed, number)
+        if len(part.triangles):
+            _set_time(recording, *frame_and_time)
+            recording.log(f"world/map/{number:02d}", surface_mesh(part))
     recording.reset_time()
 
 
 def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """The rig along the true path (the online one where the truth is missing), its cameras and their images."""
+    """Logs the rig along the true path (the online estimate without a true path), its cameras and their images."""
     name = "truth" if "truth" in run.trajectories else "online"
     if name not in run.trajectories or not len(run.trajectories[name]):
         return
     path = run.trajectories[name]
-    rows = sampled(len(path))
+    rows = subsampled_rows(len(path))
     log_rig(recording, rig)
     poses = path.world_from_camera[rows]
     quaternions = [geometry.quaternion_xyzw(pose[:3, :3]) for pose in poses]
     columns = rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=quaternions)
-    recording.send_columns("world/rig", time_columns(Moments(rows, path.times_s[rows])), columns)
-    frames = [frame for frame in run.imaged_frames() if frame < len(path)]
-    shown = np.array(frames, dtype=np.int64)[:: step_of(len(frames), N_IMAGED)]
-    for eye in ("left", "right"):
-        _send_images(recording, run, eye, Moments(shown, path.times_s[shown]))
+    recording.send_columns("world/rig", time_columns(FrameTimes(rows, path.times_s[rows])), columns)
+    frames = [frame for frame in run.frames_with_image() if frame < len(path)]
+    shown = np.array(frames, dtype=np.int64)[:: stride(len(frames), N_IMAGED)]
+    for side in ("left", "right"):
+        _send_images(recording, run, side, FrameTimes(shown, path.times_s[shown]))
 
 
-def _send_images(recording: rr.RecordingStream, run: Run, eye: str, moments: Moments) -> None:
-    images = [read_rgb(run.image_file(int(f), eye)) for f in moments.frames]
-    there = np.array([image is not None for image in images], dtype=bool)
-    if there.any():
+def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: FrameTimes) -> None:
+    """Logs the existing images of the left or right camera at these frames."""
+    images = [read_rgb(run.image_file(int(f), side)) for f in times.frames]
+    exists = np.array([image is not None for image in images], dtype=bool)
+    if exists.any():
         data = [jpeg_bytes(image, IMAGE_WIDTH_PX) for image in images if image is not None]
         columns = rr.EncodedImage.columns(blob=data, media_type=["image/jpeg"] * len(data))
-        kept = Moments(moments.frames[there], moments.times_s[there])
-        recording.send_columns(f"world/rig/{eye}", time_columns(kept), columns)
+        shown = FrameTimes(times.frames[exists], times.times_s[exists])
+        recording.send_columns(f"world/rig/{side}", time_columns(shown), columns)
 
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
-    """The two cameras in the rig, whose frame is the left camera; the image plane is as wide as the logged images."""
+    """Logs the two cameras in the frame of the rig (the left camera), scaled to the size of the logged images."""
     scale = min(1.0, IMAGE_WIDTH_PX / rig.width_px)
     camera = rr.Pinhole(
         image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,
@@ -189,42 +195,43 @@ def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
 
 
 def log_curves(recording: rr.RecordingStream, run: Run) -> None:
-    """Errors of every estimate, and how long the stages took."""
+    """Logs the errors of every estimate and the durations of the processing stages."""
     if "truth" in run.trajectories:
         for name in ESTIMATES:
             if name in run.trajectories:
                 _log_errors(recording, name, run.trajectories[name], run.trajectories["truth"])
-    for stage, (moments, values) in stage_times(run).items():
-        log_curve(recording, f"timing/{stage}", moments, values)
+    for stage, (times, values) in stage_durations(run).items():
+        log_curve(recording, f"timing/{stage}", times, values)
         if len(values) == 1:
             recording.log(f"timing/{stage}", rr.SeriesPoints(marker_sizes=4), static=True)
 
 
 def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, truth: Trajectory) -> None:
+    """Logs position, height and heading error of one estimate."""
     errors = path_errors(estimate, truth)
-    rows = sampled(len(errors.travelled_m))
-    moments = Moments(rows, truth.times_s[rows])
-    log_curve(recording, f"error/position/{name}", moments, errors.distance_m[rows], name)
-    log_curve(recording, f"error/height/{name}", moments, errors.position_m[rows, 2], name)
-    log_curve(recording, f"error/heading/{name}", moments, np.rad2deg(errors.heading_rad[rows]), name)
+    rows = subsampled_rows(len(errors.travelled_m))
+    times = FrameTimes(rows, truth.times_s[rows])
+    log_curve(recording, f"error/position/{name}", times, errors.distance_m[rows], name)
+    log_curve(recording, f"error/height/{name}", times, errors.position_m[rows, 2], name)
+    log_curve(recording, f"error/heading/{name}", times, np.rad2deg(errors.heading_rad[rows]), name)
 
 
 def log_curve(
-    recording: rr.RecordingStream, entity: str, moments: Moments, values: Array, role: str | None = None
+    recording: rr.RecordingStream, entity: str, times: FrameTimes, values: Array, role: str | None = None
 ) -> None:
-    """One curve over both timelines, in the colour of its role."""
+    """Logs one curve on both timelines, in the colour of its role."""
     if len(values):
-        look: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
-        look |= {"colors": rgb(role)} if role else {}
-        recording.log(entity, rr.SeriesLines(**look), static=True)
-        recording.send_columns(entity, time_columns(moments), rr.Scalars.columns(scalars=values))
+        style: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
+        style |= {"colors": rgb(role)} if role else {}
+        recording.log(entity, rr.SeriesLines(**style), static=True)
+        recording.send_columns(entity, time_columns(times), rr.Scalars.columns(scalars=values))
 
 
-class Live:
-    """A viewer that shows the survey while it is flown: images, pose and path as believed online."""
+class LiveViewer:
+    """Rerun viewer that shows images, estimated pose and estimated path during the survey."""
 
     def __init__(self, rig: StereoRig, recording: rr.RecordingStream | None = None) -> None:
-        """Starts the viewer, unless a recording is given that already goes somewhere."""
+        """Starts the viewer, or logs to the given recording without starting one."""
         self.recording = recording or rr.RecordingStream("twin_live")
         self.path: list[Array] = []
         if recording is None:
@@ -234,7 +241,7 @@ class Live:
         log_rig(self.recording, rig)
 
     def log_frame(self, frame: Frame, estimate: Estimate) -> None:
-        """One frame: the pose always, the images and the path at keyframes."""
+        """Logs the pose of a frame, and at keyframes also the images and the path."""
         pose = estimate.world_from_camera
         _set_time(self.recording, frame.index, frame.time_s)
         quaternion = rr.Quaternion(xyzw=geometry.quaternion_xyzw(pose[:3, :3]))
@@ -248,21 +255,22 @@ class Live:
 
 
 def colour(role: str) -> tuple[int, int, int]:
-    """The colour of a role before the viewer's dark ground: the truth is white there."""
+    """Returns the colour of a role on the viewer's dark background, where the truth is white."""
     return (245, 245, 245) if role == "truth" else rgb(role)
 
 
 def line(positions: Array, role: str) -> rr.LineStrips3D:
-    """Positions (n, 3) as one line in the colour of its role."""
+    """Returns positions (n, 3) as one line in the colour of its role."""
     return rr.LineStrips3D([positions.astype(np.float32)], colors=[colour(role)], radii=rr.Radius.ui_points(1.5))
 
 
 def segments(pairs: Array, role: str) -> rr.LineStrips3D:
-    """Pairs of points (n, 2, 3) as separate lines."""
+    """Returns pairs of points (n, 2, 3) as separate lines."""
     return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
 
 
 def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Mesh3D:
+    """Returns a surface as a Rerun mesh; alpha is its opacity, 0 to 255."""
     return rr.Mesh3D(
         albedo_factor=(255, 255, 255, alpha),
         vertex_positions=surface.points, triangle_indices=surface.triangles, vertex_colors=surface.colours,
@@ -271,13 +279,16 @@ def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Me
 
 
 def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
+    """Returns an RGB image as JPEG, reduced so that no side is longer than `longest_px`."""
     return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
 
 
-def time_columns(moments: Moments) -> list[rr.TimeColumn]:
-    return [rr.TimeColumn("frame", sequence=moments.frames), rr.TimeColumn("sim_time", duration=moments.times_s)]
+def time_columns(times: FrameTimes) -> list[rr.TimeColumn]:
+    """Returns the frame numbers and simulated times as the two timelines of the recording."""
+    return [rr.TimeColumn("frame", sequence=times.frames), rr.TimeColumn("sim_time", duration=times.times_s)]
 
 
 def _set_time(recording: rr.RecordingStream, frame: int, time_s: float) -> None:
+    """Sets the current time of both timelines."""
     recording.set_time("frame", sequence=int(frame))
     recording.set_time("sim_time", duration=float(time_s))

@@ -1,4 +1,4 @@
-"""Elevation maps as coloured surfaces in pieces, for the 3-D view."""
+"""Elevation maps as coloured surfaces for the 3-D view, split by the time at which they were first observed."""
 
 from __future__ import annotations
 
@@ -10,16 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.grid_triangles import raster_triangles
 from twin.core.records import Array, Image, StereoRig
 from twin.report.run_folder import Raster
 
-#: Most vertices of a surface; finer maps are thinned.
+#: Largest number of vertices of a surface; finer maps are subsampled.
 N_VERTICES = 100_000
-NEVER = np.iinfo(np.int64).max
+#: Group of a point that no camera observes.
+NOT_OBSERVED = np.iinfo(np.int64).max
 
 
 class Surface(NamedTuple):
-    """Points (n, 3) [m], normals (n, 3), colours (n, 3) uint8 RGB, triangles (m, 3)."""
+    """A coloured triangle mesh in the world.
+
+    Args:
+        points: (n, 3) vertices [m].
+        normals: (n, 3) unit normals.
+        colours: (n, 3) uint8 RGB.
+        triangles: (m, 3) vertex numbers.
+    """
 
     points: Array
     normals: Array
@@ -28,7 +37,7 @@ class Surface(NamedTuple):
 
 
 def floor_surface(raster: Raster) -> Surface:
-    """The true floor, in grey by height."""
+    """Returns the true floor in grey, lighter with height."""
     low, high = np.nanpercentile(raster.values, [1, 99]) if np.isfinite(raster.values).any() else (0.0, 1.0)
     shade = np.clip((raster.values - low) / max(high - low, 1e-6), 0, 1)
     grey = np.nan_to_num(110 + 90 * shade).astype(np.uint8)
@@ -36,7 +45,7 @@ def floor_surface(raster: Raster) -> Surface:
 
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
-    """The estimated map in the colours of the mosaic; without one, by height."""
+    """Returns the estimated map in the colours of the orthomosaic, or coloured by height without one."""
     if mosaic is not None and mosaic.values.shape[:2] == dem.values.shape:
         return _surface(dem, mosaic.values)
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
@@ -45,48 +54,50 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def _surface(raster: Raster, colours: Image) -> Surface:
-    """Every n-th cell as a vertex, two triangles between four neighbours that have a height."""
+    """Returns the mesh of a raster: every n-th cell as a vertex, triangles between neighbours that have a height."""
     step = int(np.ceil(np.sqrt(raster.values.size / N_VERTICES)))
     x, y = raster.grid.centres()
     height = raster.values[::step, ::step]
     points = np.stack([*np.meshgrid(x[::step], y[::step]), height], axis=-1)
     north, east = np.gradient(height, -step * raster.grid.cell_m, step * raster.grid.cell_m)
     normals = np.nan_to_num(np.stack([-east, -north, np.ones_like(height)], axis=-1))
-    triangles = _triangles(np.isfinite(height))
     unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     flat = points.reshape(-1, 3), unit.reshape(-1, 3), colours[::step, ::step].reshape(-1, 3)
-    return Surface(*flat, triangles)
+    return Surface(*flat, raster_triangles(np.isfinite(height)))
 
 
-def _triangles(there: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Triangles (m, 3) between cells that are there, counter-clockwise from above (row 0 = north)."""
-    index = np.arange(there.size).reshape(there.shape)
-    nw, ne, sw, se = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    both = np.concatenate([np.stack([nw, sw, ne], -1).reshape(-1, 3), np.stack([ne, sw, se], -1).reshape(-1, 3)])
-    return both[there.ravel()[both].all(axis=1)]
+def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
+    """Returns (n,) number of the first group of cameras that observes each point; `NOT_OBSERVED` if none does.
 
-
-def first_seen(points: Array, stages: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
-    """(n,) number of the first stage with a camera (n_k, 4, 4) that has the point in its image; `NEVER` if none has."""
-    stage = np.full(len(points), NEVER)
-    waiting = np.flatnonzero(np.isfinite(points).all(axis=1))
-    for number, poses in enumerate(stages):
+    Args:
+        points: (n, 3) in the world [m].
+        groups: poses world_from_camera (n_k, 4, 4) of the left camera in each group.
+    """
+    group = np.full(len(points), NOT_OBSERVED)
+    remaining = np.flatnonzero(np.isfinite(points).all(axis=1))
+    for number, poses in enumerate(groups):
         for pose in poses:
-            inside = _in_image(points[waiting], pose, rig)
-            stage[waiting[inside]] = number
-            waiting = waiting[~inside]
-    return stage
+            inside = _in_image(points[remaining], pose, rig)
+            group[remaining[inside]] = number
+            remaining = remaining[~inside]
+    return group
 
 
 def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
+    """Returns (n,) whether points (n, 3) project into the image of a camera."""
     x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
-    reach_x, reach_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
-    return (z > 0) & (np.abs(x) <= reach_x * z) & (np.abs(y) <= reach_y * z)
+    tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
+    return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)
 
 
-def piece(surface: Surface, stage: NDArray[np.int64], number: int) -> Surface:
-    """The triangles that are complete from a stage on, with just their vertices."""
-    triangles = surface.triangles[stage[surface.triangles].max(axis=1, initial=-1) == number]
+def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
+    """Returns the triangles whose last vertex is observed by the given group, with the vertices they use.
+
+    Args:
+        group: (n,) group of each vertex, as `first_observed` returns it.
+        number: number of the group.
+    """
+    triangles = surface.triangles[group[surface.triangles].max(axis=1, initial=-1) == number]
     used, renumbered = np.unique(triangles, return_inverse=True)
     parts = surface.points[used], surface.normals[used], surface.colours[used]
     return Surface(*parts, renumbered.reshape(-1, 3))

@@ -1,10 +1,10 @@
-"""One look for every picture of a survey: colours by role, and the style of figures."""
+"""Colours, labels and matplotlib settings shared by all figures."""
 
 from __future__ import annotations
 
 from typing import Any
 
-#: Colours by role (Okabe and Ito: told apart by the colour-blind too).
+#: Colour of each role (Okabe & Ito palette, distinguishable with colour vision deficiency).
 COLOURS = {
     "truth": "#1b2a33",
     "reference": "#9aa8b0",
@@ -18,9 +18,9 @@ COLOURS = {
 LABELS = {
     "truth": "true",
     "reference": "planned",
-    "f2f": "frame to frame only",
-    "chain": "chain of keyframes",
-    "online": "online (flown on)",
+    "f2f": "frame-to-frame (F2F) only",
+    "chain": "chain of links",
+    "online": "online estimate",
     "final": "final, after global alignment",
 }
 ESTIMATES = ("f2f", "online", "final")
@@ -45,6 +45,6 @@ FIGURE_STYLE: dict[Any, Any] = {
 
 
 def rgb(role: str) -> tuple[int, int, int]:
-    """The colour of a role as 0 to 255."""
+    """Returns the colour of a role as (red, green, blue), 0 to 255."""
     text = COLOURS[role]
     return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)

@@ -1,4 +1,4 @@
-"""Figures in words: lengths a reader can picture, and the survey in one sentence."""
+"""Results as text: numbers with units, the summary of a survey, and the terms that the reports explain."""
 
 from __future__ import annotations
 
@@ -8,17 +8,58 @@ from typing import Any, NamedTuple
 
 DASH = "–"  # noqa: RUF001
 
+#: Names of the processing stages of metrics.json (`timing.stages`), and of their sum at a keyframe.
+PROCESSING_STAGES = {
+    "physics": "simulator: physics",
+    "render": "simulator: rendering",
+    "optics": "simulator: water and sensor",
+    "f2f": "frame-to-frame motion (F2F)",
+    "f2m": "registration with the mosaic (F2M)",
+    "stereo": "stereo matching",
+    "flow": "optical flow between keyframes",
+    "network": "keyframe network",
+    "ga": "global alignment (GA)",
+    "map": "elevation map",
+    "keyframe": "all keyframe processing",
+}
+
+#: Terms and their definitions, listed at the end of every report. The full list is docs/glossary.md.
+TERMS = {
+    "RMSE": "Root mean square error.",
+    "LE90": "90th percentile of the absolute height error (linear error at 90 %).",
+    "NMAD": "Normalised median absolute deviation, 1.4826 median |e - median e|: a standard deviation that is robust "
+    "against outliers.",
+    "Sigma calibration": "RMS of error / sigma, where sigma is the estimated standard deviation. 1 is right; larger "
+    "values mean that the estimate is overconfident.",
+    "NEES": "Normalised estimation error squared, e' C^-1 e, of an error e with the estimated covariance C. Its mean "
+    "is 3 for consistent positions and 6 for consistent motions; larger values mean overconfident covariances.",
+    "Completeness": "Share of the observed map cells that have an estimated height. A cell is observed if at least one "
+    "keyframe sees it with both cameras.",
+    "Keyframe": "Frame with a stereo pair that is a node of the network and contributes to the map.",
+    "Link": "Measured motion between two keyframes.",
+    "F2F": "Frame-to-frame motion: camera motion between consecutive frames, from optical flow.",
+    "F2M": "Registration of a keyframe with the mosaic of earlier keyframes.",
+    "GA": "Global alignment: least-squares adjustment of all keyframe poses to all links.",
+    "Eq. (2)": "Closed-form motion between two keyframes (Negahdaripour & Madjidi 2003), which takes depth as exact.",
+}
+
 
 class KeyFigure(NamedTuple):
-    """One figure of the overview: what it is, its value in words, what that means."""
+    """One entry of the overview.
 
-    what: str
+    Args:
+        label: name of the quantity.
+        value: its value with unit.
+        meaning: definition, reference value or related value.
+    """
+
+    label: str
     value: str
     meaning: str
 
 
 def length(value_m: float | None) -> str:
-    """A length in the unit that suits it."""
+    """Returns a length in mm, cm or m."""
     if value_m is None:
         return DASH
     size = abs(value_m)
@@ -27,131 +68,156 @@ def length(value_m: float | None) -> str:
     return f"{100 * value_m:.1f} cm" if size < 1 else f"{value_m:.2f} m"
 
 
-def percent(share: float | None) -> str:
-    return DASH if share is None else f"{100 * share:.1f} %"
+def percent(fraction: float | None) -> str:
+    """Returns a fraction in percent with up to one decimal, or a dash for None and NaN.
+
+    Values that would be rounded to 0 % or 100 % are given as "< 0.1 %" and "> 99.9 %".
+    """
+    if fraction is None or not math.isfinite(fraction):
+        return DASH
+    value = 100 * fraction
+    if 1e-9 < value < 0.05:
+        return "< 0.1 %"
+    if 1e-9 < 100 - value < 0.05:
+        return "> 99.9 %"
+    return f"{value:.1f}".removesuffix(".0") + " %"
 
 
 def angle(value_deg: float | None) -> str:
+    """Returns an angle in degrees."""
     return DASH if value_deg is None else f"{value_deg:.2f}°"
 
 
-def small_angle(value_deg: float | None) -> str:
-    """An angle of motions: 1 mrad is 1 mm at 1 m."""
+def milliradians(value_deg: float | None) -> str:
+    """Returns an angle given in degrees in milliradians: 1 mrad is 1 mm at 1 m distance."""
     return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
 
 
-def factor(value: float | None) -> str:
-    """By what an error fell: two digits below ten, whole above."""
+def ratio(value: float | None) -> str:
+    """Returns a ratio with two digits below ten and as an integer above."""
     return DASH if value is None else f"{value:.1f} ×" if value < 9.95 else f"{value:.0f} ×"  # noqa: RUF001
 
 
-def better(gain: float | None) -> str:
-    """What a stage bought, in words; nothing where that is within a twentieth."""
+def improvement(gain: float | None) -> str:
+    """Returns the ratio of errors before / after in words; "" if they differ by less than 5 %."""
     if gain is None or 0.95 <= gain <= 1.05:
         return ""
-    return f"{factor(gain)} better" if gain > 1 else f"{factor(1 / gain)} worse"
+    return f"{ratio(gain)} smaller" if gain > 1 else f"{ratio(1 / gain)} larger"
 
 
 def milliseconds(value_ms: float | None) -> str:
+    """Returns a duration in ms, from one second on in s."""
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
 
 def plain(value: Any) -> str:
-    """A number without needless digits; a dash for none."""
+    """Returns a number with up to four significant digits; a dash for None."""
     return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
-    """The survey in one or two plain sentences: complete or not, how far off, in which water."""
+    """Returns the summary of a survey: status, conditions, final position error, map quality and warning.
+
+    Args:
+        metrics: contents of metrics.json; None for an unfinished survey.
+        scenario: contents of the scenario file.
+    """
     if metrics is None:
-        return f"This survey is unfinished: it has no metrics.json. It was to be flown {conditions(scenario)}."
-    beware = f" Beware: {metrics['warning']}." if metrics.get("warning") else ""
+        return f"This survey is unfinished: it has no metrics.json. The survey is planned {conditions(scenario)}."
+    warning = f" Warning: {metrics['warning']}." if metrics.get("warning") else ""
     if metrics["status"] != "complete":
-        flown = f"The survey broke off ({metrics['reason']}). It was flown {conditions(scenario)}."
+        status = f"The survey was aborted ({metrics['reason']}). It was flown {conditions(scenario)}."
     else:
-        flown = f"The survey is complete, flown {conditions(scenario)}."
-    return f"{flown} {_result(metrics)}{beware}"
+        status = f"The survey is complete. It was flown {conditions(scenario)}."
+    return f"{status} {_results(metrics)}{warning}"
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Height and water of the survey."""
+    """Returns altitude and water of the survey in words."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
-    own = water.get("absorption_per_m") or water.get("spectrum_file")
-    kind = "water of its own spectrum" if own else f"water of Jerlov type {jerlov}"
-    if jerlov == "clear" and not own:
+    custom = water.get("absorption_per_m") or water.get("spectrum_file")
+    kind = "water with custom optical properties" if custom else f"water of Jerlov type {jerlov}"
+    if jerlov == "clear" and not custom:
         kind, turbidity = "clear water", 1.0
-    thick = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
-    return f"{plan.get('altitude_m', 0):g} m above the reference plane in {kind}{thick}"
+    scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
+    return f"{plan.get('altitude_m', 0):g} m above the reference plane in {kind}{scattering}"
 
 
-def _result(metrics: Mapping[str, Any]) -> str:
-    final, floor = metrics["trajectory"]["final"], metrics["map"]
-    said = []
+def _results(metrics: Mapping[str, Any]) -> str:
+    """Returns position error and map quality in one or two sentences."""
+    final, elevation = metrics["trajectory"]["final"], metrics["map"]
+    sentences = []
     if final["ate_rmse_m"] is not None:
-        said.append(f"Its final path is {length(final['ate_rmse_m'])} off (RMS) over {length(final['path_m'])}.")
-    if floor["le90_m"] is not None:
-        share, error = percent(floor["completeness"]), length(floor["le90_m"])
-        said.append(f"The map holds {share} of the floor that was seen, nine tenths of it right within {error}.")
-    return " ".join(said) or "There is no map and no path to judge."
+        error, path = length(final["ate_rmse_m"]), length(final["path_m"])
+        sentences.append(f"The position error of the final trajectory is {error} (RMSE) over a path of {path}.")
+    if elevation["le90_m"] is not None:
+        share, error = percent(elevation["completeness"]), length(elevation["le90_m"])
+        sentences.append(f"The map covers {share} of the observed floor; LE90 of its heights is {error}.")
+    return " ".join(sentences) or "There is no trajectory and no map to evaluate."
 
 
-def closed_form_verdict(links: Mapping[str, Any]) -> str:
-    """What taking the depth as exact costs the motions between keyframes, in a sentence."""
-    said = []
-    for where in ("along", "across"):
-        joint, exact = links[where]["translation_rmse_m"], links[where]["closed_form_translation_rmse_m"]
-        if joint and exact is not None:
-            said.append(f"{length(exact)} to {length(joint)} {where}")
-    if not said:
+def closed_form_comparison(links: Mapping[str, Any]) -> str:
+    """Returns a sentence that compares the translation error of the links with that of the closed form, eq. (2)."""
+    changes = []
+    for direction in ("along", "across"):
+        error = links[direction]["translation_rmse_m"]
+        closed_form_error = links[direction]["closed_form_translation_rmse_m"]
+        if error and closed_form_error is not None:
+            changes.append(f"from {length(closed_form_error)} to {length(error)} {direction}")
+    if not changes:
         return "No motion between keyframes was measured."
     return (
-        "Eq. (2) takes the depth of one stereo pair as exact; structure and motion together weigh both pairs by their "
-        f"noise, which takes the error of translation from {' and from '.join(said)}."
+        "Eq. (2) takes the depth of one stereo pair as exact. Two-view structure and motion weights both stereo pairs "
+        f"by their noise, which changes the RMS translation error of the links {' and '.join(changes)}."
     )
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    """The overview of a survey's quality."""
-    return [*_path_figures(metrics), *_map_figures(metrics), *_survey_figures(metrics)] if metrics else []
+    """Returns the overview of a survey; empty for empty metrics."""
+    return [*_position_figures(metrics), *_map_figures(metrics), *_survey_figures(metrics)] if metrics else []
 
 
-def _path_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
+def _position_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
+    """Returns the key figures of the trajectories."""
     f2f, online, final = (metrics["trajectory"][key] for key in ("f2f", "online", "final"))
+    nees = plain(metrics["consistency"]["nees_position_mean"])
     return [
-        KeyFigure("Path, final", length(final["ate_rmse_m"]), f"RMS; {length(final['ate_max_m'])} at most"),
-        KeyFigure("Path, online", length(online["ate_rmse_m"]), "RMS of what the vehicle flew on"),
-        KeyFigure("Path, frame to frame", length(f2f["ate_rmse_m"]), f"RMS; drift {_drift(f2f)}"),
-        KeyFigure(
-            "NEES of positions", plain(metrics["consistency"]["nees_position_mean"]), "3 is right; more: over-sure"
-        ),
+        KeyFigure("Position error, final", length(final["ate_rmse_m"]), f"RMSE; maximum {length(final['ate_max_m'])}"),
+        KeyFigure("Position error, online", length(online["ate_rmse_m"]), "RMSE of the estimate used for control"),
+        KeyFigure("Position error, F2F", length(f2f["ate_rmse_m"]), f"RMSE; drift {_drift(f2f)}"),
+        KeyFigure("NEES of positions", nees, "mean; 3 is consistent, more is overconfident"),
     ]
 
 
 def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    floor = metrics["map"]
+    """Returns the key figures of the elevation map."""
+    elevation = metrics["map"]
+    le90, bias = length(elevation["le90_m"]), length(elevation["bias_m"])
+    rmse, nmad = length(elevation["rmse_m"]), length(elevation["nmad_m"])
+    completeness, cell = percent(elevation["completeness"]), length(elevation["cell_m"])
     return [
-        KeyFigure("Map, LE90", length(floor["le90_m"]), f"90 % of heights are better; NMAD {length(floor['nmad_m'])}"),
-        KeyFigure("Map, bias", length(floor["bias_m"]), f"mean of map minus truth; RMSE {length(floor['rmse_m'])}"),
-        KeyFigure(
-            "Completeness", percent(floor["completeness"]), f"of the floor seen; {length(floor['cell_m'])} cells"
-        ),
-        KeyFigure("Honesty of sigma", plain(floor["sigma_ratio"]), "RMS of map error over its sigma; 1 is right"),
+        KeyFigure("Map LE90", le90, f"90th percentile of absolute height error; NMAD {nmad}"),
+        KeyFigure("Map bias", bias, f"mean height error; RMSE {rmse}"),
+        KeyFigure("Completeness", completeness, f"of the observed floor; cell size {cell}"),
+        KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), "RMS of height error / sigma; 1 is right"),
     ]
 
 
 def _survey_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    shared, control, timing = metrics["overlap"], metrics["control"], metrics["timing"]
+    """Returns the key figures of overlap, control and computing time."""
+    overlap, control, timing = metrics["overlap"], metrics["control"], metrics["timing"]
+    along, sidelap = percent(overlap["along_median"]), percent(overlap["across_median"])
+    along_planned, sidelap_planned = percent(overlap["along_planned"]), percent(overlap["across_planned"])
     counts = f"{timing['frames']} frames, {timing['keyframes']} keyframes"
     return [
-        KeyFigure(
-            "Overlap along", percent(shared["along_median"]), f"median; {percent(shared['along_planned'])} planned"
-        ),
-        KeyFigure("Overlap across", percent(shared["across_median"]), f"{percent(shared['across_planned'])} planned"),
-        KeyFigure("Cross-track", length(control["cross_track_rmse_m"]), "RMS distance from the planned path"),
+        KeyFigure("Overlap along the swath", along, f"median; {along_planned} planned"),
+        KeyFigure("Sidelap", sidelap, f"median; {sidelap_planned} planned"),
+        KeyFigure("Cross-track error", length(control["cross_track_rmse_m"]), "RMS distance from the planned path"),
         KeyFigure("Real-time factor", plain(timing["real_time_factor"]), counts),
     ]
 
 
 def _drift(path: Mapping[str, Any]) -> str:
-    return DASH if path["drift_percent"] is None else f"{path['drift_percent']:.2f} % of the path"
+    """Returns the end error of a trajectory in percent of the path length."""
+    return DASH if path["drift_percent"] is None else f"{path['drift_percent']:.2f} % of the path length"

@@ -1,1 +1,1 @@
-"""The paper's experiments again (Negahdaripour & Madjidi 2003)."""
+"""Reproduction of experiments of the paper (Negahdaripour & Madjidi 2003)."""

@@ -1,4 +1,4 @@
-"""The object of the turbidity ladder: a hollow concrete block on rippled sand."""
+"""Object of the turbidity experiment: a hollow concrete block on rippled sand."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from terrains.noise import fractal_field
 Array = NDArray[np.float64]
 
 SIZE_M, SPACING_M, TEXEL_M = (2.4, 2.0), 0.005, 0.002
-BLOCK_M, HEIGHT_M = (0.39, 0.19), 0.14  # a standard block, sunk in a little
-CORE_M, CORES_AT_M = (0.13, 0.12), (-0.0875, 0.0875)
-TURN_DEG = 25.0
+BLOCK_M, HEIGHT_M = (0.39, 0.19), 0.14  # a standard block, partly buried
+CORE_M, CORE_CENTRES_M = (0.13, 0.12), (-0.0875, 0.0875)
+HEADING_DEG = 25.0
 SAND, CONCRETE = (0.36, 0.31, 0.23), (0.45, 0.44, 0.42)  # albedo
 
 
 def block_on_sand(seed: int) -> Terrain:
-    """A floor around the origin whose reference plane is the sand."""
+    """Returns a terrain around the origin; its reference plane is the mean height of the sand."""
     rng = np.random.default_rng(seed)
     x, y = _grid(SPACING_M, edges=True)
     ripples = 0.012 * np.sin(2 * np.pi * (x + 0.15 * np.sin(2.1 * y) + 0.04 * np.sin(5.3 * y)) / 0.16)
@@ -33,18 +33,23 @@ def block_on_sand(seed: int) -> Terrain:
 
 
 def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
-    """Places (x, y) from south to north: of nodes on the edges, or of the middles of cells."""
-    sides = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
-    east, north = (side if edges else side + step_m / 2 for side in sides)
+    """Returns coordinates (x, y), rows from south to north.
+
+    Args:
+        step_m: grid spacing.
+        edges: include the edges of the terrain (grid nodes); else cell centres.
+    """
+    axes = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
+    east, north = (axis if edges else axis + step_m / 2 for axis in axes)
     x, y = np.meshgrid(east, north)
     return np.asarray(x, np.float64), np.asarray(y, np.float64)
 
 
 def _inside(x: Array, y: Array) -> NDArray[np.bool_]:
-    """Where the block is, its cores left out."""
-    turn = np.deg2rad(TURN_DEG)
-    along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    """Returns where the block is, without its cores."""
+    heading = np.deg2rad(HEADING_DEG)
+    along, across = x * np.cos(heading) + y * np.sin(heading), y * np.cos(heading) - x * np.sin(heading)
     block = (np.abs(along) < BLOCK_M[0] / 2) & (np.abs(across) < BLOCK_M[1] / 2)
-    for at in CORES_AT_M:
-        block &= ~((np.abs(along - at) < CORE_M[0] / 2) & (np.abs(across) < CORE_M[1] / 2))
+    for centre in CORE_CENTRES_M:
+        block &= ~((np.abs(along - centre) < CORE_M[0] / 2) & (np.abs(across) < CORE_M[1] / 2))
     return block

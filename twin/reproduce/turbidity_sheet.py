@@ -1,7 +1,8 @@
-"""The sheet of the turbidity ladder: images above their histograms, below them contrast against range."""
+"""Figure of the turbidity levels: images, their histograms, and contrast against range."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,22 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from twin.imaging.water import medium
 from twin.report.style import FIGURE_STYLE
-from twin.reproduce.turbidity import JERLOV, RANGES_M, VISIBLE, Level
+from twin.reproduce.turbidity_level import MIN_VISIBLE_CONTRAST, TurbidityLevel
 
 BANDS = (("red", "#d55e00"), ("green", "#009e73"), ("blue", "#0072b2"))
 PANEL_IN = 3.1
 
 
-def draw(levels: list[Level], file: Path) -> Path:
-    """Writes the sheet as PNG."""
+def draw(levels: Sequence[TurbidityLevel], file: Path) -> Path:
+    """Draws the figure to a PNG file; returns its path."""
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6))
         grid = figure.add_gridspec(3, len(levels), height_ratios=[image_in, 1.6, 3.4])
-        figure.suptitle(_headline(levels), fontsize=12)
-        top = max(_share(level.image, band).max() for level in levels for band in range(3))
+        figure.suptitle(_title(levels), fontsize=12)
+        top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))
         for k, level in enumerate(levels):
             _picture(figure.add_subplot(grid[0, k]), level)
             _histogram(figure.add_subplot(grid[1, k]), level, top, first=k == 0)
@@ -36,34 +36,35 @@ def draw(levels: list[Level], file: Path) -> Path:
     return file
 
 
-def _headline(levels: list[Level]) -> str:
+def _title(levels: Sequence[TurbidityLevel]) -> str:
     return (
-        f"One object at {len(levels)} turbidity levels: scattering of Jerlov type {JERLOV} times the turbidity, two "
-        f"lamps, exposed to the same mean, {levels[0].told['depth_median_m']:.2f} m below the camera"
+        f"One object at {len(levels)} turbidity levels: scattering of Jerlov type {levels[0].scenario.water.jerlov} "
+        f"multiplied by the turbidity, two lamps, equal mean exposure, "
+        f"{levels[0].quality['depth_median_m']:.2f} m below the camera"
     )
 
 
-def _picture(axes: Axes, level: Level) -> None:
+def _picture(axes: Axes, level: TurbidityLevel) -> None:
     axes.imshow(level.image)
     axes.set_axis_off()
-    c = medium(level.scenario.water).attenuation_per_m[1]
+    c = level.water.attenuation_per_m[1]
     axes.set_title(f"turbidity {level.scenario.water.turbidity:g}   (green c = {c:.2f} /m)", loc="left")
 
 
-def _share(image: Any, band: int) -> Any:
-    """Share of pixels in bins of two gray levels."""
+def _histogram_of(image: Any, band: int) -> Any:
+    """Returns the fraction of the pixels in bins of two gray levels."""
     return np.histogram(image[..., band], bins=128, range=(0, 256))[0] / image[..., band].size
 
 
-def _histogram(axes: Axes, level: Level, top: float, first: bool) -> None:
-    middles = np.arange(128) * 2 + 1
+def _histogram(axes: Axes, level: TurbidityLevel, top: float, first: bool) -> None:
+    centres = np.arange(128) * 2 + 1
     for band, (name, colour) in enumerate(BANDS):
-        share = 100 * _share(level.image, band)
-        axes.fill_between(middles, share, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(middles, share, color=colour, linewidth=1.1, label=name)
+        share = 100 * _histogram_of(level.image, band)
+        axes.fill_between(centres, share, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(centres, share, color=colour, linewidth=1.1, label=name)
     axes.set(xlim=(0, 255), ylim=(0, 105 * top), xticks=[0, 64, 128, 192, 255], xlabel="gray level")
-    spread = ", ".join(f"{sd:.0f}" for sd in level.image.std(axis=(0, 1)))
-    axes.text(0.98, 0.93, f"spread {spread}", transform=axes.transAxes, ha="right", va="top", color="#44545c")
+    deviations = ", ".join(f"{sd:.0f}" for sd in level.image.std(axis=(0, 1)))
+    axes.text(0.98, 0.93, f"SD {deviations}", transform=axes.transAxes, ha="right", va="top", color="#44545c")
     if first:
         axes.set_ylabel("pixels [%]")
         axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.9), fontsize=8, handlelength=1.2)
@@ -71,23 +72,23 @@ def _histogram(axes: Axes, level: Level, top: float, first: bool) -> None:
         axes.tick_params(labelleft=False)
 
 
-def _curves(axes: Axes, levels: list[Level]) -> None:
+def _curves(axes: Axes, levels: Sequence[TurbidityLevel]) -> None:
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, len(levels)))
-    at_m = levels[0].told["depth_median_m"]
+    image_range_m, ranges_m = levels[0].quality["depth_median_m"], levels[0].ranges_m
     for level, shade in zip(levels, shades, strict=True):
         green = level.contrast[:, 1]
-        sight = "" if level.sight_m is None else f": lost at {level.sight_m:.1f} m"
-        axes.plot(
-            RANGES_M, green, color=shade, linewidth=2, label=f"turbidity {level.scenario.water.turbidity:g}{sight}"
-        )
-        axes.plot(at_m, np.interp(at_m, RANGES_M, green), "o", color=shade, markersize=6)
-    axes.axhline(VISIBLE, color="#cc3311", linestyle="--", linewidth=1)
-    axes.text(RANGES_M[-1], VISIBLE * 1.1, "5 %: no longer told from what surrounds it", color="#cc3311", ha="right")
-    axes.axvline(at_m, color="#9aa8b0", linewidth=1)
-    axes.text(at_m * 1.02, 1.15, "the pictures above", color="#5d6d76")
+        visibility = "" if level.visibility_m is None else f": visible to {level.visibility_m:.1f} m"
+        label = f"turbidity {level.scenario.water.turbidity:g}{visibility}"
+        axes.plot(ranges_m, green, color=shade, linewidth=2, label=label)
+        axes.plot(image_range_m, np.interp(image_range_m, ranges_m, green), "o", color=shade, markersize=6)
+    axes.axhline(MIN_VISIBLE_CONTRAST, color="#cc3311", linestyle="--", linewidth=1)
+    limit = f"{MIN_VISIBLE_CONTRAST:.0%}: limit of visibility"
+    axes.text(ranges_m[-1], MIN_VISIBLE_CONTRAST * 1.1, limit, color="#cc3311", ha="right")
+    axes.axvline(image_range_m, color="#9aa8b0", linewidth=1)
+    axes.text(image_range_m * 1.02, 1.15, "range of the images above", color="#5d6d76")
     axes.set(
-        xlim=(RANGES_M[0], RANGES_M[-1]), ylim=(0.003, 1.5), yscale="log", xlabel="range [m]",
-        ylabel="contrast left, of that in clear water", title="Contrast of fine detail against range, green light",
+        xlim=(ranges_m[0], ranges_m[-1]), ylim=(0.003, 1.5), yscale="log", xlabel="range [m]",
+        ylabel="contrast relative to clear water", title="Contrast of fine detail against range, green light",
     )  # fmt: skip
     axes.set_yticks([0.01, 0.1, 1.0], ["1 %", "10 %", "100 %"])
     axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.92))

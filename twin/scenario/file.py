@@ -1,4 +1,4 @@
-"""The scenario as a TOML file: read with what it extends and overrides, all faults told at once; and written."""
+"""The scenario as a TOML file: read with its base file and overrides, checked, and written."""
 
 from __future__ import annotations
 
@@ -11,68 +11,87 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.model import Scenario, Source
+from twin.scenario.toml_lines import key_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 _PATH_KEYS = ("imaging.error_model", "terrain.height_file", "terrain.texture_file", "water.spectrum_file")
+#: Old keys of the scenario and their new names.
+_RENAMED_KEYS = {"calibration": "calibration_error", "imaging.calibration": "imaging.error_model"}
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file (or a name in scenes/), with what it extends and `key=value` overrides.
+    """Reads a scenario file with the file that it extends, and applies overrides.
+
+    Args:
+        path: a file, or a name in scenes/.
+        overrides: `key=value` each, with a dotted key and a value in TOML; a value that is not TOML is a string.
 
     Raises:
-        ScenarioError: every fault of the file, each as `FILE:LINE: key: what is wrong`.
+        ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
     file = find_scene(path)
-    tree, lines = _read(file, seen=())
+    tree, lines = _read_with_base(file, including_files=())
     source = Source(path=file, lines=lines, overrides=tuple(overrides))
     for override in overrides:
-        _apply(tree, override)
+        _apply_override(tree, override)
     scenario = validated(tree, Scenario, source)
     scenario._source = source
     return scenario
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
-    """The keys and values of a scenario file (or a name in scenes/) with what it extends, unchecked."""
-    return _read(find_scene(path), seen=())[0]
+    """Returns the keys and values of a scenario file, or a name in scenes/, merged with its base file; unchecked."""
+    return _read_with_base(find_scene(path), including_files=())[0]
 
 
 def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
-    """The scenario of a tree with the values of these dotted keys in place of its own.
+    """Returns the scenario of a tree in which some keys have new values.
 
     Args:
-        source: tells where a fault is; paths among the values are relative to its file.
+        tree: keys and values of a scenario; stays unchanged.
+        values: dotted keys and their values; file paths are relative to the folder of the source.
+        source: origin of the values, for the lines of error messages.
 
     Raises:
-        ScenarioError: every fault of the outcome.
+        ScenarioError: lists every error.
     """
     changed = copy.deepcopy(dict(tree))
     for key, value in values.items():
+        if new_key := _renamed(key):
+            raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
         is_path = key in _PATH_KEYS and isinstance(value, str)
         try:
             _assign(changed, key, str(_expand(value, source.path.parent)) if is_path else value, key)
         except ScenarioError as error:
-            fault = TwinError(key, error.lines[0].removeprefix(f"{key}: "))
-            raise ScenarioError([source.fault(fault)]) from None
+            problem = error.lines[0].removeprefix(f"{key}: ")
+            raise ScenarioError([source.describe(TwinError(key, problem))]) from None
     scenario = validated(changed, Scenario, source)
     scenario._source = source
     return scenario
 
 
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
-    """The tree as a model of the house. Raises ScenarioError with every fault."""
+    """Returns the tree as a validated model. Raises ScenarioError, which lists every error."""
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ScenarioError([source.fault(_explain(item, model)) for item in error.errors()]) from None
+        raise ScenarioError([source.describe(_as_twin_error(item, model)) for item in error.errors()]) from None
 
 
 def find_scene(path: str | Path) -> Path:
-    """The file of a scenario: a path that exists, or the name of one in scenes/."""
+    """Returns the file of a scenario.
+
+    Args:
+        path: an existing file, or a name in scenes/.
+
+    Raises:
+        ScenarioError: there is no such file or name.
+    """
     import scenes
 
     candidate = Path(path)
@@ -88,52 +107,21 @@ def find_scene(path: str | Path) -> Path:
 
 
 def dump_toml(scenario: Scenario) -> str:
-    """The scenario as TOML that `load_scenario` reads back to an equal one."""
+    """Returns the scenario as TOML, which `load_scenario` reads as an equal scenario."""
     tree = scenario.model_dump(mode="json", exclude_none=True)
-    lists, require = {key: tree.pop(key) for key in ("lamps", "beacons")}, tree.pop("require")
-    out = [f"{k} = {_toml(v)}" for k, v in tree.items() if not isinstance(v, dict)]
-    sections = [(f"[{k}]", v) for k, v in tree.items() if isinstance(v, dict)]
-    sections += [(f"[[{key}]]", item) for key, items in lists.items() for item in items] + [("[require]", require)]
-    for head, body in sections:
-        out += ["", head, *(f"{_toml_key(k)} = {_toml(v)}" for k, v in body.items())]
-    return "\n".join(out) + "\n"
-
-
-def _toml_key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else f'"{key}"'
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
-    return repr(value)
-
-
-def _read(file: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, int]]:
-    """One TOML file merged over what it extends, its file paths made absolute, with the line of each key."""
-    if file.resolve() in seen:
-        raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
-    tree, lines = read_toml(file)
-    _resolve_paths(tree, file.parent)
-    base = tree.pop("extends", None)
-    if base is None:
-        return tree, lines
-    base_file = (file.parent / str(base)).resolve()
-    if not base_file.is_file():
-        raise ScenarioError([f"{file}:{lines.get('extends', 1)}: extends: no such file {str(base)!r}"])
-    base_tree, _ = _read(base_file, (*seen, file.resolve()))
-    return _merge(base_tree, tree), lines
+    require = tree.pop("require")
+    tables = {key: tree.pop(key) for key in ("lamps", "beacons")}
+    return tomlkit.dumps(tree | {key: items for key, items in tables.items() if items} | {"require": require})
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """A TOML file as it stands, with the line of each key.
+    """Reads a TOML file, without the file that it extends.
+
+    Returns:
+        Its keys and values, and the line of each dotted key.
 
     Raises:
-        ScenarioError: it cannot be read, or is no TOML.
+        ScenarioError: the file cannot be read, or is not TOML.
     """
     try:
         text = file.read_text(encoding="utf-8")
@@ -145,10 +133,37 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         line = re.search(r"line (\d+)", str(error))
         number = line[1] if line else len(text.splitlines())
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    return tree, _key_lines(text)
+    return tree, key_lines(text)
+
+
+def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, int]]:
+    """Reads a file and merges it over its base file.
+
+    Args:
+        including_files: resolved paths of the files that extend this one, directly or indirectly.
+
+    Returns:
+        Keys and values, with absolute file paths, and the line of each key of `file` itself.
+    """
+    if file.resolve() in including_files:
+        raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
+    tree, lines = read_toml(file)
+    old_keys = [key for key in _RENAMED_KEYS if key in lines]
+    if old_keys:
+        raise ScenarioError([f"{file}:{lines[key]}: {key}: renamed to {_RENAMED_KEYS[key]}" for key in old_keys])
+    _resolve_paths(tree, file.parent)
+    base = tree.pop("extends", None)
+    if base is None:
+        return tree, lines
+    base_file = (file.parent / str(base)).resolve()
+    if not base_file.is_file():
+        raise ScenarioError([f"{file}:{lines.get('extends', 1)}: extends: no such file {str(base)!r}"])
+    base_tree, _ = _read_with_base(base_file, (*including_files, file.resolve()))
+    return _merge(base_tree, tree), lines
 
 
 def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
+    """Makes the file paths in a tree absolute."""
     for section, key in (name.split(".") for name in _PATH_KEYS):
         keys = tree.get(section)
         if isinstance(keys, dict) and isinstance(keys.get(key), str):
@@ -156,7 +171,7 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """A path with ${TWIN_DATA} expanded; relative paths are relative to the scenario's folder."""
+    """Returns the path with ${TWIN_DATA} expanded; other relative paths are relative to `folder`."""
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
         return Path(value.replace("${TWIN_DATA}", data)).resolve()
@@ -164,6 +179,7 @@ def _expand(value: str, folder: Path) -> Path:
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
+    """Returns both trees as one; where both have a value, that of `top`."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -171,87 +187,81 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _key_lines(text: str) -> dict[str, int]:
-    """Line number of every dotted key of a TOML text; of array tables the items count from 0."""
-    lines: dict[str, int] = {}
-    counts: dict[str, int] = {}
-    prefix = ""
-    for number, line in enumerate(text.splitlines(), 1):
-        if array := re.match(r"\s*\[\[\s*([\w.]+)\s*\]\]", line):
-            counts[array[1]] = counts.get(array[1], -1) + 1
-            prefix = f"{array[1]}.{counts[array[1]]}"
-            lines.setdefault(array[1], number)
-            lines[prefix] = number
-        elif table := re.match(r"\s*\[\s*([\w.]+)\s*\]", line):
-            prefix = table[1]
-            lines[prefix] = number
-        elif key := re.match(r"""\s*(?:"([^"]+)"|'([^']+)'|([\w.-]+))\s*=""", line):
-            name = key[1] or key[2] or key[3]
-            lines[f"{prefix}.{name}" if prefix else name] = number
-    return lines
-
-
-def _apply(tree: dict[str, Any], override: str) -> None:
-    """Sets one `a.b=value` in the tree; the value is read as TOML, else as text."""
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    """Sets one `key=value` in the tree."""
     key, equals, text = override.partition("=")
-    if not equals or not key.strip():
+    key = key.strip()
+    if not equals or not key:
         raise ScenarioError([f"--set {override}: not of the form key=value (for instance plan.tracks=2)"])
+    if new_key := _renamed(key):
+        raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     try:
         value = tomllib.loads(f"v = {text}")["v"]
     except tomllib.TOMLDecodeError:
         value = text
-    key = key.strip()
     _assign(tree, key, str(_expand(str(value), Path.cwd())) if key in _PATH_KEYS else value, f"--set {override}")
 
 
-def _assign(tree: dict[str, Any], key: str, value: Any, said: str) -> None:
-    """Sets the dotted key in the tree; a fault begins with what was `said`."""
+def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
+    """Sets a dotted key in the tree.
+
+    Args:
+        origin: first words of an error message.
+    """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
         parents, leaf = ["require"], ".".join([*parents[1:], leaf]).strip('"')
     node: Any = tree
     for part in parents:
-        node = _enter(node, part, said)
+        node = _child(node, part, origin)
         if not isinstance(node, dict | list):
-            raise ScenarioError([f"{said}: {part} is a value, not a section"])
+            raise ScenarioError([f"{origin}: {part} is a value, not a section"])
     if isinstance(node, list):
-        raise ScenarioError([f"{said}: name one of the list, as in {'.'.join(parents)}.0.{leaf}=..."])
+        raise ScenarioError([f"{origin}: an item of the list must be named, as in {'.'.join(parents)}.0.{leaf}=..."])
     node[leaf] = value
 
 
-def _enter(node: Any, part: str, said: str) -> Any:
-    """The section or list item of this name."""
+def _child(node: Any, part: str, origin: str) -> Any:
+    """Returns the section or list item with this name."""
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdigit() or int(part) >= len(node):
-        raise ScenarioError([f"{said}: no item {part} (allowed: 0 to {len(node) - 1})"])
+        raise ScenarioError([f"{origin}: no item {part} (allowed: 0 to {len(node) - 1})"])
     return node[int(part)]
 
 
-def _explain(item: Any, model: type[BaseModel]) -> TwinError:
-    """One pydantic error in the words of the house."""
-    where = ".".join(str(part) for part in item["loc"])
+def _renamed(key: str) -> str | None:
+    """Returns the new name of an old key, or of a key in an old section; None where nothing was renamed."""
+    for old, new in _RENAMED_KEYS.items():
+        if key == old or key.startswith(f"{old}."):
+            return new + key.removeprefix(old)
+    return None
+
+
+def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
+    """Returns one of pydantic's errors in the words of a scenario."""
+    field = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         allowed = _fields(item["loc"][:-1], model)
-        return TwinError(where, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
+        return TwinError(field, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
     value = item.get("input")
     shown = "" if isinstance(value, dict) else f"{value!r}: "
     if item["type"] == "missing":
-        return TwinError(where, "missing", "a value must be given")
-    return TwinError(where, f"{shown}not allowed", _ALLOWED.get(item["type"]) or item["msg"].removeprefix(_PREFIX))
+        return TwinError(field, "missing", "a value must be given")
+    return TwinError(field, f"{shown}not allowed", _ALLOWED.get(item["type"]) or item["msg"].removeprefix(_PREFIX))
 
 
 _PREFIX = "Input should be "
-#: What pydantic says in words of its own, in the words of a scenario.
+#: What a scenario allows where pydantic reports an error of this type; other messages are pydantic's own.
 _ALLOWED = {
     "model_type": "a section",
     "tuple_type": "a list",
     "dict_type": "a section",
-    "string_type": "a text",
-    "string_too_short": "a text that is not empty",
-    "int_type": "a whole number",
-    "int_parsing": "a whole number",
-    "int_from_float": "a whole number",
+    "string_type": "a string",
+    "string_too_short": "a non-empty string",
+    "int_type": "an integer",
+    "int_parsing": "an integer",
+    "int_from_float": "an integer",
     "float_type": "a number",
     "float_parsing": "a number",
     "bool_type": "true or false",
@@ -260,7 +270,7 @@ _ALLOWED = {
 
 
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
-    """Names of the keys allowed in the section at this place of the model."""
+    """Returns the names of the keys allowed in the section at this location in the model."""
     for part in location:
         if part not in model.model_fields:  # an item of a list, a key of a table
             continue
@@ -271,5 +281,6 @@ def _fields(location: Iterable[Any], model: Any) -> list[str]:
 
 
 def _hint(word: str, names: Sequence[str]) -> str:
+    """Returns ` (did you mean NAME?)` for the closest name, or "" where none is close."""
     close = difflib.get_close_matches(word, names, n=1)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
+from twin.core.settings import EstimatorSettings
 from twin.errors import TwinError
 
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
@@ -21,17 +22,19 @@ Vector3 = tuple[float, float, float]
 Metres = Annotated[float, Field(gt=0)]
 Efficiency = Annotated[float, Field(gt=0, le=1)]
 PerMetre = Annotated[float, Field(ge=0, le=100)]
-OffAxis = Annotated[float, Field(ge=0, le=90)]
-Share = Annotated[float, Field(ge=0, le=100)]
+OffAxisDeg = Annotated[float, Field(ge=0, le=90)]
+RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
 
 
 class Section(BaseModel):
+    """Base class of the sections: frozen, without unknown keys, finite numbers only."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
-    def _numbers_are_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        """A text or a truth value is no number, even where it could be read as one."""
+    def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Rejects strings and booleans as numbers, which pydantic would convert."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if kind in (float, int) and isinstance(value, str | bool):
             raise PydanticCustomError("float_type" if kind is float else "int_type", "a number")
@@ -39,17 +42,19 @@ class Section(BaseModel):
 
 
 class TerrainConfig(Section):
-    """The sea floor."""
+    """Sea floor."""
 
     kind: Literal["flat", "ripples", "fractal", "reef", "file"] = Field(
-        default="reef", description="generator, or a real DEM"
+        default="reef", description="generator of the heights, or file for a measured DEM"
     )
     size_m: tuple[Metres, Metres] = Field(
-        default=(10.0, 10.0), description="extent along x and y [m], centred at the origin"
+        default=(10.0, 10.0), description="extent along x and y, centred at the origin [m]"
     )
-    relief_m: float = Field(default=0.6, ge=0, le=20, description="highest minus lowest point of a generated floor [m]")
+    relief_m: float = Field(
+        default=0.6, ge=0, le=20, description="highest minus lowest point of a generated sea floor [m]"
+    )
     base_m: float = Field(
-        default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane [m]"
+        default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane z = 0 [m]"
     )
     grid_m: float = Field(default=0.05, gt=0.001, le=1, description="spacing of a generated height grid [m]")
     height_file: str | None = Field(
@@ -59,348 +64,418 @@ class TerrainConfig(Section):
         default=0.01, gt=0, le=10, description="grid spacing of a PNG or .npy height file [m]"
     )
     height_range_m: float = Field(
-        default=1.0, gt=0, le=1000, description="height of a PNG's full white over full black [m]"
+        default=1.0, gt=0, le=1000, description="height of full white above full black in a PNG height file [m]"
     )
     texture_file: str | None = Field(
-        default=None, description="any image, tiled over the floor; generated where missing"
+        default=None, description="image that is tiled over the sea floor; generated where missing"
     )
-    texture_px_m: float = Field(default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the floor [m]")
+    texture_px_m: float = Field(
+        default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the sea floor [m]"
+    )
 
 
 class VehicleConfig(Section):
-    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); drag factors let a study vary it."""
+    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); the factors let a study vary its hydrodynamics."""
 
     dynamics: Literal["rigid", "kinematic"] = Field(
         default="rigid",
-        description="a hull under thrust, drag and current; or a carrier that moves level, at constant height and at "
-        "exactly the commanded velocity, without any of them",
+        description="rigid: a rigid body under thrust, drag and current; kinematic: moves level, at constant height "
+        "and at exactly the commanded velocity, without forces",
     )
     buoyancy_n: float = Field(
-        default=1.0, ge=-20, le=20, description="net buoyancy after trimming, positive floats [N]"
+        default=1.0, ge=-20, le=20, description="net buoyancy after trimming, positive is upwards [N]"
     )
-    drag_factor: float = Field(default=1.0, ge=0.05, le=20, description="scales linear and quadratic drag")
-    added_mass_factor: float = Field(default=1.0, ge=0, le=5, description="scales the added mass")
+    drag_factor: float = Field(default=1.0, ge=0.05, le=20, description="multiplies linear and quadratic drag")
+    added_mass_factor: float = Field(default=1.0, ge=0, le=5, description="multiplies the added mass")
 
 
 class RigConfig(Section):
-    """The calibrated stereo pair, looking down, the top of the image towards the bow."""
+    """Calibrated stereo pair that looks down, the top of the image towards the bow."""
 
-    image_width_px: int = Field(default=320, ge=64, le=2048)
-    image_height_px: int = Field(default=240, ge=48, le=2048)
+    image_width_px: int = Field(default=320, ge=64, le=2048, description="image width [px]")
+    image_height_px: int = Field(default=240, ge=48, le=2048, description="image height [px]")
     hfov_deg: float = Field(default=60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
     baseline_m: float = Field(default=0.15, gt=0.005, le=3, description="distance between the cameras [m]")
     frame_rate_hz: float = Field(
-        default=30.0, ge=5, le=120, description="images a second; the control loop swings on much fewer [Hz]"
+        default=30.0, ge=5, le=120, description="frame rate; the control loop oscillates at much lower rates [Hz]"
     )
     mount_m: Vector3 = Field(
-        default=(0.0, 0.0, -0.15), description="middle of the pair in the body: forward, left, up [m]"
+        default=(0.0, 0.0, -0.15), description="midpoint of the cameras in the body frame: forward, left, up [m]"
     )
 
 
 class ImagingConfig(Section):
-    """How light becomes numbers."""
+    """Image formation."""
 
     fidelity: Literal["rendered", "surrogate"] = Field(
         default="rendered",
-        description="images are rendered, or their measurements drawn from calibrated errors a hundred times faster",
+        description="rendered: images are rendered and matched; surrogate: measurements are sampled from a fitted "
+        "error model, about a hundred times faster",
     )
     error_model: str | None = Field(
-        default=None, description="of the surrogate: a file that `twin fit-surrogate` wrote; the shipped one if none"
+        default=None, description="error model of the surrogate, a file of `twin fit-surrogate`; default: the built-in"
     )
     gray_level: float = Field(
-        default=0.45, gt=0.01, lt=1, description="mean image level that auto-exposure aims at (0 to 1)"
+        default=0.45, gt=0.01, lt=1, description="target of auto-exposure: mean image level, a fraction of full scale"
     )
     noise_sd: float = Field(
-        default=0.008, ge=0, le=0.5, description="read noise, as a share of full scale; without [sensor]"
+        default=0.008, ge=0, le=0.5, description="read noise, a fraction of full scale; unused with [sensor]"
     )
     shot_noise: float = Field(
-        default=0.006,
-        ge=0,
-        le=0.5,
-        description="shot noise at full scale, grows with the root of signal; without [sensor]",
-    )
-    shadows: bool = Field(default=False, description="the floor throws shadows in the light of each lamp")
+        default=0.006, ge=0, le=0.5,
+        description="shot noise at full scale, a fraction of it, proportional to the square root of the signal; "
+        "unused with [sensor]",
+    )  # fmt: skip
+    shadows: bool = Field(default=False, description="the sea floor casts shadows in the light of each lamp")
     forward_scatter: bool = Field(
-        default=False,
-        description="light scattered forward on its way to the eye arrives as a blur that grows with range",
+        default=False, description="light scattered forward on its path to the camera adds a blur that grows with range"
     )
 
 
 class SensorConfig(Section):
-    """A physical camera, in the terms of an EMVA 1288 data sheet; it takes the place of the noise in `imaging`.
+    """Physical image sensor in the terms of an EMVA 1288 data sheet; replaces the noise of [imaging].
 
-    The defaults are typical of a colour machine-vision camera with a global shutter and pixels of 3.45 um.
+    The defaults are typical of a colour machine-vision camera with a global shutter and 3.45 um pixels.
     """
 
-    exposure_min_ms: float = Field(default=0.05, gt=0, le=1000, description="shortest exposure [ms]")
+    exposure_min_ms: float = Field(default=0.05, gt=0, le=1000, description="shortest exposure time [ms]")
     exposure_max_ms: float = Field(
-        default=15.0, gt=0, le=1000, description="longest exposure, no longer than a frame; then gain makes up [ms]"
-    )
-    exposure_lag_s: float = Field(
-        default=0.5, ge=0, le=60, description="time in which auto-exposure makes up for all but 1/e of a change [s]"
-    )
+        default=15.0, gt=0, le=1000,
+        description="longest exposure time, at most the frame interval; beyond it the gain is raised [ms]",
+    )  # fmt: skip
+    exposure_lag_s: float = Field(default=0.5, ge=0, le=60, description="time constant (1/e) of auto-exposure [s]")
     gain_max_db: float = Field(
-        default=24.0, ge=0, le=60, description="largest analogue gain, 20 dB = 10 times; beyond it stays dark [dB]"
+        default=24.0, ge=0, le=60, description="largest analogue gain; 20 dB is a factor of 10 [dB]"
     )
-    f_number: float = Field(default=2.8, ge=0.7, le=64, description="focal length by aperture of the lens")
+    f_number: float = Field(default=2.8, ge=0.7, le=64, description="focal length divided by aperture diameter")
     pixel_um: float = Field(default=3.45, ge=0.5, le=100, description="side of a square pixel [um]")
     quantum_efficiency: tuple[Efficiency, Efficiency, Efficiency] = Field(
-        default=(0.4, 0.55, 0.45), description="electrons by photons for R, G, B, filters and lens included"
+        default=(0.4, 0.55, 0.45), description="electrons per photon for R, G, B, including filters and lens"
     )
     full_well_e: float = Field(
-        default=10000.0, ge=100, le=1e7, description="electrons a pixel holds; they fill the scale at gain 1"
+        default=10000.0, ge=100, le=1e7, description="full-well capacity, which is full scale at gain 1 [e-]"
     )
-    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="noise of reading a pixel, in the dark [e-]")
-    bits: Literal[8, 12] = Field(default=12, description="of a raw digital number; frames leave with 8 in any case")
-    bayer: bool = Field(default=True, description="one band a pixel (RGGB), the others interpolated; else all three")
+    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="read noise of a pixel, in the dark [e-]")
+    bits: Literal[8, 12] = Field(
+        default=12, description="bit depth of the analogue-to-digital converter; delivered images have 8 bits"
+    )
+    bayer: bool = Field(
+        default=True, description="Bayer filter (RGGB) with interpolated colours; false: three bands per pixel"
+    )
     vignetting_power: float = Field(
-        default=4.0, ge=0, le=8, description="light falls with this power of the cosine of the view; 4 by nature, 0 off"
-    )
-    motion_blur: bool = Field(default=True, description="what moves during the exposure is smeared")
+        default=4.0, ge=0, le=8,
+        description="irradiance falls with this power of the cosine of the field angle; 4: natural vignetting, 0: none",
+    )  # fmt: skip
+    motion_blur: bool = Field(default=True, description="motion during the exposure blurs the image")
     readout_ms: float = Field(
-        default=0.0, ge=0, le=1000, description="rolling shutter: from the first row to the last; 0 = all at once [ms]"
+        default=0.0, ge=0, le=1000, description="rolling shutter: first to last row; 0 is a global shutter [ms]"
     )
 
 
 class LensConfig(Section):
-    """True distortion of both lenses (Brown-Conrady as in OpenCV); frames are rectified by what is believed of it.
+    """True distortion of both lenses (Brown-Conrady as in OpenCV); images are rectified with its calibrated value.
 
-    The coefficients are of tangents in the air behind a port, in water where there is none.
+    The coefficients apply to tangents of field angles: in the air behind a port, in water where there is none.
     """
 
-    k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, of r^2")
-    k2: float = Field(default=0.0, ge=-5, le=5, description="radial distortion, of r^4")
-    k3: float = Field(default=0.0, ge=-10, le=10, description="radial distortion, of r^6")
-    p1: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion, along the columns")
-    p2: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion, along the rows")
+    k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, coefficient of r^2")
+    k2: float = Field(default=0.0, ge=-5, le=5, description="radial distortion, coefficient of r^4")
+    k3: float = Field(default=0.0, ge=-10, le=10, description="radial distortion, coefficient of r^6")
+    p1: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the columns")
+    p2: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the rows")
 
 
 class PortConfig(Section):
-    """The window in front of each lens, which bends every ray twice.
+    """Window in front of each lens, which refracts every ray twice.
 
-    The rig's field of view is that of the pinhole in water which agrees with the image near the middle of a straight
-    port, at every distance; the position of a camera is that pinhole's.
+    The rig's field of view is that of the pinhole in water which matches the image near its centre behind an untilted
+    port, at every distance. The position of a camera is the position of that pinhole.
     """
 
     kind: Literal["none", "flat", "dome"] = Field(
-        default="none", description="none: pinhole in water; flat pane; dome of concentric spheres"
+        default="none", description="none: pinhole in water; flat: plane port; dome: concentric spheres"
     )
-    thickness_m: float = Field(default=0.01, gt=0, le=0.2, description="of the glass [m]")
+    thickness_m: float = Field(default=0.01, gt=0, le=0.2, description="thickness of the glass [m]")
     distance_m: float = Field(
-        default=0.02, gt=0, le=1, description="flat: from the entrance pupil of the lens to the glass [m]"
+        default=0.02, gt=0, le=1, description="flat: distance from the entrance pupil of the lens to the glass [m]"
     )
     tilt_deg: float = Field(
-        default=0.0, ge=-30, le=30, description="flat: turn about the image's rows, lower side away from the lens [deg]"
-    )
+        default=0.0, ge=-30, le=30,
+        description="flat: rotation about the image rows, positive moves the lower side away from the lens [deg]",
+    )  # fmt: skip
     radius_m: float = Field(default=0.05, gt=0, le=1, description="dome: inner radius [m]")
     offset_m: Vector3 = Field(
-        default=(0.0, 0.0, 0.0), description="dome: its centre from the entrance pupil: right, down, forward [m]"
+        default=(0.0, 0.0, 0.0),
+        description="dome: centre relative to the entrance pupil, along right, down, forward [m]",
     )
-    glass_index: float = Field(default=1.49, ge=1, le=3, description="refractive index: acrylic 1.49, glass 1.52")
+    glass_index: float = Field(
+        default=1.49, ge=1, le=3, description="refractive index of the port: acrylic 1.49, glass 1.52"
+    )
     water_index: float = Field(default=1.339, ge=1, le=2, description="refractive index of sea water")
     calibrated_at_m: float = Field(
         default=0.0, ge=0, le=100,
-        description="frames are rectified for what lies at this depth, as by a calibration in water; 0 = the port is "
-        "believed to be a change of focal length [m]",
+        description="depth for which images are rectified exactly, as after a calibration in water; 0: the port is "
+        "modelled as a change of focal length [m]",
     )  # fmt: skip
 
 
 class CalibrationErrorConfig(Section):
-    """Errors of calibration: by what the true cameras differ from those that the estimators believe in."""
+    """Calibration error: true camera parameters minus those that the estimators use."""
 
-    focal_error: float = Field(default=0.0, ge=-0.2, le=0.2, description="of both focal lengths, a share of it")
+    focal_error: float = Field(
+        default=0.0, ge=-0.2, le=0.2, description="relative error of the focal length of both cameras"
+    )
     left_principal_point_error_px: Vector2 = Field(
-        default=(0.0, 0.0), description="of the left image: to the right, down [px]"
+        default=(0.0, 0.0), description="error of the left principal point, to the right and down [px]"
     )
     right_principal_point_error_px: Vector2 = Field(
-        default=(0.0, 0.0), description="of the right image: to the right, down [px]"
+        default=(0.0, 0.0), description="error of the right principal point, to the right and down [px]"
     )
-    baseline_error: float = Field(default=0.0, ge=-0.5, le=0.5, description="of the baseline, a share of it")
+    baseline_error: float = Field(default=0.0, ge=-0.5, le=0.5, description="relative error of the baseline")
     right_roll_deg: float = Field(
-        default=0.0, ge=-5, le=5, description="turn of the right camera about its axis, clockwise from behind [deg]"
-    )
-    right_pitch_deg: float = Field(default=0.0, ge=-5, le=5, description="turn of the right camera, upwards [deg]")
+        default=0.0, ge=-5, le=5,
+        description="rotation of the right camera about its optical axis, clockwise as seen from behind [deg]",
+    )  # fmt: skip
+    right_pitch_deg: float = Field(default=0.0, ge=-5, le=5, description="upward rotation of the right camera [deg]")
     right_yaw_deg: float = Field(
-        default=0.0, ge=-5, le=5, description="turn of the right camera, away from the left one [deg]"
+        default=0.0, ge=-5, le=5, description="rotation of the right camera away from the left one [deg]"
     )
-    k1_error: float = Field(default=0.0, ge=-2, le=2, description="of the believed lens.k1: the true one less it")
-    k2_error: float = Field(default=0.0, ge=-5, le=5, description="of the believed lens.k2: the true one less it")
+    k1_error: float = Field(default=0.0, ge=-2, le=2, description="true lens.k1 minus its calibrated value")
+    k2_error: float = Field(default=0.0, ge=-5, le=5, description="true lens.k2 minus its calibrated value")
 
 
 class WaterConfig(Section):
-    """Inherent optical properties of the water, for R, G, B: of a Jerlov type, or of your own."""
+    """Inherent optical properties of the water for R, G, B: of a Jerlov type, or given here."""
 
     jerlov: JERLOV = Field(default="IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
-    turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies scattering")
+    turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies the scattering coefficient")
     absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
-        default=None, description="absorption for R, G, B in place of the type's, with scattering_per_m [1/m]"
+        default=None,
+        description="absorption coefficient for R, G, B in place of the Jerlov type's; needs scattering_per_m [1/m]",
     )
     scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
-        default=None, description="scattering for R, G, B in place of the type's, with absorption_per_m [1/m]"
+        default=None,
+        description="scattering coefficient for R, G, B in place of the Jerlov type's; needs absorption_per_m [1/m]",
     )
     spectrum_file: str | None = Field(
         default=None,
-        description="CSV of wavelength [nm], absorption and scattering [1/m] in place of the type's; ${TWIN_DATA} is "
-        "expanded",
+        description="CSV of wavelength [nm], absorption and scattering [1/m] in place of the Jerlov type's; "
+        "${TWIN_DATA} is expanded",
     )
     mean_cosine: float = Field(
-        default=0.924, ge=0, le=0.99, description="of the angle of scattering (Henyey-Greenstein's g); 0 = even"
-    )
+        default=0.924, ge=0, le=0.99,
+        description="mean cosine of the scattering angle (Henyey-Greenstein's g); 0 is isotropic",
+    )  # fmt: skip
     kept_share: float = Field(
         default=0.0, ge=0, le=1,
-        description="share k of scattered light that stays in the light on its way (multiple scattering): attenuation "
-        "is a + (1 - k) b, from the beam's c (0) to absorption alone (1); 0.74 keeps what turns by less than 15 deg",
+        description="fraction k of the scattered light that stays in the beam (multiple scattering): attenuation is "
+        "a + (1 - k) b, from the beam attenuation c (k = 0) to absorption alone (k = 1); 0.74 keeps scattering "
+        "angles below 15 deg",
     )  # fmt: skip
 
     @property
     def label(self) -> str:
-        """What the water is called."""
+        """Name of the water in reports."""
         own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
         return f"{own or self.jerlov}, turbidity {self.turbidity:g}"
 
 
 class LampConfig(Section):
-    """A lamp on the vehicle."""
+    """Lamp on the vehicle."""
 
-    position_m: Vector3 = Field(description="in the body: forward, left, up [m]")
+    position_m: Vector3 = Field(description="position in the body frame: forward, left, up [m]")
     tilt_deg: float = Field(
-        default=0.0, ge=-90, le=90, description="beam axis from straight down towards the bow [deg]"
+        default=0.0, ge=-90, le=90, description="tilt of the beam axis from straight down towards the bow [deg]"
     )
-    pan_deg: float = Field(default=0.0, ge=-90, le=90, description="beam axis from straight down towards port [deg]")
-    intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the axis [cd]")
-    beam: tuple[tuple[OffAxis, Share], ...] = Field(
+    pan_deg: float = Field(
+        default=0.0, ge=-90, le=90, description="tilt of the beam axis from straight down towards port [deg]"
+    )
+    intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the beam axis [cd]")
+    beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(
         default=(),
-        description="pairs of angle off the axis [deg], from 0, and intensity as a share of that on it, straight "
-        "between and dark beyond; empty = a measured LED",
+        description="beam pattern: pairs of angle off the axis [deg], from 0, and intensity relative to the axis, "
+        "interpolated linearly, dark beyond the last angle; empty: a measured LED",
     )
     colour_temperature_k: float = Field(
-        default=6500.0, ge=1000, le=40000, description="of a black body; 6500 is white, intensity stays [K]"
-    )
+        default=6500.0, ge=1000, le=40000,
+        description="colour temperature; 6500 is white; the luminous intensity does not change with it [K]",
+    )  # fmt: skip
 
 
 class SunConfig(Section):
     """Daylight from straight above."""
 
-    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="white daylight [lx]")
+    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="illuminance of white daylight [lx]")
     depth_m: float = Field(
         default=0.0, ge=0, le=500,
-        description="of the reference plane z = 0 below the surface, where the daylight is told: the water takes from "
-        "it on its way down; 0 = it is told on the floor, and even [m]",
+        description="depth of the reference plane z = 0 below the surface, where illuminance_lx applies; the water "
+        "attenuates it on the way down; 0: illuminance_lx applies on the sea floor, at every height [m]",
     )  # fmt: skip
     caustics: float = Field(
         default=0.0, ge=0, le=1,
-        description="share of the daylight that comes from the sun itself and is focused by waves; needs depth_m",
+        description="fraction of the daylight that is direct sunlight, which waves focus; needs depth_m",
     )  # fmt: skip
 
 
 class SnowConfig(Section):
     """Marine snow: white particles that drift with the current through the light."""
 
-    density_per_m3: float = Field(default=0.0, ge=0, le=5000, description="particles in a cubic metre; 0 = none [1/m3]")
-    diameter_m: float = Field(default=0.001, ge=0.0001, le=0.02, description="size of a particle [m]")
-    albedo: float = Field(default=0.5, gt=0, le=1, description="brightness: share of the light that it sends back")
+    density_per_m3: float = Field(default=0.0, ge=0, le=5000, description="particles per cubic metre; 0: none [1/m3]")
+    diameter_m: float = Field(default=0.001, ge=0.0001, le=0.02, description="diameter of a particle [m]")
+    albedo: float = Field(default=0.5, gt=0, le=1, description="albedo of a particle, the fraction of light reflected")
 
 
 class CurrentConfig(Section):
     """Steady, irrotational current."""
 
-    velocity_mps: Vector3 = Field(default=(0.0, 0.0, 0.0), description="east, north, up [m/s]")
+    velocity_mps: Vector3 = Field(default=(0.0, 0.0, 0.0), description="velocity: east, north, up [m/s]")
 
 
 class NavigationConfig(Section):
-    """Navigation sensors: all are simulated; only those in `aiding` reach the estimators."""
+    """Navigation sensors: all are simulated; the estimators get the readings of those in `aiding`."""
 
-    aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty = vision only")
-    pressure_sigma_m: float = Field(default=0.01, gt=0, le=10, description="noise of height by pressure [m]")
-    attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30, description="noise of roll and pitch [deg]")
-    heading_sigma_deg: float = Field(default=0.5, gt=0, le=90, description="noise of heading [deg]")
+    aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty: vision only")
+    pressure_sigma_m: float = Field(
+        default=0.01, gt=0, le=10, description="standard deviation of the height from the pressure sensor [m]"
+    )
+    attitude_sigma_deg: float = Field(
+        default=0.2, gt=0, le=30, description="standard deviation of roll and pitch from the AHRS [deg]"
+    )
+    heading_sigma_deg: float = Field(
+        default=0.5, gt=0, le=90, description="standard deviation of the heading from the AHRS [deg]"
+    )
     dvl_sigma_mps: float = Field(
-        default=SensorNoise.dvl_mps, gt=0, le=10, description="noise of each axis of the velocity over ground [m/s]"
-    )
+        default=SensorNoise.dvl_mps, gt=0, le=10,
+        description="standard deviation of each axis of the velocity over ground from the DVL [m/s]",
+    )  # fmt: skip
     dvl_scale_sigma: float = Field(
-        default=SensorNoise.dvl_scale, gt=0, le=0.1, description="scale error of that velocity, drawn once a survey"
-    )
+        default=SensorNoise.dvl_scale, gt=0, le=0.1,
+        description="standard deviation of the relative scale error of that velocity, constant during a survey",
+    )  # fmt: skip
     usbl_sigma_m: float = Field(
-        default=SensorNoise.usbl_m, gt=0, le=100, description="noise of each axis of an acoustic position fix [m]"
-    )
+        default=SensorNoise.usbl_m, gt=0, le=100,
+        description="standard deviation of each axis of an acoustic position fix [m]",
+    )  # fmt: skip
     usbl_interval_s: float = Field(
-        default=1.0, gt=0, le=3600, description="least time between acoustic fixes, each taken at a keyframe [s]"
+        default=1.0, gt=0, le=3600, description="shortest time between acoustic fixes, each taken at a keyframe [s]"
     )
     beacon_sigma_px: float = Field(
-        default=SensorNoise.beacon_px, gt=0, le=50, description="noise of a beacon's column and row in the image [px]"
-    )
+        default=SensorNoise.beacon_px, gt=0, le=50,
+        description="standard deviation of column and row of a beacon in the image [px]",
+    )  # fmt: skip
 
 
 class BeaconConfig(Section):
-    """A small light at a surveyed position."""
+    """Small light at a surveyed position."""
 
-    position_m: Vector3 = Field(description="in the world: east, north, up [m]")
+    position_m: Vector3 = Field(description="position in the world: east, north, up [m]")
 
 
 class PlanConfig(Section):
-    """The survey to fly (Negahdaripour & Madjidi 2003, sections III and III-A)."""
+    """Survey pattern to fly (Negahdaripour & Madjidi 2003, sections III and III-A)."""
 
     pattern: Literal["lawnmower", "loops"] = Field(
-        default="lawnmower", description="parallel legs, or loops that cross at the start in the middle of a disc"
+        default="lawnmower",
+        description="lawnmower: parallel legs; loops: loops that cross at the start in the centre of a disc",
     )
     area_m: tuple[Metres, Metres] = Field(
         default=(4.0, 2.0),
-        description="extent along x (the legs) and y, centred; of loops both are the diameter of the disc [m]",
+        description="extent along x (along the legs) and y, centred at the origin; for loops, both are the diameter "
+        "of the disc [m]",
     )
     altitude_m: float = Field(
         default=2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
     )
     speed_mps: float = Field(
-        default=0.25, gt=0.01, le=2, description="speed along legs and loops; on tight loops less [m/s]"
+        default=0.25, gt=0.01, le=2, description="speed along legs and loops; lower on tight loops [m/s]"
     )
-    overlap_along: float = Field(default=0.9, gt=0, lt=1, description="overlap of consecutive keyframes")
-    overlap_across: float = Field(default=0.8, gt=0, lt=1, description="overlap of neighbouring swaths")
+    overlap_along: float = Field(
+        default=0.9, gt=0, lt=1, description="overlap of consecutive keyframes, a fraction of the footprint"
+    )
+    overlap_across: float = Field(
+        default=0.8, gt=0, lt=1, description="sidelap of neighbouring swaths, a fraction of the footprint"
+    )
     tracks: int = Field(
-        default=0, ge=0, le=1000, description="tracks to fly (two legs or a loop each); 0 fills the area"
+        default=0, ge=0, le=1000, description="number of tracks (two legs, or one loop); 0: enough to cover the area"
     )
-    clearance_m: float = Field(default=0.3, ge=0, le=10, description="least distance of the cameras to the floor [m]")
+    clearance_m: float = Field(
+        default=0.3, ge=0, le=10, description="smallest vertical distance of the cameras to the sea floor [m]"
+    )
 
 
 class ControlConfig(Section):
     """Trajectory following and station keeping."""
 
     hold_s: float = Field(
-        default=2.0, ge=0.1, le=600, description="station keeping at the end of a track, while GA runs [s]"
+        default=2.0, ge=0.1, le=600, description="station keeping at the end of a track, during global alignment [s]"
     )
-    natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10, description="closed-loop bandwidth [rad/s]")
+    natural_frequency_radps: float = Field(
+        default=1.2, gt=0.05, le=10, description="natural frequency of the closed position loop [rad/s]"
+    )
 
 
 class EstimateConfig(Section):
-    """F2F, F2M, the keyframe network and global alignment."""
+    """F2F, F2M, the keyframe network and global alignment (GA)."""
 
     window_tracks: int = Field(
-        default=4, ge=0, le=1000, description="previous tracks in the window of global alignment"
+        default=EstimatorSettings.window_tracks, ge=0, le=1000,
+        description="number of previous tracks in the window of global alignment",
+    )  # fmt: skip
+    node_stride: int = Field(
+        default=EstimatorSettings.node_stride, ge=1, le=20, description="every n-th keyframe is a node of the network"
     )
-    node_stride: int = Field(default=1, ge=1, le=20, description="every n-th keyframe is a node of the network")
-    min_overlap: float = Field(default=0.45, gt=0, lt=1, description="least true overlap of linked nodes")
-    max_links: int = Field(default=7, ge=1, le=50, description="most links of a node to earlier ones")
-    use_f2m: bool = Field(default=True, description="correct the position at keyframes by registration with the mosaic")
-    use_ga: bool = Field(default=True, description="global alignment at the end of each track and of the survey")
-    points: int = Field(default=500, ge=30, le=5000, description="most matched points of a keyframe")
-    patch_px: int = Field(default=11, ge=7, le=61, description="window of matching, one for stereo and flow alike [px]")
+    min_overlap: float = Field(
+        default=EstimatorSettings.min_overlap, gt=0, lt=1,
+        description="smallest overlap of linked nodes, the fraction of a node's matched points that both images show",
+    )  # fmt: skip
+    max_links: int = Field(
+        default=EstimatorSettings.max_links, ge=1, le=50,
+        description="largest number of links from a node to earlier nodes",
+    )  # fmt: skip
+    use_f2m: bool = Field(
+        default=EstimatorSettings.use_f2m, description="register keyframes with the mosaic to correct the position"
+    )
+    use_ga: bool = Field(
+        default=EstimatorSettings.use_ga, description="global alignment at the end of each track and of the survey"
+    )
+    points: int = Field(
+        default=EstimatorSettings.points, ge=30, le=5000, description="largest number of matched points of a keyframe"
+    )
+    patch_px: int = Field(
+        default=EstimatorSettings.patch_px, ge=7, le=61,
+        description="side of the matching window, the same for stereo and optical flow [px]",
+    )  # fmt: skip
 
 
 class MapConfig(Section):
-    """The Kalman depth map and its composition."""
+    """Elevation map from Kalman depth filters."""
 
-    cell_m: float = Field(default=0.02, gt=0.001, le=1, description="cell of the elevation map [m]")
+    cell_m: float = Field(default=0.02, gt=0.001, le=1, description="cell size of the elevation map [m]")
 
 
 class Source(BaseModel):
-    """Where a scenario came from, so that a fault found later can still be told with file and line."""
+    """Origin of a scenario's keys, for the file and line of error messages.
+
+    Args:
+        path: file of the scenario.
+        lines: line number of each dotted key of that file.
+        overrides: `key=value` of the command line.
+    """
 
     path: Path
     lines: dict[str, int] = {}
     overrides: tuple[str, ...] = ()
 
-    def fault(self, error: TwinError) -> str:
-        """`FILE:LINE: key: what is wrong (allowed: ...)`; the line is of the nearest enclosing key that is there."""
-        if any(o.split("=", 1)[0].strip().replace('"', "") == error.field for o in self.overrides):
+    def describe(self, error: TwinError) -> str:
+        """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, or `--set: ...` for an overridden key.
+
+        The line is that of the key, or of the innermost section in the file that contains it.
+        """
+        overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
+        in_overridden_section = error.field not in self.lines and any(
+            k.startswith(f"{error.field}.") for k in overridden
+        )
+        if error.field in overridden or in_overridden_section:
             return f"--set: {error}"
         key = error.field
         while key not in self.lines and "." in key:
@@ -411,20 +486,20 @@ class Source(BaseModel):
 class Scenario(Section):
     """One survey, fully described."""
 
-    name: str = Field(default="survey", min_length=1, max_length=80)
-    seed: int = Field(default=0, ge=0, lt=2**32)
+    name: str = Field(default="survey", min_length=1, max_length=80, description="name of the survey")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="seed of all random numbers")
     terrain: TerrainConfig = TerrainConfig()
     vehicle: VehicleConfig = VehicleConfig()
     rig: RigConfig = RigConfig()
     imaging: ImagingConfig = ImagingConfig()
     sensor: SensorConfig | None = Field(
-        default=None, description="a physical camera instead of noise by shares of full scale"
+        default=None, description="physical image sensor; default: noise as fractions of full scale, from [imaging]"
     )
     lens: LensConfig = LensConfig()
     port: PortConfig = PortConfig()
     calibration_error: CalibrationErrorConfig = CalibrationErrorConfig()
     water: WaterConfig = WaterConfig()
-    lamps: tuple[LampConfig, ...] = ()
+    lamps: tuple[LampConfig, ...] = Field(default=(), description="lamps on the vehicle")
     sun: SunConfig = SunConfig()
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
@@ -433,18 +508,18 @@ class Scenario(Section):
     control: ControlConfig = ControlConfig()
     estimate: EstimateConfig = EstimateConfig()
     map: MapConfig = MapConfig()
-    beacons: tuple[BeaconConfig, ...] = ()
+    beacons: tuple[BeaconConfig, ...] = Field(default=(), description="small lights at surveyed positions")
     require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
 
     @property
     def source(self) -> Source:
-        """Where the scenario was read, for faults that are found later."""
+        """Origin of the scenario, for error messages."""
         return self._source
 
     def believed_rig(self) -> StereoRig:
-        """The rig's calibration as the estimators know it."""
+        """Returns the calibrated rig as the estimators use it, without the calibration error."""
         rig = self.rig
         focal_px = rig.image_width_px / 2 / float(_tan_deg(rig.hfov_deg / 2))
         forward, left, up = rig.mount_m
@@ -459,7 +534,7 @@ class Scenario(Section):
         )
 
     def believed_noise(self) -> SensorNoise:
-        """The navigation sensors' data sheet and the survey of the beacons as the estimators know them."""
+        """Returns the noise of the navigation sensors and the positions of the beacons as the estimators use them."""
         navigation = self.navigation
         return SensorNoise(
             navigation.pressure_sigma_m,
@@ -472,8 +547,12 @@ class Scenario(Section):
             tuple(beacon.position_m for beacon in self.beacons),
         )
 
+    def estimator_settings(self) -> EstimatorSettings:
+        """Returns the settings of the estimators."""
+        return EstimatorSettings(**self.estimate.model_dump())
+
     def fingerprint(self) -> str:
-        """Hash of the resolved scenario: equal hash and seed, equal survey."""
+        """Returns a hash of all values; scenarios with the same hash give the same survey."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 

@@ -1,105 +1,91 @@
-"""After the flight: final alignment, map, judgement, and the run folder."""
+"""Conclusion of a survey: final alignment, map, comparison with the truth, and the run folder."""
 
 from __future__ import annotations
 
 import resource
-import time
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from twin.core.geometry import Array
-from twin.core.records import ElevationMap, SurveyResult, Truth
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
-from twin.judge.metrics import evaluate
-from twin.report.run_writer import RunFolder
+from twin.judge.metrics import EvaluationInput, evaluate
+from twin.report.run_writer import RunFolder, SurveyRecord
+from twin.session.monitor import SurveyMonitor
 from twin.world.mission import Mission
 from twin.world.world import World
 
 
 class RunResult(NamedTuple):
-    """A survey's outcome: "complete" or "aborted", its figures (metrics.json) and its folder."""
+    """Outcome of a survey: status "complete" or "aborted", its metrics (metrics.json), and its folder."""
 
     status: str
     metrics: dict[str, Any]
     folder: Path
 
 
-def conclude(
-    mission: Mission,
-    folder: RunFolder,
-    navigator: Navigator,
-    world: World,
-    watch: Stopwatch,
-    begun: float,
-    reason: str,
-    say: Callable[[str, float], None],
-) -> RunResult:
-    """Aligns, maps, judges and writes what was flown; `reason` tells why it ended early ("" if it did not)."""
+class Flight(NamedTuple):
+    """A survey that has been flown.
+
+    Args:
+        stopwatch: durations of the stages.
+        reason: why the survey was aborted; "" if it is complete.
+    """
+
+    mission: Mission
+    world: World
+    navigator: Navigator
+    stopwatch: Stopwatch
+    reason: str
+
+
+def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
+    """Aligns all keyframes, builds the map, compares with the truth, and writes the run folder."""
+    mission, world, navigator, stopwatch, reason = flight
     try:
         result = navigator.finish()
     except (SurveyAborted, OSError) as error:
         result, reason = navigator.finish(), reason or str(error)
-    for link in navigator.dropped:
+    for link in navigator.network.history.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
     for alignment in result.alignments:
         folder.log("aligned", **alignment._asdict())
-    with watch("map"):
-        elevation = make_map(mission, navigator, result, lambda share: say("map", share))
-    wall_s = time.perf_counter() - begun
-    truth, said = world.truth(), {"reason": reason, "warning": "; ".join(world.warnings)}
-    metrics = _judge(mission, result, elevation, truth, watch, wall_s, said)
-    say("report", 0.0)
-    metrics = folder.finish(mission, result, elevation, truth, watch, metrics)
+    with stopwatch("map"):
+        elevation = navigator.build_map(result, mission.grid, lambda share: monitor.report_stage("map", share))
+    wall_s = monitor.wall_s
+    truth, scenario = world.truth(), mission.scenario
+    plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
+    timing = _timing(len(result.online) / mission.rig.frame_rate_hz, wall_s, stopwatch)
+    identity = _identity(mission, reason, "; ".join(world.warnings))
+    metrics = evaluate(EvaluationInput(result, elevation, truth, mission.rig, plan, timing, identity, scenario.require))
+    monitor.report_stage("report", 0.0)
+    n_frames_per_keyframe = mission.plan.n_frames_per_keyframe
+    metrics = folder.finish(
+        SurveyRecord(result, elevation, truth, mission.grid, mission.start, n_frames_per_keyframe, stopwatch, metrics)
+    )
     return RunResult(metrics["status"], metrics, folder.path)
 
 
-def make_map(
-    mission: Mission, navigator: Navigator, result: SurveyResult, say: Callable[[float], None]
-) -> ElevationMap | None:
-    """The map along the final trajectory; None where no keyframe was reached. `say` is told the share done."""
-    n_keyframes = len(result.keyframe_rows)
-    if n_keyframes == 0:
-        return None
-    return navigator.vision.build_map(result, mission.grid, _step_cov(result), lambda done: say(done / n_keyframes))
-
-
-def _step_cov(result: SurveyResult) -> Array:
-    """(n, 6, 6) covariance of each keyframe relative to the one before, as their link measured it."""
-    cov = np.zeros((len(result.keyframe_rows), 6, 6))
-    chain = result.links.j == result.links.i + 1
-    cov[result.links.j[chain]] = result.links.own_cov[chain]
-    return cov
-
-
-def _judge(
-    mission: Mission,
-    result: SurveyResult,
-    elevation: ElevationMap | None,
-    truth: Truth,
-    watch: Stopwatch,
-    wall_s: float,
-    said: dict[str, str],
-) -> dict[str, Any]:
-    scenario = mission.scenario
-    timing = {
+def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
+    """Returns simulated and wall time, peak memory, and the durations of the processing stages."""
+    return {
         "wall_s": wall_s,
-        "simulated_s": len(result.online) / mission.rig.frame_rate_hz,
+        "simulated_s": simulated_s,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "stages": watch.summary(),
+        "stages": stopwatch.summary(),
     }
-    identity = {
+
+
+def _identity(mission: Mission, reason: str, warning: str) -> dict[str, Any]:
+    """Returns name, seed, version, scenario hash, status, reason of an abort, and warning of a survey."""
+    scenario = mission.scenario
+    return {
         "name": scenario.name,
         "seed": scenario.seed,
         "version": version("seabed-twin"),
         "scenario_hash": scenario.fingerprint(),
-        "status": "aborted" if said["reason"] else "complete",
-        **said,
+        "status": "aborted" if reason else "complete",
+        "reason": reason,
+        "warning": warning,
     }
-    plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
-    return evaluate(result, elevation, truth, mission.rig, plan, timing, identity, scenario.require)

@@ -1,1 +1,1 @@
-"""Physics of the vehicle in water."""
+"""Physics of the vehicle in water, and its navigation sensors."""

@@ -1,4 +1,4 @@
-"""Our vehicle as a body in water: its trimmed hull, and the step and the limits of its physics."""
+"""Hull of the BlueROV2 with the trim of a scenario; timestep and velocity limits of the physics."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hydrodynamics import Hull, angular_first
 
-COARSEST_STEP_S = 1 / 120
+MAX_TIMESTEP_S = 1 / 120
 GRAVITY_MPS2 = 9.81
-SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far beyond anything that swims: the physics has diverged
+SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far beyond any underwater vehicle: the physics has diverged
 
 
 def physics_timestep_s(frame_rate_hz: float) -> float:
-    """The longest step up to 1/120 s of which a whole number makes a frame."""
-    return 1 / (frame_rate_hz * math.ceil(1 / (frame_rate_hz * COARSEST_STEP_S) - 1e-9))
+    """Returns the longest timestep up to 1/120 s that divides the frame period into a whole number of steps."""
+    return 1 / (frame_rate_hz * math.ceil(1 / (frame_rate_hz * MAX_TIMESTEP_S) - 1e-9))
 
 
-def hull_of(vehicle: VehicleConfig) -> Hull:
-    """The trimmed hull of a scenario."""
+def trimmed_hull(vehicle: VehicleConfig) -> Hull:
+    """Returns the BlueROV2 hull with the buoyancy and the drag and added mass factors of a scenario."""
     rov = BLUEROV2_HEAVY
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(
         inertia=np.array([*rov.inertia_kgm2, rov.mass_kg, rov.mass_kg, rov.mass_kg]),
-        added=vehicle.added_mass_factor * angular_first(rov.added_mass),
+        added_inertia=vehicle.added_mass_factor * angular_first(rov.added_mass),
         linear_drag=vehicle.drag_factor * angular_first(rov.linear_damping),
         quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_damping),
         centre_of_buoyancy_m=np.array(rov.centre_of_buoyancy_m),

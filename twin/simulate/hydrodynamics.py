@@ -2,10 +2,10 @@
 
     (M_RB + M_A) nu' + C_RB(nu) nu + C_A(nu_r) nu_r + M_A w x R'v_c + D(nu_r) nu_r + g(R) = tau,   nu_r = nu - R'v_c
 
-Twists are [angular, linear] velocity of the centre of gravity in body axes, wrenches [moment, force]. The fifth term is
-M_A times what the body's rotation does to a steady current seen in body axes: without it the same motion would feel
-other forces in a moving body of water than in a still one. Added mass is solved for, never fed back from the last
-step's acceleration, which is unstable once it exceeds the mass.
+A twist is the [angular, linear] velocity of the centre of gravity in body axes, a wrench is [moment, force]. The fourth
+term accounts for the rate of change of a steady current in rotating body axes: without it, the dynamics would not be
+Galilean invariant. The equation is solved for nu' including added mass; feeding back
+the acceleration of the last step would be unstable where added mass exceeds mass.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ Array = NDArray[np.float64]
 
 
 class Hull(NamedTuple):
-    """A hull whose axes are its principal axes, origin in the centre of gravity.
+    """Parameters of a hull; the body axes are its principal axes, with the origin in the centre of gravity.
 
     Args:
         inertia: (6,) moments of inertia [kg m2], then the mass three times [kg].
-        added: (6,) added moments of inertia [kg m2], then added masses [kg].
+        added_inertia: (6,) added moments of inertia [kg m2], then added masses [kg].
         linear_drag: (6,) [N m s/rad], [N s/m], positive.
         quadratic_drag: (6,) [N m s2/rad2], [N s2/m2], positive.
         centre_of_buoyancy_m: (3,) in the body.
-        weight_n, buoyancy_n: whole weight and whole buoyancy.
+        weight_n, buoyancy_n: weight and buoyancy force.
     """
 
     inertia: Array
-    added: Array
+    added_inertia: Array
     linear_drag: Array
     quadratic_drag: Array
     centre_of_buoyancy_m: Array
@@ -41,13 +41,13 @@ class Hull(NamedTuple):
 
 
 def angular_first(linear_first: Array) -> Array:
-    """[roll, pitch, yaw, surge, sway, heave] of [surge, sway, heave, roll, pitch, yaw]: (6, ...) -> (6, ...)."""
+    """Reorders (6, ...) from [surge, sway, heave, roll, pitch, yaw] to [roll, pitch, yaw, surge, sway, heave]."""
     return np.roll(linear_first, 3, axis=0)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: int) -> None:
-    """out[at:at+3] += sign * a[i:i+3] x b[j:j+3]"""
+    """Adds a cross product in place: out[at:at+3] += sign * a[i:i+3] x b[j:j+3]."""
     out[at] += sign * (a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1])
     out[at + 1] += sign * (a[i + 2] * b[j] - a[i] * b[j + 2])
     out[at + 2] += sign * (a[i] * b[j + 1] - a[i + 1] * b[j])
@@ -55,14 +55,14 @@ def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: 
 
 @njit(cache=True, nogil=True)
 def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: Array, wrench: Array) -> Array:
-    """Solves the equation of motion for nu' in body axes [rad/s2, m/s2].
+    """Solves the equation of motion for the acceleration nu' (6,) in body axes [rad/s2, m/s2].
 
     Args:
-        hull: the hull.
+        hull: parameters of the hull.
         world_from_body: (3, 3) rotation.
         twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
         current_mps: (3,) steady current in the world.
-        wrench: (6,) of the thrusters in the body [N m, N].
+        wrench: (6,) wrench of the thrusters in the body [N m, N].
     """
     flow = np.zeros(6)  # R'v_c
     up = np.zeros(3)
@@ -71,10 +71,14 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
         for i in range(3):
             flow[3 + k] += world_from_body[i, k] * current_mps[i]
     relative = twist - flow
-    momentum, added_momentum = hull.inertia * twist, hull.added * relative
+    momentum, added_momentum = hull.inertia * twist, hull.added_inertia * relative
     added_flow = np.zeros(6)
     _add_cross(added_flow, 3, 1.0, twist, 0, flow, 3)
-    force = wrench - (hull.linear_drag + hull.quadratic_drag * np.abs(relative)) * relative - hull.added * added_flow
+    force = (
+        wrench
+        - (hull.linear_drag + hull.quadratic_drag * np.abs(relative)) * relative
+        - hull.added_inertia * added_flow
+    )
     for p in (momentum, added_momentum):
         _add_cross(force, 0, -1.0, twist, 0, p, 0)
         _add_cross(force, 3, -1.0, twist, 0, p, 3)
@@ -82,34 +86,35 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     _add_cross(force, 0, hull.buoyancy_n, hull.centre_of_buoyancy_m, 0, up, 0)
     for k in range(3):
         force[3 + k] += (hull.buoyancy_n - hull.weight_n) * up[k]
-    return force / (hull.inertia + hull.added)
+    return force / (hull.inertia + hull.added_inertia)
 
 
 @njit(cache=True, nogil=True)
 def free_joint_acceleration(
     hull: Hull, world_from_body: Array, velocity: Array, current_mps: Array, wrench: Array
 ) -> Array:
-    """The same acceleration in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
+    """Returns the acceleration (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
 
-    Their order is [linear in the world, angular in the body], so the linear part is R (v' + w x v).
+    These are [linear in the world, angular in the body], so the linear part is R (v' + w x v).
 
     Args:
-        velocity: (6,) of the free joint [m/s, rad/s]; the others as in `acceleration`.
+        velocity: (6,) velocity of the free joint [m/s, rad/s].
+        hull, world_from_body, current_mps, wrench: see `acceleration`.
     """
-    twist = twist_of_free_joint(world_from_body, velocity)
-    rate = acceleration(hull, world_from_body, twist, current_mps, wrench)
-    _add_cross(rate, 3, 1.0, twist, 0, twist, 3)
+    twist = twist_from_free_joint(world_from_body, velocity)
+    body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)
+    _add_cross(body_acceleration, 3, 1.0, twist, 0, twist, 3)
     result = np.zeros(6)
     for i in range(3):
-        result[3 + i] = rate[i]
+        result[3 + i] = body_acceleration[i]
         for k in range(3):
-            result[i] += world_from_body[i, k] * rate[3 + k]
+            result[i] += world_from_body[i, k] * body_acceleration[3 + k]
     return result
 
 
 @njit(cache=True, nogil=True)
-def twist_of_free_joint(world_from_body: Array, velocity: Array) -> Array:
-    """Twist [angular, linear] in the body (6,) of a free joint's velocity [linear in world, angular in body]."""
+def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
+    """Converts a free joint's velocity (6,) [linear in world, angular in body] to a twist (6,) in the body."""
     twist = np.zeros(6)
     for k in range(3):
         twist[k] = velocity[3 + k]
@@ -119,7 +124,14 @@ def twist_of_free_joint(world_from_body: Array, velocity: Array) -> Array:
 
 
 def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twist: Array) -> float:
-    """Kinetic energy of body and entrained still water plus potential of weight and buoyancy [J]; position (3,) [m]."""
+    """Returns the kinetic energy, including added mass in still water, plus the potential energy [J].
+
+    Args:
+        hull: parameters of the hull.
+        world_from_body: (3, 3) rotation.
+        position_m: (3,) position of the centre of gravity.
+        twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
+    """
     centre_z = position_m[2] + float(world_from_body[2] @ hull.centre_of_buoyancy_m)
-    kinetic = 0.5 * float((hull.inertia + hull.added) @ twist**2)
+    kinetic = 0.5 * float((hull.inertia + hull.added_inertia) @ twist**2)
     return kinetic + hull.weight_n * float(position_m[2]) - hull.buoyancy_n * centre_z

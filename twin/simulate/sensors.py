@@ -1,4 +1,4 @@
-"""Navigation sensors: pressure, attitude, velocity over ground, acoustic fixes and beacons, each with its noise."""
+"""Navigation sensors: pressure, attitude, Doppler velocity log, acoustic positioning and beacons, each with noise."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from twin.scenario.model import NavigationConfig
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-_LAMP_M = 0.05  # a beacon stands out this far from what is behind it
+_BEACON_HEIGHT_M = 0.05  # a beacon stands out from the surface it is mounted on by at most this height
 
 
 class NavigationSensors:
-    """All navigation sensors of a vehicle; those that are not listed as aiding say nothing.
+    """All navigation sensors of a vehicle; only those listed in `navigation.aiding` return readings.
 
     Args:
-        settings: which sensors aid, and how often an acoustic fix is taken.
-        noise: as their data sheets give it; the beacons stand where they were surveyed.
-        rng: a stream for each of "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
-        project: the true left camera: frame's pixels (n, 2) of points (n, 3) in it; the believed one where None.
+        settings: the sensors used for aiding, and the interval of acoustic fixes.
+        noise: standard deviations by data sheet, and the surveyed positions of the beacons.
+        rig: stereo rig as calibrated.
+        rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
+        project: true projection of the left camera: points (n, 3) in the camera to pixels (n, 2). None: `rig.project`.
     """
 
     def __init__(
@@ -40,20 +41,21 @@ class NavigationSensors:
     ):
         self._project = rig.project if project is None else project
         self._aiding, self._noise, self._rig, self._rng = settings.aiding, noise, rig, rng
-        self._dvl = DopplerLog(noise, rng["dvl"])
-        self._usbl = AcousticFix(noise, settings.usbl_interval_s, rng["usbl"])
+        self._dvl = DopplerVelocityLog(noise, rng["dvl"])
+        self._usbl = AcousticPositioning(noise, settings.usbl_interval_s, rng["usbl"])
 
     def read(
         self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Callable[[], Depth] | None
     ) -> Readings:
-        """What they say now.
+        """Simulates the readings of one frame.
 
         Args:
+            time_s: time of the frame.
             world_from_body: (4, 4) true pose.
             twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
-            depth_m: gives the true depth (height, width) of the left image at a keyframe; else None.
+            depth_m: at a keyframe, a function that returns the true depth (height, width) of the left image; else None.
         """
-        readings = read_sensors(
+        readings = read_pressure_and_attitude(
             world_from_body, self._rig.body_from_camera, self._noise, self._aiding, self._rng["navigation"]
         )
         velocity = self._dvl.read(twist_body[3:])
@@ -62,7 +64,7 @@ class NavigationSensors:
             world_from_camera = world_from_body @ self._rig.body_from_camera
             fix = self._usbl.read(time_s, world_from_camera[:3, 3])
             if "beacons" in self._aiding:
-                sightings = sight_beacons(
+                sightings = detect_beacons(
                     world_from_camera, depth_m(), self._project, self._noise, self._rng["beacons"]
                 )
         return replace(
@@ -72,129 +74,171 @@ class NavigationSensors:
             beacons=sightings,
         )
 
-    def gauges(self) -> Gauges:
-        """Those that say something at every frame, as compiled loops read them."""
-        level, attitude, velocity = (name in self._aiding for name in ("pressure", "ahrs", "dvl"))
-        return Gauges(
-            self._rig.body_from_camera, self._noise.pressure_m, attitude_sigmas(self._noise), self._dvl.gain,
-            self._noise.dvl_mps, level, attitude, velocity,
+    def per_frame_sensors(self) -> PerFrameSensors:
+        """Returns the parameters of the sensors that are read at every frame, for compiled code."""
+        pressure, ahrs, dvl = (name in self._aiding for name in ("pressure", "ahrs", "dvl"))
+        return PerFrameSensors(
+            self._rig.body_from_camera, self._noise.pressure_m, self._noise.attitude_sigmas_rad, self._dvl.gain,
+            self._noise.dvl_mps, pressure, ahrs, dvl,
         )  # fmt: skip
 
-    def noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Standard normal numbers of these (n_frames, 4) and (n_frames, 3), as `read` would draw them."""
+    def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
+        """Draws the standard normal numbers that `read` would draw for the next frames.
+
+        Returns:
+            (n_frames, 4) for pressure and attitude; (n_frames, 3) for the Doppler velocity log.
+        """
         return self._rng["navigation"].standard_normal((n_frames, 4)), self._rng["dvl"].standard_normal((n_frames, 3))
 
 
-class Gauges(NamedTuple):
-    """The sensors that say something at every frame, their deviations, and which of them are fitted."""
+class PerFrameSensors(NamedTuple):
+    """Parameters of the sensors that are read at every frame.
+
+    Args:
+        body_from_camera: (4, 4) pose of the left camera in the body.
+        pressure_sigma_m: standard deviation of the height from pressure.
+        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw.
+        dvl_gain: 1 + scale error of the Doppler velocity log.
+        dvl_sigma_mps: standard deviation of each velocity component.
+        has_pressure, has_ahrs, has_dvl: whether each sensor is used.
+    """
 
     body_from_camera: Array
-    pressure_m: float
-    attitude_rad: Array
+    pressure_sigma_m: float
+    attitude_sigmas_rad: Array
     dvl_gain: float
-    dvl_mps: float
-    tells_height: bool
-    tells_attitude: bool
-    tells_velocity: bool
+    dvl_sigma_mps: float
+    has_pressure: bool
+    has_ahrs: bool
+    has_dvl: bool
 
 
 @njit(cache=True, nogil=True)
-def read_gauges(gauges, world_from_body, twist_body, numbers, dvl_numbers):
-    """Height [m], attitude (3,) [rad] and velocity (3,) [m/s] as read; NaN where a sensor is not fitted."""
-    height, angles = _level(world_from_body, gauges.body_from_camera, gauges.pressure_m, gauges.attitude_rad, numbers)
-    velocity = _logged(twist_body[3:], gauges.dvl_gain, gauges.dvl_mps, dvl_numbers)
-    nothing = np.full(3, np.nan)
+def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_numbers):
+    """Simulates the readings of the per-frame sensors; NaN for a sensor that is not used.
+
+    Args:
+        sensors: `PerFrameSensors`.
+        world_from_body: (4, 4) true pose.
+        twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
+        numbers, dvl_numbers: (4,) and (3,) standard normal numbers, see `NavigationSensors.draw_noise`.
+    Returns:
+        Height of the left camera [m], attitude (3,) [rad], velocity (3,) in the body [m/s].
+    """
+    height, angles = _height_and_attitude(
+        world_from_body, sensors.body_from_camera, sensors.pressure_sigma_m, sensors.attitude_sigmas_rad, numbers
+    )
+    velocity = _dvl_velocity(twist_body[3:], sensors.dvl_gain, sensors.dvl_sigma_mps, dvl_numbers)
+    unused = np.full(3, np.nan)
     return (
-        height if gauges.tells_height else np.nan,
-        angles if gauges.tells_attitude else nothing,
-        velocity if gauges.tells_velocity else nothing,
+        height if sensors.has_pressure else np.nan,
+        angles if sensors.has_ahrs else unused,
+        velocity if sensors.has_dvl else unused,
     )
 
 
-def read_sensors(
+def read_pressure_and_attitude(
     world_from_body: Array,
     body_from_camera: Array,
     noise: SensorNoise,
     aiding: Collection[str],
     rng: np.random.Generator,
 ) -> Readings:
-    """What pressure gauge and AHRS say, where `aiding` lists them; both are drawn, so that no draw depends on the list.
+    """Simulates the pressure sensor and the attitude and heading reference system (AHRS).
 
-    The pressure gauge sits in the left camera's housing: its depth is the camera's own, and no attitude enters by a
-    lever arm. The attitude and heading reference tells roll, pitch and yaw of the body.
+    The pressure sensor is in the housing of the left camera and measures the height of the camera, so attitude errors
+    do not enter through a lever arm. The AHRS measures roll, pitch and yaw of the body. Noise is always drawn for both,
+    so that random numbers do not depend on `aiding`.
 
     Args:
         world_from_body, body_from_camera: (4, 4) true poses.
-        rng: a stream that serves these sensors alone.
+        noise: standard deviations.
+        aiding: names of the sensors used; the readings of the others are None.
+        rng: random generator of these two sensors only.
     """
-    height, angles = _level(
-        world_from_body, body_from_camera, noise.pressure_m, attitude_sigmas(noise), rng.standard_normal(4)
+    height, angles = _height_and_attitude(
+        world_from_body, body_from_camera, noise.pressure_m, noise.attitude_sigmas_rad, rng.standard_normal(4)
     )
     return Readings(
         pressure_z_m=height if "pressure" in aiding else None, ahrs_rpy_rad=angles if "ahrs" in aiding else None
     )
 
 
-def attitude_sigmas(noise: SensorNoise) -> Array:
-    """Deviations of roll, pitch and yaw (3,) [rad]."""
-    return np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
-
-
 @njit(cache=True, nogil=True)
-def _level(world_from_body, body_from_camera, pressure_m, attitude_rad, numbers):
-    """Height [m] and attitude (3,) [rad] by the gauge and the AHRS whose noise is these standard normal numbers."""
+def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, attitude_sigmas_rad, numbers):
+    """Returns the measured camera height [m] and attitude (3,) [rad], with noise from standard normal numbers (4,)."""
     up, arm = world_from_body[2], body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
-    angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_rad * numbers[1:]
-    return height + pressure_m * numbers[0], geometry.wrap_angle(angles)
+    angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_sigmas_rad * numbers[1:]
+    return height + pressure_sigma_m * numbers[0], geometry.wrap_angle(angles)
 
 
-class DopplerLog:
-    """Velocity over ground with white noise and a scale error that is drawn once and stays."""
+class DopplerVelocityLog:
+    """Doppler velocity log: velocity over ground with white noise and a scale error that is constant over the survey.
+
+    Args:
+        noise: standard deviations of the white noise and of the scale error.
+        rng: random generator of this sensor only.
+    """
 
     def __init__(self, noise: SensorNoise, rng: np.random.Generator):
         self._sigma_mps, self._rng = noise.dvl_mps, rng
         self.gain = 1 + noise.dvl_scale * float(rng.standard_normal())
 
     def read(self, velocity_mps: Array) -> Array:
-        """The reading (3,) of a true velocity (3,) of the body's origin, in the body [m/s]."""
-        return _logged(velocity_mps, self.gain, self._sigma_mps, self._rng.standard_normal(3))
+        """Returns the measured velocity (3,) [m/s] for a true velocity (3,) of the body's origin, in the body."""
+        return _dvl_velocity(velocity_mps, self.gain, self._sigma_mps, self._rng.standard_normal(3))
 
 
 @njit(cache=True, nogil=True)
-def _logged(velocity_mps, gain, sigma_mps, numbers):
+def _dvl_velocity(velocity_mps, gain, sigma_mps, numbers):
+    """Returns the measured velocity (3,) [m/s], with noise from standard normal numbers (3,)."""
     return gain * velocity_mps + sigma_mps * numbers
 
 
-class AcousticFix:
-    """USBL: a position now and then. The keyframes trigger it, so that a fix belongs to a stereo pair's instant."""
+class AcousticPositioning:
+    """Ultra-short baseline (USBL) positioning, triggered by keyframes so that a fix has the time of a stereo pair.
+
+    Args:
+        noise: standard deviations.
+        interval_s: least time between fixes.
+        rng: random generator of this sensor only.
+    """
 
     def __init__(self, noise: SensorNoise, interval_s: float, rng: np.random.Generator):
         self._sigma_m, self._interval_s, self._rng = noise.usbl_m, interval_s, rng
         self._next_s = 0.0
 
     def read(self, time_s: float, position_m: Array) -> Array | None:
-        """The fix (3,) at a keyframe where the true position is this (3,) [m]; None where none is due yet."""
+        """Returns the measured position (3,) at a keyframe; None if the interval has not elapsed.
+
+        Args:
+            time_s: time of the keyframe.
+            position_m: (3,) true position of the left camera.
+        """
         if time_s < self._next_s - 1e-9:
             return None
         self._next_s = time_s + self._interval_s
         return position_m + self._sigma_m * self._rng.standard_normal(3)
 
 
-def sight_beacons(
+def detect_beacons(
     world_from_camera: Array,
     depth_m: Depth,
     project: Callable[[Array], Array],
     noise: SensorNoise,
     rng: np.random.Generator,
 ) -> tuple[Sighting, ...]:
-    """What a detector says of the beacons in the left image; the floor hides what lies behind it.
+    """Simulates the detection of beacons in the left image; beacons behind the floor are not detected.
 
-    Noise is drawn for every beacon, so that no draw depends on which of them are in view.
+    Noise is drawn for every beacon, so that random numbers do not depend on which beacons are in view.
 
     Args:
-        depth_m: (height, width) of the left image.
-        project: pixels (n, 2) of points (n, 3) in the left camera.
+        world_from_camera: (4, 4) true pose of the left camera.
+        depth_m: (height, width) true depth of the left image.
+        project: projects points (n, 3) in the left camera to pixels (n, 2).
+        noise: standard deviations and beacon positions.
+        rng: random generator of this sensor only.
     """
     beacons = np.array(noise.beacons_m).reshape(-1, 3)
     errors_px = noise.beacon_px * rng.standard_normal((len(beacons), 2))
@@ -205,8 +249,9 @@ def sight_beacons(
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
+    """Returns whether a point at a pixel (2,) and a depth is inside the image and in front of the floor."""
     rows, columns = depth_m.shape
-    if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # NaN lies nowhere
+    if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # also true for NaN
         return False
     column, row = np.rint(pixel).astype(int)
-    return bool(distance_m < depth_m[row, column] + _LAMP_M)
+    return bool(distance_m < depth_m[row, column] + _BEACON_HEIGHT_M)

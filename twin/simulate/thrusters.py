@@ -1,4 +1,4 @@
-"""Thrusters: from commands to thrust, with their lag."""
+"""Thruster model: steady thrust curve and linear lag."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from scenes.bluerov2 import Vehicle as Vessel
+from scenes.bluerov2 import VehicleParameters
 from twin.core import geometry
 from twin.simulate.hydrodynamics import angular_first
 
@@ -18,106 +18,115 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, nogil=True)
 def steady_thrust_n(command: Array, coefficients: Array) -> Array:
-    """Thrust [N] at rest of commands in [-1, 1]: an odd polynomial, coefficients from the highest power down to u."""
+    """Returns the steady thrust [N] at zero speed for commands u in [-1, 1].
+
+    Args:
+        command: (n,) commands.
+        coefficients: coefficients of the odd polynomial in u, from the highest power down to u.
+    """
     thrust = np.zeros_like(command)
     for coefficient in coefficients:  # Horner's scheme in the square
         thrust = thrust * command * command + coefficient
     return thrust * command
 
 
-class Thrusters(NamedTuple):
-    """Thrusters that follow their commands with a linear lag, for a fixed step.
+class ThrusterState(NamedTuple):
+    """State and parameters of n thrusters with a linear lag, for a fixed timestep; two arrays are modified in place.
 
     Args:
-        a, b, c: (m, m), (m, 1), (m,) step of the lag, its input and its output.
-        effects: (6, n) wrench [moment, force] in the body per newton of each.
-        coefficients: of the thrust curve.
-        state: (m, n) of the lag, changed in place.
-        steady_n: (n,) thrust that the last command leads to, changed in place.
+        a, b, c: (m, m), (m, 1), (m,) discrete state-space model of the lag: transition, input and output.
+        configuration: (6, n) wrench [moment, force] in the body per newton of each thruster.
+        coefficients: coefficients of the thrust curve.
+        lag_state: (m, n) state of the lag, modified in place.
+        steady_n: (n,) steady thrust of the last command, modified in place.
     """
 
     a: Array
     b: Array
     c: Array
-    effects: Array
+    configuration: Array
     coefficients: Array
-    state: Array
+    lag_state: Array
     steady_n: Array
 
 
 class LaggedThrusters:
-    """The thrusters of a vessel: each follows its commanded steady thrust with the vessel's linear lag.
+    """Thrusters of a vehicle; each thrust follows the commanded steady thrust with a linear lag.
 
-    The lag is discretised exactly for commands that are held over a step.
+    The lag is discretised exactly for commands that are constant over a timestep (zero-order hold).
 
     Args:
-        vessel: positions, directions, thrust curve and lag.
-        timestep_s: step.
+        vehicle: thruster positions and directions, thrust curve and lag.
+        timestep_s: physics timestep.
     """
 
-    def __init__(self, vessel: Vessel, timestep_s: float):
-        numerator, denominator = vessel.thruster_lag
-        a, b = _held(denominator, timestep_s)
+    def __init__(self, vehicle: VehicleParameters, timestep_s: float):
+        numerator, denominator = vehicle.thruster_lag
+        a, b = _zero_order_hold(denominator, timestep_s)
         c = np.zeros(len(a))
         c[-len(numerator) :] = numerator
-        effects = angular_first(vessel.allocation)
-        n = effects.shape[1]
-        self.parts = Thrusters(
-            a, b, c, effects, np.array(vessel.thrust_coefficients, float), np.zeros((len(a), n)), np.zeros(n)
-        )
+        configuration = angular_first(vehicle.thrust_configuration)
+        n, coefficients = configuration.shape[1], np.array(vehicle.thrust_coefficients, float)
+        self.state = ThrusterState(a, b, c, configuration, coefficients, np.zeros((len(a), n)), np.zeros(n))
 
     def thrust_n(self) -> Array:
-        """Thrust of each at this instant (n,)."""
-        return self.parts.c @ self.parts.state
+        """Returns the current thrust of each thruster (n,) [N]."""
+        return self.state.c @ self.state.lag_state
 
     def wrench(self) -> Array:
-        """Their wrench on the body at this instant, [moment, force] in the body (6,) [N m, N]."""
-        return wrench_of(self.parts)
+        """Returns the current wrench of all thrusters, [moment, force] in the body (6,) [N m, N]."""
+        return thruster_wrench(self.state)
 
     def command(self, command: Array) -> None:
-        """Sets commands (n,), cut to [-1, 1], for the steps that follow."""
-        set_command(self.parts, command)
+        """Sets the commands (n,), clipped to [-1, 1], for the following steps."""
+        set_thruster_command(self.state, command)
 
     def step(self) -> None:
-        """One step under the last commands."""
-        pass_step(self.parts)
+        """Advances the lag by one timestep under the last commands."""
+        step_thrusters(self.state)
 
 
 @njit(cache=True, nogil=True)
-def set_command(thrusters, command):
-    """As `LaggedThrusters.command`."""
-    cut = np.minimum(np.maximum(command, -1.0), 1.0)
-    geometry.put(thrusters.steady_n, steady_thrust_n(cut, thrusters.coefficients))
+def set_thruster_command(thrusters, command):
+    """Compiled kernel of `LaggedThrusters.command`."""
+    clipped = np.minimum(np.maximum(command, -1.0), 1.0)
+    geometry.put(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients))
 
 
 @njit(cache=True, nogil=True)
-def pass_step(thrusters):
-    """As `LaggedThrusters.step`."""
-    before, order = thrusters.state.copy(), len(thrusters.a)
+def step_thrusters(thrusters):
+    """Compiled kernel of `LaggedThrusters.step`."""
+    previous, order = thrusters.lag_state.copy(), len(thrusters.a)
     for i in range(order):
-        for n in range(thrusters.state.shape[1]):
-            thrusters.state[i, n] = thrusters.b[i, 0] * thrusters.steady_n[n]
+        for n in range(thrusters.lag_state.shape[1]):
+            thrusters.lag_state[i, n] = thrusters.b[i, 0] * thrusters.steady_n[n]
             for k in range(order):
-                thrusters.state[i, n] += thrusters.a[i, k] * before[k, n]
+                thrusters.lag_state[i, n] += thrusters.a[i, k] * previous[k, n]
 
 
 @njit(cache=True, nogil=True)
-def wrench_of(thrusters):
-    """As `LaggedThrusters.wrench`."""
+def thruster_wrench(thrusters):
+    """Compiled kernel of `LaggedThrusters.wrench`."""
     wrench = np.zeros(6)
-    for n in range(thrusters.state.shape[1]):
+    for n in range(thrusters.lag_state.shape[1]):
         thrust = 0.0
         for k in range(len(thrusters.c)):
-            thrust += thrusters.c[k] * thrusters.state[k, n]
+            thrust += thrusters.c[k] * thrusters.lag_state[k, n]
         for i in range(6):
-            wrench[i] += thrusters.effects[i, n] * thrust
+            wrench[i] += thrusters.configuration[i, n] * thrust
     return wrench
 
 
-def _held(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
-    """Controllable canonical form of 1 / denominator (leading coefficient 1), exact for inputs held over a step.
+def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
+    """Discretises the controllable canonical form of 1 / denominator for inputs that are constant over a timestep.
 
-    exp([[A, B], [0, 0]] dt) holds both matrices of the step (Van Loan 1978). (n + 1,) -> (n, n), (n, 1).
+    The first rows of exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
+
+    Args:
+        denominator: (n + 1,) coefficients, the leading one 1.
+        timestep_s: dt.
+    Returns:
+        Transition matrix (n, n) and input matrix (n, 1).
     """
     n = len(denominator) - 1
     rates = np.zeros((n + 1, n + 1))

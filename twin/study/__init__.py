@@ -1,1 +1,1 @@
-"""Many surveys at once: which ones, on which machines, and what they say together."""
+"""Monte Carlo studies and plan tuning: sampling of scenarios, execution on many workers, statistics and reports."""

@@ -1,4 +1,4 @@
-"""Which samples a study flies: grids are gone through, everything else is drawn."""
+"""Experimental design of a study: sampled keys follow a design in the unit cube, grids are enumerated."""
 
 from __future__ import annotations
 
@@ -8,98 +8,98 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twin.study.spread import Array, equal_parts
-from twin.study.study_file import METHODS, Study, Together
+from twin.study.distribution import Array, equal_bins
+from twin.study.study_file import JointValues, SamplingMethod, Study
 
-_DESIGN_STREAM = 0x57D1  # keeps the draws of samples apart from those within a survey of the same seed
+_DESIGN_STREAM = 0x57D1  # separates the random numbers of the design from those of a survey with the same seed
 
 
 class Sample(NamedTuple):
-    """One setting: its number from 0, the row of the draws that it belongs to, and the value of every varied key."""
+    """One setting: its number from 0, the index of its design point, and the value of every varied key."""
 
     number: int
-    draw: int
+    point: int
     values: dict[str, Any]
 
 
 def samples(study: Study) -> Iterator[Sample]:
-    """All settings of a study, each draw with every cell of the grids.
+    """Yields all settings of a study: each design point combined with every cell of the grids.
 
-    More samples of "random" or "sobol" begin with those of fewer.
+    With "random" or "sobol", a larger number of samples begins with the samples of a smaller one.
     """
-    axes = list(_drawn(study))
-    cells = [dict(pairs for part in cell for pairs in part) for cell in product(*_gone_through(study))]
-    shares = points(study.sampling.method, study.sampling.samples or 1, len(axes), study.sampling.seed)
-    columns = [axis(shares[:, k]) for k, axis in enumerate(axes)]
+    axes = list(_sampled_axes(study))
+    cells = [dict(pairs for part in cell for pairs in part) for cell in product(*_grid_axes(study))]
+    points = design_points(study.sampling.method, study.sampling.samples or 1, len(axes), study.sampling.seed)
+    columns = [axis(points[:, k]) for k, axis in enumerate(axes)]
     number = 0
-    for draw in range(len(shares)):
-        drawn = {key: value for column in columns for key, value in column[draw].items()}
+    for point in range(len(points)):
+        sampled = {key: value for column in columns for key, value in column[point].items()}
         for cell in cells:
-            values = drawn | cell
-            yield Sample(number, draw, {key: values[key] for key in study.varied})
+            values = sampled | cell
+            yield Sample(number, point, {key: values[key] for key in study.varied_keys})
             number += 1
 
 
-def seeds(study: Study, sample: Sample) -> list[int]:
-    """The seeds that a sample is flown with: the same for all, or for all cells of its draw only."""
+def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
+    """Returns the seeds that a sample is flown with: common to all samples, or to those of its design point."""
     plan = study.sampling
-    first = plan.seed + (0 if plan.paired else sample.draw * plan.seeds)
+    first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]
 
 
-def points(method: METHODS, n_points: int, n_axes: int, seed: int) -> Array:
-    """(n, n_axes) points in the unit cube; n is n_points, of "saltelli" n_points (n_axes + 2)."""
-    from scipy.stats import qmc  # takes a second, and workers never need it
+def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int) -> Array:
+    """Returns (n, n_axes) points in the unit cube; n is n_points, or n_points (n_axes + 2) for "saltelli"."""
+    from scipy.stats import qmc  # the import takes a second, and workers do not need it
 
     rng = np.random.default_rng([seed, _DESIGN_STREAM])
     if n_axes == 0 or method in ("random", "grid"):
         return rng.random((n_points, n_axes))
     if method == "saltelli":
         return _saltelli(np.asarray(qmc.Sobol(2 * n_axes, rng=rng).random(n_points)))
-    cube = qmc.LatinHypercube(n_axes, rng=rng) if method == "lhs" else qmc.Sobol(n_axes, rng=rng)
-    return np.asarray(cube.random(n_points))
+    sampler = qmc.LatinHypercube(n_axes, rng=rng) if method == "lhs" else qmc.Sobol(n_axes, rng=rng)
+    return np.asarray(sampler.random(n_points))
 
 
 def _saltelli(pairs: Array) -> Array:
-    """A, B, and A with one column of B for each axis (Saltelli et al. 2010, Comput. Phys. Commun. 181, 259).
+    """Returns A, B, and for each axis A with that column of B (Saltelli et al. 2010, Comput. Phys. Commun. 181, 259).
 
     Args:
-        pairs: (n, 2 d) points of A and B side by side.
+        pairs: (n, 2 d), the points of A in the first d columns and those of B in the others.
 
     Returns:
-        (n (d + 2), d): the blocks one after another, as `statistics.sobol_indices` takes their outcomes.
+        (n (d + 2), d), the blocks stacked in the order that `statistics.sobol_indices` expects.
     """
     a, b = np.hsplit(pairs, 2)
     blocks = [np.where(np.arange(a.shape[1]) == k, b, a) for k in range(a.shape[1])]
     return np.vstack([a, b, *blocks])
 
 
-def axes_of(study: Study) -> list[str]:
-    """What each drawn axis varies: a key, or keys that vary together."""
-    alone = [key for key, spread in study.vary.items() if spread.is_drawn]
-    return alone + [" + ".join(table.keys) for table in study.together]
+def axis_names(study: Study) -> list[str]:
+    """Returns the name of each sampled axis: a key, or the keys of a table joined by " + "."""
+    single = [key for key, distribution in study.vary.items() if distribution.is_sampled]
+    return single + [" + ".join(table.keys) for table in study.together]
 
 
-def _drawn(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any]]]]:
-    """Of each axis that is drawn: from shares to values by key."""
+def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any]]]]:
+    """Yields for each sampled axis the function from coordinates (0 to 1) to values by key."""
     if study.sampling.method == "grid":
         return
-    for key, spread in study.vary.items():
-        if spread.is_drawn:
-            yield lambda share, key=key, spread=spread: [{key: value} for value in spread.at(share)]
+    for key, distribution in study.vary.items():
+        if distribution.is_sampled:
+            yield lambda x, key=key, distribution=distribution: [{key: v} for v in distribution.quantiles(x)]
     for table in study.together:
-        yield lambda share, table=table: [_row(table, k) for k in equal_parts(share, len(table.rows))]
+        yield lambda x, table=table: [_row(table, k) for k in equal_bins(x, len(table.rows))]
 
 
-def _gone_through(study: Study) -> Iterator[list[list[tuple[str, Any]]]]:
-    """Of each axis of the grid: the values by key."""
-    whole = study.sampling.method == "grid"
-    for key, spread in study.vary.items():
-        if whole or not spread.is_drawn:
-            yield [[(key, value)] for value in spread.values]
-    for table in study.together if whole else ():
+def _grid_axes(study: Study) -> Iterator[list[list[tuple[str, Any]]]]:
+    """Yields for each axis of the grid its (key, value) pairs."""
+    all_axes = study.sampling.method == "grid"
+    for key, distribution in study.vary.items():
+        if all_axes or not distribution.is_sampled:
+            yield [[(key, value)] for value in distribution.values]
+    for table in study.together if all_axes else ():
         yield [list(_row(table, k).items()) for k in range(len(table.rows))]
 
 
-def _row(table: Together, k: int) -> dict[str, Any]:
+def _row(table: JointValues, k: int) -> dict[str, Any]:
     return dict(zip(table.keys, table.rows[k], strict=True))

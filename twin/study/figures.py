@@ -1,4 +1,4 @@
-"""The figures of a study's report."""
+"""Figures of the study report."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from numpy.typing import NDArray
 
 from twin.report.figures import WIDTH_IN, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.wording import percent
 from twin.study import statistics
-from twin.study.findings import Findings, Influence, Level
+from twin.study.analysis import MetricSummary, Sensitivity, StudyAnalysis
 from twin.study.statistics import Array, Interval
-from twin.study.wording import name_of, percent, value_of
+from twin.study.wording import metric_name, metric_value
 
-GOOD, BAD, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
-_MOST_POINTS = 3000
+PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
+_MAX_POINTS = 3000
 _ROW_IN = 2.7
 
 
-def draw_all(found: Findings) -> dict[str, str]:
-    """Every figure that the study has the data for, as data URIs by name."""
+def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
+    """Returns every figure for which the study has data, as data URIs by name."""
     drawings: dict[str, Callable[[], Figure | None]] = {
-        "passing": lambda: passing(found),
-        "levels": lambda: distributions(found, found.levels),
-        "sensitivity": lambda: sensitivity(found.influences),
-        "contrast": lambda: contrast(found),
-    } | {f"curves.{metric}": lambda metric=metric: curves(found, metric) for metric in found.metrics}
+        "pass_probability": lambda: pass_probability(analysis),
+        "histograms": lambda: metric_histograms(analysis, analysis.metric_summaries),
+        "sensitivity": lambda: sensitivity(analysis.sensitivities),
+        "key_histograms": lambda: key_histograms(analysis),
+    } | {f"metric.{metric}": lambda metric=metric: metric_by_key(analysis, metric) for metric in analysis.metrics}
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw() for name, draw in drawings.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
 
 
 def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
-    """Axes in rows of up to `columns`."""
+    """Returns a figure with `count` axes, in rows of up to `columns`."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, _ROW_IN * rows))
@@ -49,93 +50,104 @@ def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
     return figure, axes[:count]
 
 
-def passing(found: Findings) -> Figure | None:
-    """Share of surveys that pass, by each key."""
-    if not found.keys or not found.ended.any():
+def pass_probability(analysis: StudyAnalysis) -> Figure | None:
+    """Draws the pass probability against each varied key; returns None if no survey was evaluated."""
+    if not analysis.keys or not analysis.evaluated.any():
         return None
-    figure, panels = make_panels(len(found.keys))
-    for key, axes in zip(found.keys, panels, strict=True):
-        groups, names = found.key_groups(key, found.ended)
-        good, units = found.passed[found.ended], found.units[found.ended]
-        shares = [statistics.share(good[groups == k], units[groups == k]) for k in np.unique(groups)]
-        _with_bars(axes, _places(axes, found, key, found.ended, groups, names), shares, COLOURS["online"])
-        axes.axhline(found.share.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
-        if found.sought is not None and key == found.study.seek and np.isfinite(found.sought[0]).all():
-            axes.axvline(found.sought[0].value, color=LIMIT, linewidth=1)
-            axes.axvspan(found.sought[0].low, found.sought[0].high, color=LIMIT, alpha=0.12, linewidth=0)
+    figure, panels = make_panels(len(analysis.keys))
+    passed, clusters = analysis.passed[analysis.evaluated], analysis.clusters[analysis.evaluated]
+    for key, axes in zip(analysis.keys, panels, strict=True):
+        groups, names = analysis.key_groups(key, analysis.evaluated)
+        proportions = [
+            statistics.clustered_proportion(passed[groups == k], clusters[groups == k]) for k in np.unique(groups)
+        ]
+        x = _key_axis(axes, analysis.key_numbers(key), analysis.evaluated, groups, names)
+        _error_bars(axes, x, proportions, COLOURS["online"])
+        axes.axhline(analysis.pass_probability.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
+        if analysis.threshold is not None and key == analysis.study.seek and np.isfinite(analysis.threshold[0]).all():
+            axes.axvline(analysis.threshold[0].value, color=LIMIT, linewidth=1)
+            axes.axvspan(analysis.threshold[0].low, analysis.threshold[0].high, color=LIMIT, alpha=0.12, linewidth=0)
         axes.set(ylim=(-0.03, 1.03), xlabel=key)
         axes.yaxis.set_major_formatter(lambda value, _: percent(value))
-    panels[0].set_ylabel("surveys that pass")
+    panels[0].set_ylabel("pass probability")
     return figure
 
 
-def _places(axes: Axes, found: Findings, key: str, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]):
-    """Where each group of a key stands on the x axis: at the median of its numbers, or one after another."""
-    values = found.key_numbers(key)
+def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
+    """Formats the x axis for a key, and returns the position of each group: its median value, or its index.
+
+    Args:
+        axes: axes to format.
+        values: values of the key; None if it is text.
+        chosen: mask of the surveys shown.
+        groups: group of each chosen survey.
+        names: names of the groups.
+    """
     if values is None:
-        turned = 25 if max(len(name) for name in names) > 8 else 0
-        axes.set_xticks(range(len(names)), names, rotation=turned)
+        rotation = 25 if max(len(name) for name in names) > 8 else 0
+        axes.set_xticks(range(len(names)), names, rotation=rotation)
         axes.set_xlim(-0.5, len(names) - 0.5)
         return np.arange(len(names), dtype=float)
     if spans_decades(values):
         log_axis(axes.xaxis, axes.set_xscale)
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.set_xlim(*_around(values[chosen], spans_decades(values)))
+    axes.set_xlim(*_axis_range(values[chosen], spans_decades(values)))
     return np.array([np.median(values[chosen][groups == k]) for k in np.unique(groups)])
 
 
-def _around(values: Array, log: bool) -> tuple[float, float]:
-    """Limits of an axis a little beyond the values."""
+def _axis_range(values: Array, log: bool) -> tuple[float, float]:
+    """Returns the range of the values with a margin."""
     low, high = float(values.min()), float(values.max())
     if log:
         return low / 1.15, high * 1.15
-    room = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-    return low - room, high + room
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
+    return low - margin, high + margin
 
 
 def spans_decades(values: Array) -> bool:
+    """Returns whether a logarithmic axis suits the values: all positive, with a ratio of more than 8."""
     return bool(values.min(initial=np.inf) > 0 and values.max(initial=0) > 8 * values.min(initial=np.inf))
 
 
-def _with_bars(axes: Axes, x: Array, found: list[Interval], colour: str) -> None:
-    y = np.array([f.value for f in found])
-    ends = np.array([[f.value - f.low, f.high - f.value] for f in found]).T
-    ends = np.where(np.isfinite(ends), np.maximum(ends, 0), 0)
-    axes.errorbar(x, y, ends, fmt="o-", color=colour, markersize=4, capsize=2.5, linewidth=1.2, zorder=4)
+def _error_bars(axes: Axes, x: Array, intervals: list[Interval], colour: str) -> None:
+    y = np.array([i.value for i in intervals])
+    bars = np.array([[i.value - i.low, i.high - i.value] for i in intervals]).T
+    bars = np.where(np.isfinite(bars), np.maximum(bars, 0), 0)
+    axes.errorbar(x, y, bars, fmt="o-", color=colour, markersize=4, capsize=2.5, linewidth=1.2, zorder=4)
 
 
-def distributions(found: Findings, levels: list[Level]) -> Figure | None:
-    """How a metric is spread over the surveys, with its limit and median."""
-    levels = [level for level in levels if level.surveys > 1]
-    if not levels:
+def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
+    """Draws the histogram of each metric with its median, 95 % bound and limit."""
+    summaries = [summary for summary in summaries if summary.surveys > 1]
+    if not summaries:
         return None
-    figure, panels = make_panels(len(levels))
-    for level, axes in zip(levels, panels, strict=True):
-        values = found.numbers(level.name)
-        values = values[found.counted(level.name)]
+    figure, panels = make_panels(len(summaries))
+    for summary, axes in zip(summaries, panels, strict=True):
+        values = analysis.numbers(summary.name)
+        values = values[analysis.included(summary.name)]
         log = spans_decades(values)
-        edges = _edges(values, log)
+        edges = _bin_edges(values, log)
         axes.hist(values, list(edges), color=COLOURS["online"], alpha=0.75)
         if log:
             log_axis(axes.xaxis, axes.set_xscale)
         else:
             axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        if np.isfinite(level.median.low):
-            axes.axvspan(level.median.low, level.median.high, color=GOOD, alpha=0.25, linewidth=0)
-        axes.axvline(level.median.value, color=GOOD, label="median")
-        axes.axvline(level.bound.value, color=BAD, linestyle=":", label="95 % keep")
-        if level.limit is not None:
-            axes.axvline(level.limit, color=LIMIT, linestyle="--", label="limit")
-        unit_axis(axes.xaxis, level.name)
-        axes.set_xlabel(label_of(level.name))
+        if np.isfinite(summary.median.low):
+            axes.axvspan(summary.median.low, summary.median.high, color=PASSED, alpha=0.25, linewidth=0)
+        axes.axvline(summary.median.value, color=PASSED, label="median")
+        axes.axvline(summary.bound.value, color=NOT_PASSED, linestyle=":", label="95 % bound")
+        if summary.limit is not None:
+            axes.axvline(summary.limit, color=LIMIT, linestyle="--", label="limit")
+        unit_axis(axes.xaxis, summary.name)
+        axes.set_xlabel(axis_label(summary.name))
     panels[0].set_ylabel("surveys")
     panels[0].legend(fontsize=8)
     return figure
 
 
-def _edges(values: Array, log: bool) -> Array:
+def _bin_edges(values: Array, log: bool) -> Array:
     count = int(np.clip(2 * len(values) ** (1 / 3), 5, 40))
     low, high = float(values.min()), float(values.max())
     if log:
@@ -143,98 +155,98 @@ def _edges(values: Array, log: bool) -> Array:
     return np.linspace(low, high if high > low else low + 1e-9 + abs(low) * 1e-3, count + 1)
 
 
-def label_of(metric: str) -> str:
-    """A metric's name, in lines that fit beside a panel."""
-    return textwrap.fill(name_of(metric), 26)
+def axis_label(metric: str) -> str:
+    """Returns the name of a metric, wrapped to the width of a panel."""
+    return textwrap.fill(metric_name(metric), 26)
 
 
-def unit_axis(axis, metric: str) -> None:
-    """Ticks in the metric's unit; few, as they are words."""
-    axis.set_major_formatter(lambda value, _: value_of(metric, value))
+def unit_axis(axis: Any, metric: str) -> None:
+    """Formats the ticks of an axis in the unit of the metric."""
+    axis.set_major_formatter(lambda value, _: metric_value(metric, value))
     axis.set_tick_params(labelsize=8)
 
 
 def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
-    """An axis in decades, with labels at 1, 2 and 5."""
+    """Makes an axis logarithmic, with labels at 1, 2 and 5."""
     set_scale("log")
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda *_: "")
 
 
-def curves(found: Findings, metric: str) -> Figure | None:
-    """A metric against each key: every survey a dot, and the median of each group with its interval."""
-    y, chosen = found.numbers(metric), found.counted(metric)
-    if not found.keys or chosen.sum() < 2:
+def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
+    """Draws a metric against each key: every survey as a dot, and the median of each group with its interval."""
+    y, included = analysis.numbers(metric), analysis.included(metric)
+    if not analysis.keys or included.sum() < 2:
         return None
-    figure, panels = make_panels(len(found.keys))
-    for key, axes in zip(found.keys, panels, strict=True):
-        groups, names = found.key_groups(key, chosen)
-        places = _places(axes, found, key, chosen, groups, names)
-        _dots(axes, found, key, chosen, groups, y[chosen])
-        units = found.units[chosen]
+    figure, panels = make_panels(len(analysis.keys))
+    for key, axes in zip(analysis.keys, panels, strict=True):
+        values = analysis.key_numbers(key)
+        groups, names = analysis.key_groups(key, included)
+        group_x = _key_axis(axes, values, included, groups, names)
+        jitter = np.random.default_rng(0)
+        x = groups + jitter.uniform(-0.15, 0.15, len(groups)) if values is None else values[included]
+        _dots(axes, x, y[included], analysis.passed[included], jitter)
+        clusters = analysis.clusters[included]
         medians = [
-            statistics.bootstrap(y[chosen][groups == k], statistics.median, units[groups == k])
+            statistics.bootstrap_interval(y[included][groups == k], statistics.median, clusters[groups == k])
             for k in np.unique(groups)
         ]
-        _with_bars(axes, places, medians, COLOURS["online"])
-        if (limit := found.limits.get(metric)) is not None:
+        _error_bars(axes, group_x, medians, COLOURS["online"])
+        if (limit := analysis.limits.get(metric)) is not None:
             axes.axhline(limit, color=LIMIT, linestyle="--", linewidth=1)
-        if spans_decades(y[chosen]):
+        if spans_decades(y[included]):
             log_axis(axes.yaxis, axes.set_yscale)
         unit_axis(axes.yaxis, metric)
         axes.set_xlabel(key)
     return figure
 
 
-def _dots(axes: Axes, found: Findings, key: str, chosen: NDArray[np.bool_], groups: NDArray, y: Array) -> None:
-    rng = np.random.default_rng(0)
-    values = found.key_numbers(key)
-    x = groups + rng.uniform(-0.15, 0.15, len(groups)) if values is None else values[chosen]
-    some = rng.permutation(len(x))[:_MOST_POINTS]
-    good = found.passed[chosen]
-    for kind, colour in ((good, POINTS), (~good, BAD)):
-        at = some[kind[some]]
-        axes.plot(x[at], y[at], ".", color=colour, markersize=3.5, alpha=0.55, zorder=2)
+def _dots(axes: Axes, x: Array, y: Array, passed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+    """Draws surveys as dots coloured by their result; a random subset if there are too many."""
+    shown = rng.permutation(len(x))[:_MAX_POINTS]
+    for mask, colour in ((passed, POINTS), (~passed, NOT_PASSED)):
+        subset = shown[mask[shown]]
+        axes.plot(x[subset], y[subset], ".", color=colour, markersize=3.5, alpha=0.55, zorder=2)
 
 
-def sensitivity(influences: list[Influence]) -> Figure | None:
-    """Rank correlation of each metric with each key that has numbers, and its interval."""
-    shown = [f for f in influences if np.isfinite(f.correlation.value)]
-    metrics = list(dict.fromkeys(f.metric for f in shown))
+def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
+    """Draws the rank correlation of each metric with each numeric key, with its interval."""
+    shown = [s for s in sensitivities if np.isfinite(s.correlation.value)]
+    metrics = list(dict.fromkeys(s.metric for s in shown))
     if not shown:
         return None
-    count = max(sum(f.metric == metric for f in shown) for metric in metrics)
+    count = max(sum(s.metric == metric for s in shown) for metric in metrics)
     figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.36 * count))
     panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
-    keys = list(dict.fromkeys(f.key for f in shown))
+    keys = list(dict.fromkeys(s.key for s in shown))
     for metric, axes in zip(metrics, panels, strict=True):
-        for f in (f for f in shown if f.metric == metric):
-            at, r = -keys.index(f.key), f.correlation
-            axes.barh(at, r.value, 0.6, color=BAD if r.value > 0 else COLOURS["online"], alpha=0.8)
-            axes.plot([r.low, r.high], [at, at], color=COLOURS["truth"], linewidth=1.2)
+        for s in (s for s in shown if s.metric == metric):
+            y, r = -keys.index(s.key), s.correlation
+            axes.barh(y, r.value, 0.6, color=NOT_PASSED if r.value > 0 else COLOURS["online"], alpha=0.8)
+            axes.plot([r.low, r.high], [y, y], color=COLOURS["truth"], linewidth=1.2)
         axes.axvline(0, color=COLOURS["truth"], linewidth=0.8)
         axes.set(xlim=(-1.05, 1.05), xlabel="rank correlation")
-        axes.set_title(name_of(metric), fontsize=9)
+        axes.set_title(metric_name(metric), fontsize=9)
         axes.grid(visible=False, axis="y")
     panels[0].set_yticks([-k for k in range(len(keys))], keys)
     return figure
 
 
-def contrast(found: Findings) -> Figure | None:
-    """How each key is spread among surveys that passed and that did not."""
-    good, bad = found.ended & found.passed, found.ended & ~found.passed
-    keys = [key for key in found.keys if found.key_numbers(key) is not None]
+def key_histograms(analysis: StudyAnalysis) -> Figure | None:
+    """Draws the histogram of each numeric key, stacked by surveys that passed and that did not."""
+    good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
+    keys = [key for key in analysis.keys if analysis.key_numbers(key) is not None]
     if not keys or not good.any() or not bad.any():
         return None
     figure, panels = make_panels(len(keys))
     for key, axes in zip(keys, panels, strict=True):
-        values = found.key_numbers(key)
+        values = analysis.key_numbers(key)
         assert values is not None
-        log = spans_decades(values[found.ended])
-        edges = _edges(values[found.ended], log)
-        both = [values[good], values[bad]]
-        axes.hist(both, list(edges), stacked=True, color=[GOOD, BAD], label=["passed", "not passed"], alpha=0.85)
+        log = spans_decades(values[analysis.evaluated])
+        edges = _bin_edges(values[analysis.evaluated], log)
+        both, colours = [values[good], values[bad]], [PASSED, NOT_PASSED]
+        axes.hist(both, list(edges), stacked=True, color=colours, label=["passed", "not passed"], alpha=0.85)
         if log:
             log_axis(axes.xaxis, axes.set_xscale)
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -1,4 +1,4 @@
-"""What a user sees of a study while it runs, on stderr: a bar on a terminal, a line a survey where asked for."""
+"""Progress of a study on stderr: a progress bar on a terminal, and one line per survey on request."""
 
 from __future__ import annotations
 
@@ -9,69 +9,66 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
+from rich.progress import Progress as ProgressBar
 
+from twin.report.wording import plain
 from twin.study.flight import Row, has_passed
-from twin.study.statistics import wilson
+from twin.study.statistics import wilson_interval
 
 
-class Progress:
-    """How far a study is, and its running estimate."""
+class StudyProgress:
+    """Numbers of surveys flown, passed and failed so far, and the current estimate of the pass probability."""
 
-    def __init__(self, bar: Bar | None = None, live: bool = False):
+    def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
         self.total = self.done = self.passed = self.failed = 0
-        self.bar, self.live = bar, live
+        self.bar, self.print_surveys = bar, print_surveys
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
 
     def begin(self, total: int) -> None:
-        """So many surveys will be flown."""
+        """Sets the number of surveys to fly."""
         self.total = total
-        self._draw()
+        self._update_bar()
 
     def add(self, row: Row) -> None:
-        """One survey came back."""
+        """Counts a survey that has ended."""
         self.done += 1
         self.passed += has_passed(row)
         self.failed += row["status"] == "failed"
-        if self.live and self.bar:
-            self.bar.console.print(line_on(row), markup=False, highlight=False)
-        elif self.live:
-            print(f"{self.done}/{self.total} {line_on(row)}; {self}", file=sys.stderr, flush=True)
-        self._draw()
+        if self.print_surveys and self.bar:
+            self.bar.console.print(survey_line(row), markup=False, highlight=False)
+        elif self.print_surveys:
+            print(f"{self.done}/{self.total} {survey_line(row)}; {self}", file=sys.stderr, flush=True)
+        self._update_bar()
 
-    def _draw(self) -> None:
+    def _update_bar(self) -> None:
         if self.bar:
             self.bar.update(self._task, total=self.total, completed=self.done, note=str(self))
 
     def __str__(self) -> str:
-        ended = self.done - self.failed
-        lost = f"{self.failed} failed" if self.failed else ""
-        if not ended:
-            return lost
-        share = wilson(self.passed, ended)
-        estimate = f"{100 * share.value:.0f} % pass ({100 * share.low:.0f} to {100 * share.high:.0f} %)"
-        return f"{estimate}, {lost}" if lost else estimate
+        evaluated = self.done - self.failed
+        failures = f"{self.failed} failed" if self.failed else ""
+        if not evaluated:
+            return failures
+        estimate = wilson_interval(self.passed, evaluated)
+        passing = f"{100 * estimate.value:.0f} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
+        return f"{passing}, {failures}" if failures else passing
 
 
 @contextmanager
-def shown(live: bool) -> Iterator[Progress]:
-    """What shows the progress on this terminal, if it is one."""
+def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
+    """Yields the progress of a study, with a progress bar if stderr is a terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield Progress(live=live)
+        yield StudyProgress(print_surveys=print_surveys)
         return
     columns = (TextColumn("surveys"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bar(*columns, TextColumn("{task.fields[note]}"), console=console) as bar:
-        yield Progress(bar, live)
+    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=console) as bar:
+        yield StudyProgress(bar, print_surveys)
 
 
-def line_on(row: Row) -> str:
-    """A survey in a line."""
-    missed = "" if has_passed(row) else ", missed its limits"
-    how = row["status"] + (f" ({row['reason']})" if row["reason"] else missed)
-    varied = ", ".join(f"{name[5:]} {_short(value)}" for name, value in row.items() if name.startswith("vary."))
-    return f"sample {row['sample']}, seed {row['seed']}: {how}" + (f"; {varied}" if varied else "")
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def survey_line(row: Row) -> str:
+    """Returns the result of a survey in one line."""
+    missed = "" if has_passed(row) else ", requirements not met"
+    result = row["status"] + (f" ({row['reason']})" if row["reason"] else missed)
+    varied = ", ".join(f"{name[5:]} {plain(value)}" for name, value in row.items() if name.startswith("vary."))
+    return f"sample {row['sample']}, seed {row['seed']}: {result}" + (f"; {varied}" if varied else "")

@@ -1,4 +1,4 @@
-"""study.html: one self-contained page that tells what a study found."""
+"""Report of a study: the self-contained page study.html."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 
 from twin.report.html import render_page
 from twin.study import wording
+from twin.study.analysis import StudyAnalysis
 from twin.study.figures import draw_all
-from twin.study.findings import Findings
 from twin.study.statistics import RESAMPLES
 from twin.study.study_file import Study
 
 
-def write_report(study: Study, found: Findings, page: Path) -> None:
-    """Writes the page."""
-    page.write_text(render_page("twin.study", "study.html.j2", context(study, found)), encoding="utf-8")
+def write_report(study: Study, analysis: StudyAnalysis, page: Path) -> None:
+    """Writes the report of a study to the file `page`."""
+    page.write_text(render_page("twin.study", "study.html.j2", context(study, analysis)), encoding="utf-8")
 
 
-def context(study: Study, found: Findings) -> dict[str, Any]:
-    """All that the page shows."""
+def context(study: Study, analysis: StudyAnalysis) -> dict[str, Any]:
+    """Returns the variables of the page template."""
     return {
         "study": study,
-        "found": found,
-        "words": wording,
-        "headline": wording.headline(study, found),
-        "influences": [f for f in found.influences if np.isfinite(f.correlation.value) or f.explained > 0],
-        "figures": draw_all(found),
+        "analysis": analysis,
+        "wording": wording,
+        "headline": wording.headline(study, analysis),
+        "sensitivities": [s for s in analysis.sensitivities if np.isfinite(s.correlation.value) or s.explained > 0],
+        "figures": draw_all(analysis),
         "resamples": RESAMPLES,
         "text": study.source.path.read_text(encoding="utf-8"),
         "version": version("seabed-twin"),

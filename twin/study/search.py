@@ -1,4 +1,4 @@
-"""Which candidates to try next: Optuna's multi-objective TPE sampler, its trials in a journal on disk."""
+"""Multi-objective search with Optuna's TPE sampler; its trials are stored in a journal file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from optuna.trial import Trial, TrialState
 
 from twin.errors import TwinError
 from twin.judge.require import more_is_better
-from twin.study.spread import Spread
-from twin.study.study_file import Study, Tuning
+from twin.study.distribution import Distribution
+from twin.study.study_file import Study, TuningConfig
 
-NAME = "twin"  #: of the study in the journal
+NAME = "twin"  #: of the Optuna study in the journal
 
 
 class Proposal(NamedTuple):
-    """A candidate to fly."""
+    """A candidate to evaluate: trial number, value of each searched key, and the Optuna trial."""
 
     number: int
     values: dict[str, Any]
@@ -30,60 +30,62 @@ class Proposal(NamedTuple):
 
 
 class Search:
-    """The trials of a search, in `optuna.journal` of a folder: other programs may read it while the search goes on."""
+    """Search of a plan; its trials are in `optuna.journal`, which other programs may read at the same time."""
 
-    def __init__(self, study: Study, plan: Tuning, folder: Path):
-        """Begins a search, or goes on with it.
+    def __init__(self, study: Study, config: TuningConfig, folder: Path):
+        """Starts the search, or continues that of the folder.
 
         Raises:
             TwinError: the journal belongs to another search.
         """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self.plan, self.seed = plan, study.sampling.seed
-        self.axes = {key: _axis(spread) for key, spread in plan.search.items()}
-        self.trials = optuna.create_study(
+        self.config, self.seed = config, study.sampling.seed
+        self.space = {key: _optuna_distribution(distribution) for key, distribution in config.search.items()}
+        self.optuna_study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(folder / "optuna.journal"))),
             study_name=NAME,
-            directions=["maximize" if more_is_better(name) else "minimize" for name in plan.objectives],
+            directions=["maximize" if more_is_better(name) else "minimize" for name in config.objectives],
             load_if_exists=True,
         )
-        longer = {"tune": {"trials", "confirm"}}  # a search may go on beyond what it began with
-        identity = study.model_dump_json(exclude=longer | {"timeout_s": True, "retries": True})  # pyright: ignore
-        if self.trials.user_attrs.get("identity", identity) != identity:
-            raise TwinError("--resume", f"{folder} holds another search", "the study that it began with")
-        self.trials.set_user_attr("identity", identity)
+        extendable = {"tune": {"trials", "confirm"}}  # a continued search may have more trials
+        identity = study.model_dump_json(exclude=extendable | {"timeout_s": True, "retries": True})  # pyright: ignore
+        if self.optuna_study.user_attrs.get("identity", identity) != identity:
+            raise TwinError("--resume", f"{folder} contains another search", "the folder of this search")
+        self.optuna_study.set_user_attr("identity", identity)
 
-    def next(self) -> list[Proposal]:
-        """The candidates to fly next: those left unfinished, else a batch chosen from what is known; none at the end.
+    def next_batch(self) -> list[Proposal]:
+        """Returns the unfinished candidates of an interrupted search, else a new batch; empty after the last trial.
 
-        A batch depends on the trials before it alone, not on the number of workers nor on interruptions.
+        A batch depends only on the earlier trials, not on the number of workers or on interruptions.
         """
-        known = self.trials.get_trials(deepcopy=False)
-        if left := [trial for trial in known if trial.state == TrialState.RUNNING]:
-            return [_proposal(Trial(self.trials, trial._trial_id)) for trial in left]
-        self.trials.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
-        count = min(self.plan.batch, self.plan.trials - len(known))
-        return [_proposal(self.trials.ask(self.axes)) for _ in range(count)]
+        known = self.optuna_study.get_trials(deepcopy=False)
+        if unfinished := [trial for trial in known if trial.state == TrialState.RUNNING]:
+            return [_proposal(Trial(self.optuna_study, trial._trial_id)) for trial in unfinished]
+        self.optuna_study.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
+        count = min(self.config.batch, self.config.trials - len(known))
+        return [_proposal(self.optuna_study.ask(self.space)) for _ in range(count)]
 
     def finished(self) -> list[tuple[int, dict[str, Any]]]:
-        """Number and values of every candidate that was told."""
-        done = self.trials.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
-        return [(trial.number, dict(trial.params)) for trial in done]
+        """Returns number and values of every evaluated candidate."""
+        complete = self.optuna_study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+        return [(trial.number, dict(trial.params)) for trial in complete]
 
-    def tell(self, proposal: Proposal, objectives: Sequence[float], lack: float) -> None:
-        """What came of a candidate.
+    def record(self, proposal: Proposal, objectives: Sequence[float], shortfall: float) -> None:
+        """Records the evaluation of a candidate.
 
         Args:
-            lack: what the share of surveys that pass lacks of the required one; at most 0 is enough.
+            proposal: the candidate.
+            objectives: value of each objective.
+            shortfall: required minus achieved pass probability; the candidate is feasible if it is at most 0.
         """
-        proposal.trial.set_constraint("lack", lack)
-        self.trials.tell(proposal.trial, list(objectives))
+        proposal.trial.set_constraint("shortfall", shortfall)
+        self.optuna_study.tell(proposal.trial, list(objectives))
 
 
-def _axis(spread: Spread) -> BaseDistribution:
-    if spread.kind == "choice":
-        return CategoricalDistribution(spread.values)
-    return FloatDistribution(*spread.values, log=spread.kind == "log_uniform")
+def _optuna_distribution(distribution: Distribution) -> BaseDistribution:
+    if distribution.kind == "choice":
+        return CategoricalDistribution(distribution.values)
+    return FloatDistribution(*distribution.values, log=distribution.kind == "log_uniform")
 
 
 def _proposal(trial: Trial) -> Proposal:

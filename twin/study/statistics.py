@@ -1,4 +1,4 @@
-"""What a sample of surveys allows to say: shares, quantiles and dependences, each with how sure that is."""
+"""Statistics of a sample of surveys: proportions, quantiles, correlations and Sobol indices, with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -11,112 +11,137 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
 Array = NDArray[np.float64]
-LEVEL = 0.95  #: confidence of every interval
+LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: of every bootstrap
-_LISTED = 12  #: a number with no more values than this is taken value by value, others in bins
+_MIN_CLUSTERS = 5  # for a bootstrap interval
+_MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value, others into bins
 
 
 class Interval(NamedTuple):
-    """An estimate and the ends of its interval; NaN where there is too little to tell."""
+    """An estimate with the bounds of its confidence interval; NaN if there are too few data."""
 
     value: float
     low: float
     high: float
 
 
-def wilson(passed: float, count: float) -> Interval:
-    """Share of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
+def wilson_interval(successes: float, n: float) -> Interval:
+    """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
-    (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n); `count` may be an effective number.
-    """
-    if count <= 0:
-        return Interval(np.nan, 0.0, 1.0)
-    z, p = float(stats.norm.ppf(0.5 + LEVEL / 2)), passed / count
-    middle = (p + z**2 / (2 * count)) / (1 + z**2 / count)
-    half = z * np.sqrt(p * (1 - p) / count + z**2 / (4 * count**2)) / (1 + z**2 / count)
-    return Interval(p, max(0.0, float(middle - half)), min(1.0, float(middle + half)))
-
-
-def share(passed: ArrayLike, units: ArrayLike) -> Interval:
-    """Wilson's interval where surveys of one unit (same seed, or same sample) resemble each other.
-
-    The number of surveys is divided by the design effect (Kish 1965): the variance of the share as units scatter
-    over that of as many independent surveys; it stays between the number of units and that of surveys.
-    """
-    good = np.asarray(passed, dtype=float)
-    names, index = np.unique(np.asarray(units), return_inverse=True)
-    n, k = len(good), len(names)
-    if n == 0 or n == k:
-        return wilson(float(good.sum()), n)
-    p = float(good.mean())
-    off = np.bincount(index, good - p)
-    variance = float((off**2).sum()) / n**2 * k / max(k - 1, 1)
-    effective = min(max(p * (1 - p) / variance, k), n) if variance > 0 else k
-    return wilson(p * effective, effective)
-
-
-def bootstrap(values: ArrayLike, statistic: Callable[[Array], Array], units: ArrayLike | None = None) -> Interval:
-    """A statistic with its percentile bootstrap interval, whole units drawn; NaN ends of less than five units.
+    (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n)
 
     Args:
-        statistic: of the last axis, without regard to NaN.
+        successes: number of successes.
+        n: number of trials, or effective number of trials.
+    """
+    if n <= 0:
+        return Interval(np.nan, 0.0, 1.0)
+    z, p = float(stats.norm.ppf(0.5 + LEVEL / 2)), successes / n
+    centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    return Interval(p, max(0.0, float(centre - half)), min(1.0, float(centre + half)))
+
+
+def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
+    """Returns the proportion of successes with Wilson's interval, corrected for correlation within clusters.
+
+    The number of surveys is divided by the design effect (Kish 1965): the variance of the proportion estimated between
+    clusters over that of independent surveys. This effective number is limited to the range from the number of
+    clusters to the number of surveys.
+
+    Args:
+        passed: (n,) whether each survey passed.
+        clusters: (n,) label of the cluster of each survey, i.e. its sample or its seed.
+    """
+    success = np.asarray(passed, dtype=float)
+    labels, index = np.unique(np.asarray(clusters), return_inverse=True)
+    n, k = len(success), len(labels)
+    if n == 0 or n == k:
+        return wilson_interval(float(success.sum()), n)
+    p = float(success.mean())
+    residual = np.bincount(index, success - p)
+    variance = float((residual**2).sum()) / n**2 * k / max(k - 1, 1)
+    effective = min(max(p * (1 - p) / variance, k), n) if variance > 0 else k
+    return wilson_interval(p * effective, effective)
+
+
+def bootstrap_interval(
+    values: ArrayLike, statistic: Callable[[Array], Array], clusters: ArrayLike | None = None
+) -> Interval:
+    """Returns a statistic with its percentile bootstrap interval, resampling whole clusters.
+
+    Args:
+        values: (n,) data.
+        statistic: maps an array to its statistic along the last axis, ignoring NaN.
+        clusters: (n,) label of the cluster of each value; None if the values are independent.
+
+    Returns:
+        The bounds are NaN with fewer than five clusters.
     """
     data = np.asarray(values, dtype=float)
-    table = _by_unit(data, np.arange(len(data)) if units is None else np.asarray(units))
+    table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
     if len(table) == 0:
         return Interval(np.nan, np.nan, np.nan)
     value = float(statistic(table.reshape(-1)))
-    if len(table) < 5:
+    if len(table) < _MIN_CLUSTERS:
         return Interval(value, np.nan, np.nan)
 
-    def of_units(drawn: NDArray[np.int64], axis: int = -1) -> Array:
-        return statistic(table[drawn].reshape(*drawn.shape[:-1], -1))
+    def of_clusters(chosen: NDArray[np.int64], axis: int = -1) -> Array:
+        return statistic(table[chosen].reshape(*chosen.shape[:-1], -1))
 
-    found = stats.bootstrap(
-        (np.arange(len(table)),), of_units, n_resamples=RESAMPLES, batch=max(1, 2_000_000 // table.size),
+    bounds = stats.bootstrap(
+        (np.arange(len(table)),), of_clusters, n_resamples=RESAMPLES, batch=max(1, 2_000_000 // table.size),
         vectorized=True, confidence_level=LEVEL, method="percentile", rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
-    return Interval(value, float(found.low), float(found.high))
+    return Interval(value, float(bounds.low), float(bounds.high))
 
 
-def _by_unit(values: Array, units: NDArray) -> Array:
-    """(units, largest unit) table of the values, filled up with NaN."""
-    _, index = np.unique(units, return_inverse=True)
+def _by_cluster(values: Array, clusters: NDArray) -> Array:
+    """Returns the values as a (clusters, size of the largest) table, padded with NaN."""
+    _, index = np.unique(clusters, return_inverse=True)
     order = np.argsort(index, kind="stable")
     sizes = np.bincount(index)
     table = np.full((len(sizes), sizes.max(initial=0)), np.nan)
-    place = np.arange(len(values)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    table[index[order], place] = values[order]
+    column = np.arange(len(values)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    table[index[order], column] = values[order]
     return table
 
 
 def median(values: Array) -> Array:
+    """Returns the median along the last axis, ignoring NaN."""
     return percentile(values, 50)
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Along the last axis, without regard to NaN (ten times slower where there is any)."""
-    find = np.nanpercentile if np.isnan(values).any() else np.percentile
-    return find(values, percent, axis=-1)
+    """Returns a percentile along the last axis, ignoring NaN; ten times slower if there are any."""
+    function = np.nanpercentile if np.isnan(values).any() else np.percentile
+    return function(values, percent, axis=-1)
 
 
 def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
-    """Spearman's rank correlation; interval by Fisher's z of variance (1 + r^2/2)/(n - 3) (Bonett & Wright 2000)."""
+    """Returns Spearman's rank correlation with its interval, NaN with fewer than five values.
+
+    Interval: Fisher's z with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000, Psychometrika 65, 23).
+    """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) < 5 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return Interval(np.nan, np.nan, np.nan)
-    found: Any = stats.spearmanr(a, b)
-    r = float(found.statistic)
+    result: Any = stats.spearmanr(a, b)
+    r = float(result.statistic)
     z = float(stats.norm.ppf(0.5 + LEVEL / 2)) * np.sqrt((1 + r**2 / 2) / (len(a) - 3))
     centre = np.arctanh(np.clip(r, -1 + 1e-12, 1 - 1e-12))
     return Interval(r, float(np.tanh(centre - z)), float(np.tanh(centre + z)))
 
 
-def explained(groups: NDArray[np.int64], y: ArrayLike) -> float:
-    """Share of the variance of y's ranks that the group alone explains, without what chance alone would.
+def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
+    """Returns the fraction of the variance of y's ranks that the groups explain, corrected for chance.
 
-    The first-order Sobol index of the ranks from given samples, by groups; epsilon squared (Kelley 1935):
-    1 - (within / (n - k)) / (total / (n - 1)). NaN of less than five values a group.
+    An estimate of the first-order Sobol index of the ranks, by epsilon squared (Kelley 1935):
+    1 - (within / (n - k)) / (total / (n - 1)). NaN with fewer than five values per group on average.
+
+    Args:
+        groups: (n,) group of each value.
+        y: (n,) values.
     """
     ranks = stats.rankdata(y)
     n, k = len(ranks), len(np.unique(groups))
@@ -129,76 +154,93 @@ def explained(groups: NDArray[np.int64], y: ArrayLike) -> float:
 
 
 class SobolIndex(NamedTuple):
-    """Share of a metric's variance that an axis explains alone (first order), and with all others (total)."""
+    """First-order and total Sobol index of an axis: fraction of a metric's variance, without and with interactions."""
 
     first: Interval
     total: Interval
 
 
-def sobol_indices(outcomes: ArrayLike, n_axes: int) -> list[SobolIndex]:
-    """First-order and total Sobol indices of a Saltelli design, with bootstrap intervals (`scipy.stats.sobol_indices`).
+def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
+    """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals.
+
+    See `scipy.stats.sobol_indices`.
 
     Args:
-        outcomes: (n (n_axes + 2),) of the blocks A, B, AB_1, AB_2, ...
+        values: (n (n_axes + 2),) metric at the design points of the blocks A, B, AB_1, AB_2, ...
+        n_axes: number of sampled axes.
     """
-    blocks = np.asarray(outcomes, dtype=float).reshape(n_axes + 2, 1, -1)
+    blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)
     given: Any = {"f_A": blocks[0], "f_B": blocks[1], "f_AB": blocks[2:]}
-    found: Any = stats.sobol_indices(func=given, n=blocks.shape[-1], rng=np.random.default_rng(0))
-    with warnings.catch_warnings(action="ignore"):  # an axis without any effect has no spread
-        ends: Any = found.bootstrap(confidence_level=LEVEL, n_resamples=RESAMPLES)
+    result: Any = stats.sobol_indices(func=given, n=blocks.shape[-1], rng=np.random.default_rng(0))
+    with warnings.catch_warnings(action="ignore"):  # an axis without any effect has a variance of 0
+        resampled: Any = result.bootstrap(confidence_level=LEVEL, n_resamples=RESAMPLES)
 
     def interval(name: str, k: int) -> Interval:
-        value, between = float(np.ravel(getattr(found, name))[k]), getattr(ends, name).confidence_interval
-        low, high = (float(np.ravel(end)[k]) for end in between)
+        value, bounds = float(np.ravel(getattr(result, name))[k]), getattr(resampled, name).confidence_interval
+        low, high = (float(np.ravel(bound)[k]) for bound in bounds)
         return Interval(value, low, high) if np.isfinite(low) else Interval(value, value, value)
 
     return [SobolIndex(interval("first_order", k), interval("total_order", k)) for k in range(n_axes)]
 
 
-def threshold(x: ArrayLike, passed: ArrayLike, share: float, rising: bool, units: ArrayLike) -> Interval:
-    """How far x may go until fewer than `share` pass, with its bootstrap interval.
+def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool, clusters: ArrayLike) -> Interval:
+    """Returns the x at which the pass probability crosses a given value, with its cluster bootstrap interval.
 
-    The probability of passing as a function of x is the monotone one of greatest likelihood (isotonic regression,
-    Barlow et al. 1972); x is where it crosses `share`. Infinite where it never does.
+    The pass probability is estimated as a monotone function of x by isotonic regression (Barlow et al. 1972).
 
     Args:
-        rising: whether more pass as x grows.
+        x: (n,) value of the key for each survey.
+        passed: (n,) whether each survey passed.
+        probability: pass probability at the threshold.
+        rising: whether the pass probability increases with x.
+        clusters: (n,) label of the cluster of each survey.
+
+    Returns:
+        Infinite if the probability is not crossed within the data; NaN with fewer than five clusters.
     """
-    sign, good = 1.0 if rising else -1.0, np.asarray(passed, float)
-    _, unit = np.unique(np.asarray(units), return_inverse=True)
-    values, place = np.unique(sign * np.asarray(x, float), return_inverse=True)
-    n_units = unit.max(initial=-1) + 1
-    if n_units < 5:
+    sign, success = 1.0 if rising else -1.0, np.asarray(passed, float)
+    _, cluster = np.unique(np.asarray(clusters), return_inverse=True)
+    values, index = np.unique(sign * np.asarray(x, float), return_inverse=True)
+    n_clusters = cluster.max(initial=-1) + 1
+    if n_clusters < _MIN_CLUSTERS:
         return Interval(np.nan, np.nan, np.nan)
 
     def crossing(weight: Array) -> float:
-        total = np.bincount(place, weight)
-        at = total > 0
-        level = optimize.isotonic_regression(np.bincount(place, weight * good)[at] / total[at], weights=total[at]).x
-        first = int(np.searchsorted(level, share - 1e-9))
-        if first in (0, len(level)):
+        total = np.bincount(index, weight)
+        used = total > 0
+        fit = optimize.isotonic_regression(
+            np.bincount(index, weight * success)[used] / total[used], weights=total[used]
+        ).x
+        first = int(np.searchsorted(fit, probability - 1e-9))
+        if first in (0, len(fit)):
             return -np.inf if first == 0 else np.inf
-        return float(values[at][first - 1 : first + 1].mean())
+        return float(values[used][first - 1 : first + 1].mean())
 
     rng = np.random.default_rng(0)
-    often = rng.multinomial(n_units, np.full(n_units, 1 / n_units), size=RESAMPLES).astype(float)
-    found = [crossing(times[unit]) for times in often]
-    low, high = sorted(sign * np.quantile(found, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], method="inverted_cdf"))
-    return Interval(sign * crossing(np.ones(len(good))), float(low), float(high))
+    counts = rng.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=RESAMPLES).astype(float)
+    crossings = [crossing(count[cluster]) for count in counts]
+    low, high = sorted(sign * np.quantile(crossings, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], method="inverted_cdf"))
+    return Interval(sign * crossing(np.ones(len(success))), float(low), float(high))
 
 
-def groups_of(x: ArrayLike) -> NDArray[np.int64]:
-    """Which group each number is in: its value where there are few, else one of up to ten bins of equal count."""
+def group_indices(x: ArrayLike) -> NDArray[np.int64]:
+    """Returns the group of each number: its value if there are few distinct ones, else one of up to ten equal bins.
+
+    Each bin has about the same number of values.
+    """
     values = np.asarray(x, dtype=float)
-    listed, index = np.unique(values, return_inverse=True)
-    if len(listed) <= _LISTED and len(listed) < len(values):
+    distinct, index = np.unique(values, return_inverse=True)
+    if len(distinct) <= _MAX_DISCRETE and len(distinct) < len(values):
         return index.astype(np.int64)
     bins = int(np.clip(len(values) // 6, 2, 10))
     return (stats.rankdata(values, method="ordinal") - 1).astype(np.int64) * bins // max(len(values), 1)
 
 
-def how_often_above(x: ArrayLike, y: ArrayLike) -> float:
-    """Share of pairs in which a value of x is above one of y, ties by half: Mann & Whitney's U over all pairs."""
+def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
+    """Returns the probability that a value of x exceeds one of y, with ties counting half; NaN if x or y is empty.
+
+    U / (n_x n_y) with U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
+    """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) == 0 or len(b) == 0:
         return float("nan")

@@ -1,4 +1,4 @@
-"""The surveys of a study: each sample as a checked scenario, once for each seed."""
+"""Surveys of a study: the validated scenario of each sample, once per seed."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import read_tree, with_values
 from twin.scenario.model import Scenario, Source
-from twin.study.design import Sample, samples, seeds
+from twin.study.design import Sample, samples, seeds_of_sample
 from twin.study.study_file import Study, named_keys
 
-_MOST_FAULTS = 20
+_MAX_ERRORS = 20
 
 
 class Survey(NamedTuple):
-    """One survey of a study: its sample, what varies, the scenario to fly, its folder and what is to stay of it."""
+    """One survey of a study: sample, seed, varied values, scenario with its hash, run folder, and what to keep."""
 
     sample: int
     seed: int
@@ -28,75 +28,91 @@ class Survey(NamedTuple):
 
     @property
     def key(self) -> tuple[int, int]:
+        """Returns sample and seed, which identify a survey within its study."""
         return self.sample, self.seed
 
 
 class SampleSource(Source):
-    """Tells a fault of a sampled scenario at the key of the study that brought it about."""
+    """Source of a sampled scenario: reports an error at the line of the study file that gives the key."""
 
     sample: int
-    given: dict[str, str]  #: where in the study a key of the scenario is given
+    given: dict[str, str]  #: dotted name in the study file that gives a scenario key, by scenario key
 
-    def fault(self, error: TwinError) -> str:
+    def describe(self, error: TwinError) -> str:
+        """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, followed by the number of the sample."""
         key = error.field
         while key not in self.given and "." in key:
             key = key.rpartition(".")[0]
-        place = self.given.get(key, "scenario")
-        if place.endswith(key):  # its own line, as "vary.plan.tracks"
-            said = TwinError(place + error.field.removeprefix(key), error.problem, error.allowed)
+        study_key = self.given.get(key, "scenario")
+        if study_key.endswith(key):  # e.g. "vary.plan.tracks", which has a line of its own
+            in_study = TwinError(study_key + error.field.removeprefix(key), error.problem, error.allowed)
         else:
-            said = TwinError(place, str(error))
-        return f"{super().fault(said)} in sample {self.sample}"
+            in_study = TwinError(study_key, str(error))
+        return f"{super().describe(in_study)} in sample {self.sample}"
 
 
 def surveys(study: Study, folder: Path) -> Iterator[Survey]:
-    """Every survey of the study, sample by sample.
+    """Yields every survey of the study, sample by sample.
+
+    Args:
+        folder: results folder of the study; the run folders are created in its subfolder `runs`.
 
     Raises:
-        ScenarioError: the faults of a sample.
+        ScenarioError: the scenario of a sample is not valid.
     """
-    base = read_tree(study.base)
+    base = read_tree(study.scenario_file)
     for sample in samples(study):
-        yield from surveys_of(study, folder, sample, sampled(study, base, sample))
+        yield from surveys_of_sample(study, folder, sample, scenario_of_sample(study, base, sample))
 
 
-def surveys_of(study: Study, folder: Path, sample: Sample, scenario: Scenario) -> Iterator[Survey]:
-    """The surveys of one sample: a seed each."""
-    for seed in seeds(study, sample):
-        flown = scenario.model_copy(update={"seed": seed})
-        place = folder / "runs" / f"{sample.number:05d}_s{seed}"
-        yield Survey(sample.number, seed, sample.values, flown, flown.fingerprint(), place, study.keep)
+def surveys_of_sample(study: Study, folder: Path, sample: Sample, scenario: Scenario) -> Iterator[Survey]:
+    """Yields the surveys of one sample: one per seed."""
+    for seed in seeds_of_sample(study, sample):
+        seeded = scenario.model_copy(update={"seed": seed})
+        run_folder = folder / "runs" / f"{sample.number:05d}_s{seed}"
+        yield Survey(sample.number, seed, sample.values, seeded, seeded.fingerprint(), run_folder, study.keep)
 
 
-def keys(study: Study) -> Iterator[tuple[int, int]]:
-    """Sample and seed of every survey."""
-    return ((sample.number, seed) for sample in samples(study) for seed in seeds(study, sample))
+def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
+    """Yields sample and seed of every survey."""
+    return ((sample.number, seed) for sample in samples(study) for seed in seeds_of_sample(study, sample))
 
 
-def sampled(study: Study, base: Mapping[str, Any], sample: Sample) -> Scenario:
-    """The scenario of a sample. Raises ScenarioError with every fault, told with the study's lines."""
-    given = {key: place for place, key in named_keys(study)}
+def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) -> Scenario:
+    """Returns the scenario of a sample.
+
+    Args:
+        base: keys and values of the scenario that the study varies.
+
+    Raises:
+        ScenarioError: lists every error of the scenario, each with a line of the study file.
+    """
+    given = {key: study_key for study_key, key in named_keys(study)}
     source = SampleSource(path=study.source.path, lines=study.source.lines, sample=sample.number, given=given)
     tree = dict(base) | ({"require": study.limits} if study.limits else {})
     return with_values(tree, study.set | sample.values, source)
 
 
 def check_samples(study: Study) -> None:
-    """Builds the scenario of every sample. Raises ScenarioError with the faults of all, each place once."""
-    base, faults = read_tree(study.base), []
+    """Validates the scenario of every sample.
+
+    Raises:
+        ScenarioError: lists the errors of all samples, each key once.
+    """
+    base, errors = read_tree(study.scenario_file), []
     for sample in samples(study):
         try:
-            sampled(study, base, sample)
+            scenario_of_sample(study, base, sample)
         except ScenarioError as error:
-            faults += error.lines
-    if faults:
-        raise ScenarioError(told(faults))
+            errors += error.lines
+    if errors:
+        raise ScenarioError(merge_errors(errors))
 
 
-def told(faults: Iterable[str]) -> list[str]:
-    """Faults of many samples, each place and key once, with the number of further samples."""
-    places: dict[str, list[str]] = {}
-    for fault in faults:
-        places.setdefault(": ".join(fault.split(": ")[:2]), []).append(fault)
-    lines = [same[0] + (f" and {len(same) - 1} more" if len(same) > 1 else "") for same in places.values()]
-    return lines[:_MOST_FAULTS] + ([f"... and {len(lines) - _MOST_FAULTS} more"] if len(lines) > _MOST_FAULTS else [])
+def merge_errors(errors: Iterable[str]) -> list[str]:
+    """Returns one error per line and key of the study file, with the number of further samples that have it."""
+    by_key: dict[str, list[str]] = {}
+    for error in errors:
+        by_key.setdefault(": ".join(error.split(": ")[:2]), []).append(error)
+    lines = [same[0] + (f" and {len(same) - 1} more" if len(same) > 1 else "") for same in by_key.values()]
+    return lines[:_MAX_ERRORS] + ([f"... and {len(lines) - _MAX_ERRORS} more"] if len(lines) > _MAX_ERRORS else [])

@@ -1,4 +1,4 @@
-"""A good plan: candidates are chosen, flown in the same conditions and judged; the best are flown again, afresh."""
+"""Search of a survey plan: candidates are evaluated under common conditions, finalists again with new seeds."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ from twin.errors import ScenarioError, TwinError
 from twin.judge.require import more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
-from twin.study.campaign import fly_all, open_folder
 from twin.study.design import Sample, samples
 from twin.study.engine import Engine
 from twin.study.flight import Row, fly, has_passed
-from twin.study.ledger import write_parquet
-from twin.study.progress import Progress
+from twin.study.progress import StudyProgress
+from twin.study.results_log import write_parquet
+from twin.study.runner import fly_surveys, open_folder
 from twin.study.search import Search
-from twin.study.statistics import Interval, wilson
-from twin.study.study_file import Study, Tuning
-from twin.study.surveys import Survey, keys, sampled, surveys_of, told
+from twin.study.statistics import Interval, wilson_interval
+from twin.study.study_file import Study, TuningConfig
+from twin.study.surveys import Survey, merge_errors, scenario_of_sample, survey_keys, surveys_of_sample
 
-_LEAST_SHARE = 0.5  # that must pass where the study does not say
-_FRESH = 1_000_000  # added to the seed where a finalist is flown again
-_WORST = 1e9  # of an objective where no survey was complete; Optuna has no infinity
+_DEFAULT_PROBABILITY = 0.5  # required pass probability if the study has none
+_SEED_OFFSET = 1_000_000  # of the confirmation of finalists
+_PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna does not accept infinity
 
 
-class Flown(NamedTuple):
-    """What a search keeps of a survey."""
+class SurveyScore(NamedTuple):
+    """Result of a survey as far as the search needs it: status, whether it passed, and metrics of the objectives."""
 
     status: str
     passed: bool
-    figures: dict[str, float | None]
+    metrics: dict[str, float | None]
 
 
 class Candidate(NamedTuple):
-    """A plan that was tried: the values chosen, its objectives, the share of surveys that pass, and what it lacks."""
+    """An evaluated plan: trial number, value of each searched key, objectives, pass probability and its shortfall."""
 
     number: int
     values: dict[str, Any]
     objectives: tuple[float, ...]
-    share: Interval
-    lack: float  #: of the share that is required; at most 0 is enough
+    pass_probability: Interval
+    shortfall: float  #: required minus achieved pass probability; at most 0 if the plan is feasible
 
     @property
-    def has_result(self) -> bool:
-        """Whether any survey was complete, so that it has figures."""
-        return max(abs(value) for value in self.objectives) < _WORST
+    def has_metrics(self) -> bool:
+        """Returns whether any of its surveys was completed, so that all objectives have a value."""
+        return max(abs(value) for value in self.objectives) < _PENALTY
 
 
-class Tuned(NamedTuple):
-    """A search that is over: every candidate, those flown afresh, and the plan recommended as flown afresh."""
+class TuningResult(NamedTuple):
+    """Result of a search: all candidates, the finalists as re-evaluated with new seeds, and the recommended plan."""
 
     candidates: list[Candidate]
     finalists: list[Candidate]
@@ -66,147 +66,182 @@ def tune(
     folder: Path,
     resume: bool,
     engine: Engine,
-    progress: Progress,
+    progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
-) -> Tuned:
-    """Searches as `[tune]` says; what the folder has already is not flown again. Ctrl-C ends it early.
+) -> TuningResult:
+    """Searches the plan that `[tune]` describes, and writes results.parquet. Ctrl-C ends the search early.
+
+    Args:
+        folder: results folder, new or empty unless `resume` is set.
+        resume: continue the search of the folder; its surveys are not flown again.
+        function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: there is no [tune]; the folder is taken, cannot be written, or belongs to another search.
-        ScenarioError: an end of the search is no valid scenario. Nothing was flown.
+        TwinError: the study has no [tune]; the folder is not empty, cannot be written, or belongs to another search.
+        ScenarioError: a bound of the search gives an invalid scenario; nothing was flown.
     """
-    plan = plan_of(study)
-    check_ends(study, plan)
-    ledger = open_folder(folder, resume, ())
-    flights = Flights(study, plan, folder, ledger.rows())
+    config = tuning_config(study)
+    check_bounds(study, config)
+    log = open_folder(folder, resume, ())
+    trial_surveys = CandidateSurveys(study, config, folder, log.rows())
 
-    def flown(way: Flights, candidates: dict[int, dict[str, Any]]) -> bool:
-        def write(row: Row) -> None:
-            ledger.add(row)
-            way.keep(row)
+    def fly_candidates(plan_surveys: CandidateSurveys, candidates: dict[int, dict[str, Any]]) -> bool:
+        def add_row(row: Row) -> None:
+            log.add(row)
+            plan_surveys.add(row)
 
-        return fly_all(study, way.missing(candidates), write, engine, progress, function)
+        return fly_surveys(study, plan_surveys.missing(candidates), add_row, engine, progress, function)
 
-    search, tried, interrupted = Search(study, plan, folder), [], False
-    progress.begin(plan.trials * flights.n_surveys)
-    while not interrupted and (batch := search.next()):
-        interrupted = not flown(flights, {p.number: p.values for p in batch})
+    search, interrupted = Search(study, config, folder), False
+    progress.begin(config.trials * trial_surveys.n_surveys)
+    while not interrupted and (batch := search.next_batch()):
+        interrupted = not fly_candidates(trial_surveys, {p.number: p.values for p in batch})
         for proposal in batch if not interrupted else ():
-            candidate = flights.judge(proposal.number, proposal.values)
-            search.tell(proposal, candidate.objectives, candidate.lack)
-    tried = [flights.judge(number, values) for number, values in search.finished()]
+            candidate = trial_surveys.evaluate(proposal.number, proposal.values)
+            search.record(proposal, candidate.objectives, candidate.shortfall)
+    candidates = [trial_surveys.evaluate(number, values) for number, values in search.finished()]
 
-    afresh, finalists, recommended = flights.afresh(ledger.rows()), [], None
-    front = best(tried, plan)
+    confirmation, finalists, recommended = trial_surveys.confirmation(log.rows()), [], None
+    front = pareto_front(candidates, config)
     first, end = 0, len(front)
-    while first < end and not interrupted:  # the better in the first objective, the riskier: halved again and again
+    while first < end and not interrupted:  # bisection: a better first objective usually has a lower pass probability
         middle = (first + end) // 2
         chosen = front[middle]
-        progress.begin(progress.total + afresh.n_surveys)
-        if interrupted := not flown(afresh, {chosen.number: chosen.values}):
+        progress.begin(progress.total + confirmation.n_surveys)
+        if interrupted := not fly_candidates(confirmation, {chosen.number: chosen.values}):
             break
-        finalists.append(afresh.judge(chosen.number, chosen.values))
-        if finalists[-1].lack <= 0:
+        finalists.append(confirmation.evaluate(chosen.number, chosen.values))
+        if finalists[-1].shortfall <= 0:
             recommended, end = finalists[-1], middle
         else:
             first = middle + 1
-    scenario = flights.scenario(recommended) if recommended else None
-    ledger.flush()
-    write_parquet(ledger.table(), folder / "results.parquet")
-    return Tuned(tried, finalists, recommended, scenario, interrupted)
+    scenario = trial_surveys.scenario(recommended) if recommended else None
+    log.flush()
+    write_parquet(log.table(), folder / "results.parquet")
+    return TuningResult(candidates, finalists, recommended, scenario, interrupted)
 
 
-def plan_of(study: Study) -> Tuning:
-    """What is searched. Raises TwinError."""
+def tuning_config(study: Study) -> TuningConfig:
+    """Returns the section [tune] of a study.
+
+    Raises:
+        TwinError: the study has none.
+    """
     if study.tune is None:
-        raise TwinError(str(study.source.path), "there is no section [tune]", "a study that searches")
+        raise TwinError(str(study.source.path), "has no section [tune]", "a study with a section [tune]")
     return study.tune
 
 
-class Flights:
-    """The surveys of candidates: the same conditions and the same seeds for each."""
+def required_probability(study: Study) -> float:
+    """Returns the pass probability that a plan must reach."""
+    return _DEFAULT_PROBABILITY if study.probability is None else study.probability
 
-    def __init__(self, study: Study, plan: Tuning, folder: Path, rows: Iterable[Row]):
-        self.study, self.plan, self.folder = study, plan, folder
-        self.base, self.conditions = read_tree(study.base), list(samples(study))
-        self.n_surveys = len(list(keys(study)))
-        self._flown: dict[tuple[int, int], Flown] = {}
+
+class CandidateSurveys:
+    """Surveys of the candidates: all candidates have the same conditions and the same seeds.
+
+    Keeps the results of the surveys flown so far.
+    """
+
+    def __init__(self, study: Study, config: TuningConfig, folder: Path, rows: Iterable[Row]):
+        self.study, self.config, self.folder = study, config, folder
+        self.base, self.conditions = read_tree(study.scenario_file), list(samples(study))
+        self.n_surveys = len(list(survey_keys(study)))
+        self._scores: dict[tuple[int, int], SurveyScore] = {}
         for row in rows:
-            self.keep(row)
+            self.add(row)
 
-    def afresh(self, rows: Iterable[Row]) -> Flights:
-        """The same with other draws and other seeds, and more of them."""
+    def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
+        """Returns the surveys that confirm a finalist: with new samples and seeds, and `confirm` times as many.
+
+        Args:
+            rows: rows of the surveys flown so far.
+        """
         sampling = self.study.sampling
-        more = "seeds" if sampling.samples is None else "samples"
-        fresh = {"seed": sampling.seed + _FRESH, more: (getattr(sampling, more) or 1) * self.plan.confirm}
-        study = self.study.model_copy(update={"sampling": sampling.model_copy(update=fresh)})
-        return Flights(study, self.plan, self.folder, rows)
+        count = "seeds" if sampling.samples is None else "samples"
+        update = {"seed": sampling.seed + _SEED_OFFSET, count: (getattr(sampling, count) or 1) * self.config.confirm}
+        study = self.study.model_copy(update={"sampling": sampling.model_copy(update=update)})
+        return CandidateSurveys(study, self.config, self.folder, rows)
 
-    def keep(self, row: Row) -> None:
-        """Remembers what a search needs of a row."""
-        figures = {name: row.get(name) for name in self.plan.objectives}
-        self._flown[row["sample"], row["seed"]] = Flown(row["status"], has_passed(row), figures)
+    def add(self, row: Row) -> None:
+        """Adds the result of a survey."""
+        metrics = {name: row.get(name) for name in self.config.objectives}
+        self._scores[row["sample"], row["seed"]] = SurveyScore(row["status"], has_passed(row), metrics)
 
     def surveys(self, number: int, values: dict[str, Any]) -> Iterator[Survey]:
-        """What a candidate flies."""
+        """Yields the surveys of a candidate.
+
+        Args:
+            number: trial number of the candidate.
+            values: value of each searched key.
+        """
         for condition in self.conditions:
-            mixed = Sample(number * len(self.conditions) + condition.number, condition.draw, values | condition.values)
-            yield from surveys_of(self.study, self.folder, mixed, sampled(self.study, self.base, mixed))
+            index = number * len(self.conditions) + condition.number
+            sample = Sample(index, condition.point, values | condition.values)
+            scenario = scenario_of_sample(self.study, self.base, sample)
+            yield from surveys_of_sample(self.study, self.folder, sample, scenario)
 
     def missing(self, candidates: dict[int, dict[str, Any]]) -> Iterator[Survey]:
-        """The surveys of these candidates that were not flown, or failed."""
+        """Yields the surveys of these candidates (values by trial number) that have no result yet, or failed."""
         for number, values in candidates.items():
             for survey in self.surveys(number, values):
-                if survey.key not in self._flown or self._flown[survey.key].status == "failed":
+                if survey.key not in self._scores or self._scores[survey.key].status == "failed":
                     yield survey
 
-    def judge(self, number: int, values: dict[str, Any]) -> Candidate:
-        """What its surveys say of a candidate; those that failed say nothing."""
-        flown = [self._flown[survey.key] for survey in self.surveys(number, values)]
-        ended = [one for one in flown if one.status != "failed"]
-        share = wilson(sum(one.passed for one in ended), len(ended))
-        required = _LEAST_SHARE if self.study.probability is None else self.study.probability
-        lack = required - share.value if ended else 1.0
-        return Candidate(
-            number, values, tuple(self._objective(name, ended) for name in self.plan.objectives), share, lack
-        )
+    def evaluate(self, number: int, values: dict[str, Any]) -> Candidate:
+        """Returns a candidate with its objectives and pass probability; surveys that failed are not counted.
 
-    def _objective(self, name: str, ended: list[Flown]) -> float:
-        """Risk, or the median of a metric over the surveys that were complete."""
+        Args:
+            number: trial number of the candidate.
+            values: value of each searched key.
+        """
+        flown = [self._scores[survey.key] for survey in self.surveys(number, values)]
+        scores = [score for score in flown if score.status != "failed"]
+        passing = wilson_interval(sum(score.passed for score in scores), len(scores))
+        shortfall = required_probability(self.study) - passing.value if scores else 1.0
+        objectives = tuple(self._objective(name, scores) for name in self.config.objectives)
+        return Candidate(number, values, objectives, passing, shortfall)
+
+    def _objective(self, name: str, scores: list[SurveyScore]) -> float:
+        """Returns the risk, or the median of a metric over the completed surveys."""
         if name == "risk":
-            return 1.0 - sum(one.passed for one in ended) / len(ended) if ended else 1.0
-        figures = [one.figures[name] for one in ended if one.status == "complete"]
-        known = [figure for figure in figures if figure is not None]
-        return float(np.median(known)) if known else -_WORST if more_is_better(name) else _WORST
+            return 1.0 - sum(score.passed for score in scores) / len(scores) if scores else 1.0
+        complete = [score.metrics[name] for score in scores if score.status == "complete"]
+        known = [value for value in complete if value is not None]
+        return float(np.median(known)) if known else -_PENALTY if more_is_better(name) else _PENALTY
 
     def scenario(self, candidate: Candidate) -> Scenario:
-        """The plan as a scenario, in the conditions of the study's own scenario."""
-        return sampled(self.study, self.base, Sample(0, 0, candidate.values))
+        """Returns the plan as a scenario, under the conditions of the scenario that the study varies."""
+        return scenario_of_sample(self.study, self.base, Sample(0, 0, candidate.values))
 
 
-def check_ends(study: Study, plan: Tuning) -> None:
-    """Builds the scenario at each end of what is searched. Raises ScenarioError with all faults, each once."""
-    base, faults = read_tree(study.base), []
+def check_bounds(study: Study, config: TuningConfig) -> None:
+    """Validates the scenario at each bound of the search.
+
+    Raises:
+        ScenarioError: lists all errors, each key once.
+    """
+    base, errors = read_tree(study.scenario_file), []
     condition = next(samples(study))
-    for key, spread in plan.search.items():
-        for value in spread.values:
+    for key, distribution in config.search.items():
+        for value in distribution.values:
             try:
-                sampled(study, base, condition._replace(values={key: value} | condition.values))
+                scenario_of_sample(study, base, condition._replace(values={key: value} | condition.values))
             except ScenarioError as error:
-                faults += error.lines
-    if faults:
-        raise ScenarioError(told(faults))
+                errors += error.lines
+    if errors:
+        raise ScenarioError(merge_errors(errors))
 
 
-def best(candidates: list[Candidate], plan: Tuning) -> list[Candidate]:
-    """Of those that pass often enough, the ones that no other beats; the best in the first objective first."""
-    kept = [candidate for candidate in candidates if candidate.lack <= 0]
-    signs = np.array([-1.0 if more_is_better(name) else 1.0 for name in plan.objectives])
-    front = [one for one in kept if not any(_beats(other, one, signs) for other in kept)]
+def pareto_front(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
+    """Returns the Pareto-optimal candidates among the feasible ones, sorted by the first objective, best first."""
+    feasible = [candidate for candidate in candidates if candidate.shortfall <= 0]
+    signs = np.array([-1.0 if more_is_better(name) else 1.0 for name in config.objectives])
+    front = [one for one in feasible if not any(_dominates(other, one, signs) for other in feasible)]
     return sorted(front, key=lambda one: (tuple(signs * one.objectives), one.number))
 
 
-def _beats(one: Candidate, other: Candidate, signs: Any) -> bool:
-    """Whether it is nowhere worse and somewhere better."""
-    mine, theirs = signs * one.objectives, signs * other.objectives
-    return bool((mine <= theirs).all() and (mine < theirs).any())
+def _dominates(one: Candidate, other: Candidate, signs: Any) -> bool:
+    """Returns whether `one` is better than `other` in some objective and worse in none."""
+    a, b = signs * one.objectives, signs * other.objectives
+    return bool((a <= b).all() and (a < b).any())

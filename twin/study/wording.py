@@ -1,183 +1,194 @@
-"""What a study found, in plain sentences."""
+"""Results of a study in sentences."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from twin.judge.require import more_is_better
-from twin.report.wording import DASH, length
-from twin.report.wording import plain as number
-from twin.study.findings import Contrast, Findings
+from twin.report.wording import DASH, length, percent, plain
+from twin.study.analysis import KeyComparison, StudyAnalysis
 from twin.study.statistics import LEVEL, Interval
 from twin.study.study_file import Study
 
-_NAMES = {
-    "trajectory.final.ate_rmse_m": "error of the final path (RMS)",
-    "trajectory.online.ate_rmse_m": "error of the path as flown (RMS)",
-    "map.le90_m": "map error that 90 % of heights keep (LE90)",
-    "map.completeness": "completeness of the map",
-    "map.rmse_m": "map error (RMS)",
-    "map.nmad_m": "map error (NMAD)",
-    "timing.simulated_s": "survey time",
-    "vision.points_median": "matched points",
-    "vision.points_p10": "matched points of the worst tenth",
-    "vision.contrast_median": "contrast of the images",
+_METRIC_NAMES = {
+    "trajectory.final.ate_rmse_m": "final trajectory error (ATE, RMSE)",
+    "trajectory.online.ate_rmse_m": "online trajectory error (ATE, RMSE)",
+    "map.le90_m": "map height error (LE90)",
+    "map.completeness": "map completeness",
+    "map.rmse_m": "map height error (RMSE)",
+    "map.nmad_m": "map height error (NMAD)",
+    "timing.simulated_s": "survey duration",
+    "vision.points_median": "matched points (median)",
+    "vision.points_p10": "matched points (10th percentile)",
+    "vision.contrast_median": "image contrast (median)",
+    "risk": "risk (fraction not passed)",
 }
 
 
-def name_of(metric: str) -> str:
-    """A metric in words where there are some."""
-    return _NAMES.get(metric, metric)
+def metric_name(metric: str) -> str:
+    """Returns the name of a metric in words, or its dotted name if there is none."""
+    return _METRIC_NAMES.get(metric, metric)
 
 
-def value_of(metric: str, value: float | None) -> str:
-    """A figure in the unit that its name says."""
+def metric_value(metric: str, value: float | None) -> str:
+    """Returns the value of a metric with its unit; `risk` is a fraction."""
+    if metric == "risk":
+        return percent(value)
     if value is None or not np.isfinite(value):
         return DASH
     if metric.endswith("_m"):
         return length(value)
-    return number(float(value)) + (" s" if metric.endswith("_s") else "")
+    return plain(float(value)) + (" s" if metric.endswith("_s") else "")
 
 
-def interval(metric: str, found: Interval) -> str:
-    """A figure with the ends of its interval."""
-    ends = f" ({value_of(metric, found.low)} to {value_of(metric, found.high)})" if np.isfinite(found.low) else ""
-    return value_of(metric, found.value) + ends
+def metric_interval(metric: str, interval: Interval) -> str:
+    """Returns the estimate of a metric with its confidence interval in brackets."""
+    low, high = metric_value(metric, interval.low), metric_value(metric, interval.high)
+    bounds = f" ({low} to {high})" if np.isfinite(interval.low) else ""
+    return metric_value(metric, interval.value) + bounds
 
 
-def headed(metric: str) -> str:
-    """A metric as a heading begins with it."""
-    words = name_of(metric)
-    return words[:1].upper() + words[1:]
+def metric_heading(metric: str) -> str:
+    """Returns the name of a metric with a capital initial."""
+    name = metric_name(metric)
+    return name[:1].upper() + name[1:]
 
 
-def correlation(found: Interval) -> str:
-    """A rank correlation with its interval."""
-    return f"{found.value:+.2f} ({found.low:+.2f} to {found.high:+.2f})" if np.isfinite(found.value) else DASH
-
-
-def percent(share: float) -> str:
-    """A share; no rounding makes a few into none or nearly all into all."""
-    if not np.isfinite(share):
+def correlation(interval: Interval) -> str:
+    """Returns a rank correlation with its confidence interval in brackets."""
+    if not np.isfinite(interval.value):
         return DASH
-    shown = 100 * share
-    return f"{shown:.1f} %" if 0 < shown < 1 or 99 < shown < 100 else f"{shown:.0f} %"
+    return f"{interval.value:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
 
 
-def share(found: Interval) -> str:
-    """A share with its interval; small samples put some below 0."""
-    return f"{percent(found.value)} ({percent(found.low)} to {percent(found.high)})"
+def percent_interval(interval: Interval) -> str:
+    """Returns a fraction in percent with its confidence interval in brackets."""
+    return f"{percent(interval.value)} ({percent(interval.low)} to {percent(interval.high)})"
 
 
-def passing_of(found: Interval) -> str:
-    """A share with its confidence."""
-    return f"{percent(found.value)} ({percent(LEVEL)} confidence: {percent(found.low)} to {percent(found.high)})"
+def confidence(interval: Interval) -> str:
+    """Returns a fraction in percent with its labelled confidence interval."""
+    return f"{percent(interval.value)} ({_labelled(percent(interval.low), percent(interval.high))})"
 
 
-def headline(study: Study, found: Findings) -> str:
-    """The answer: how far the sought key may go, how probable it is that a survey passes, and what that means."""
-    n = int(found.ended.sum())
+def headline(study: Study, analysis: StudyAnalysis) -> str:
+    """Returns the main result: threshold of the `seek` key, pass probability, and whether the requirement is met."""
+    n = int(analysis.evaluated.sum())
     if n == 0:
-        return "No survey ended, so nothing can be said." + _failed(found)
-    passing = found.share
+        return "No survey could be evaluated." + _failed(analysis)
     return (
-        f"{_sought(study, found)}A survey passes with a probability of {percent(passing.value)} ({percent(LEVEL)} "
-        f"confidence: {percent(passing.low)} to {percent(passing.high)}): {int(found.passed.sum())} of {n} "
-        f"{_passing(found)}.{_required(found)}{_reason(found)}{_failed(found)}{_beware(found)}"
+        f"{_threshold(study, analysis)}The pass probability is {confidence(analysis.pass_probability)}: "
+        f"{int(analysis.passed.sum())} of {n} surveys {_passing(analysis)}."
+        f"{_requirement(analysis)}{_main_reason(analysis)}{_failed(analysis)}{_warnings(analysis)}"
     )
 
 
-def pace(surveys: int, wall_s: float, worked_s: float) -> str:
-    """How many surveys were flown in what time, and what each took of a worker."""
-    each_s = worked_s / surveys
+def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
+    """Returns the number of surveys flown, their rate, and their mean run time.
+
+    Args:
+        surveys: number of surveys flown.
+        wall_s: wall time [s].
+        worker_s: sum of the run times on the workers [s].
+    """
     return (
-        f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} a minute; each took a worker {each_s:.2f} s"
+        f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} per minute; "
+        f"mean run time {worker_s / surveys:.2f} s"
     )
 
 
-def _sought(study: Study, found: Findings) -> str:
-    """How far the sought key may go."""
-    if found.sought is None:
+def _labelled(low: str, high: str) -> str:
+    return f"{percent(LEVEL)} confidence interval: {low} to {high}"
+
+
+def _threshold(study: Study, analysis: StudyAnalysis) -> str:
+    """Returns the values of the `seek` key for which enough surveys pass."""
+    if analysis.threshold is None:
         return ""
-    limit, rising = found.sought
-    wanted = f"At least {percent(study.probability or 0)} of surveys pass"
+    limit, rising = analysis.threshold
+    required = f"At least {percent(study.probability or 0)} of surveys pass"
     if np.isnan(limit.value):
         return ""
     if np.isinf(limit.value):
-        return f"{wanted} at {'every' if (limit.value < 0) == rising else 'no'} {study.seek} that was flown. "
-    ends = " to ".join(number(float(end)) if np.isfinite(end) else "beyond what was flown" for end in limit[1:])
-    bound = "at least" if rising else "at most"
-    return f"{wanted} where {study.seek} is {bound} {number(limit.value)} ({percent(LEVEL)} confidence: {ends}). "
+        return f"{required} at {'every' if (limit.value < 0) == rising else 'no'} value of {study.seek} in this study. "
+    low, high = (plain(float(b)) if np.isfinite(b) else "outside the range of this study" for b in limit[1:])
+    relation = "at least" if rising else "at most"
+    return f"{required} if {study.seek} is {relation} {plain(limit.value)} ({_labelled(low, high)}). "
 
 
-def _beware(found: Findings) -> str:
-    """How many surveys to trust less, and the first of the warnings."""
-    warned = found.warning[found.warning != ""]
-    return f" Beware in {len(warned)} of {len(found.warning)}: {warned[0]}." if len(warned) else ""
+def _warnings(analysis: StudyAnalysis) -> str:
+    """Returns the number of surveys with a warning, and the first warning."""
+    warned = analysis.warning[analysis.warning != ""]
+    return f" Warning in {len(warned)} of {len(analysis.warning)} surveys: {warned[0]}." if len(warned) else ""
 
 
-def _reason(found: Findings) -> str:
-    """Why, where none passed."""
-    if found.passed.any() or not found.reasons:
+def _main_reason(analysis: StudyAnalysis) -> str:
+    """Returns the most frequent reason if no survey passed."""
+    if analysis.passed.any() or not analysis.failure_reasons:
         return ""
-    return f" The most frequent reason: {found.reasons[0].reason}."
+    return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
 
 
-def _passing(found: Findings) -> str:
-    kept = [f"{name_of(m)} {relation(m)} {value_of(m, limit)}" for m, limit in found.limits.items()]
-    return "ended complete" + (" with " + " and ".join(kept) if kept else "")
+def _passing(analysis: StudyAnalysis) -> str:
+    limits = [f"{metric_name(m)} {limit_relation(m)} {metric_value(m, v)}" for m, v in analysis.limits.items()]
+    return "were completed" + (" with " + " and ".join(limits) if limits else "")
 
 
-def relation(metric: str) -> str:
+def limit_relation(metric: str) -> str:
+    """Returns "at least" for a metric with a lower limit, "at most" for one with an upper limit."""
     return "at least" if more_is_better(metric) else "at most"
 
 
-def _required(found: Findings) -> str:
-    """What that means for the share that is required, and whether the number of surveys decides it."""
-    wanted, passing = found.required_share, found.share
-    if wanted is None or found.study.seek is not None:
+def _requirement(analysis: StudyAnalysis) -> str:
+    """Returns whether the required pass probability is met, and whether the confidence interval is conclusive."""
+    required, passing = analysis.required_probability, analysis.pass_probability
+    if required is None or analysis.study.seek is not None:
         return ""
-    verdict = "missed" if found.missed else "met"
-    decided = passing.high < wanted or passing.low >= wanted
-    doubt = "" if decided else ", though so few surveys do not decide it"
-    return f" Required are {percent(wanted)}: {verdict}{doubt}."
+    verdict = "not met" if analysis.requirement_missed else "met"
+    conclusive = passing.high < required or passing.low >= required
+    doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
+    return f" The required {percent(required)} is {verdict}{doubt}."
 
 
-def _failed(found: Findings) -> str:
-    n = int((~found.ended).sum())
+def _failed(analysis: StudyAnalysis) -> str:
+    n = int((~analysis.evaluated).sum())
     if not n:
         return ""
-    least = percent(float(found.passed.sum()) / len(found.passed))
+    lowest = percent(float(analysis.passed.sum()) / len(analysis.passed))
     return (
-        f" {n} more failed by the machine or the program and do not count; if none of them would have passed, "
-        f"the probability is {least}. --resume flies them again."
+        f" {n} more surveys failed because of the computer or the program and are not counted; if none of them would "
+        f"have passed, the pass probability would be {lowest}. Use --resume to fly them again."
     )
 
 
-def contrast_in_words(contrast: Contrast) -> str:
-    """What tells surveys that did not pass from those that did."""
-    higher = contrast.above >= 0.5
-    often = contrast.above if higher else 1 - contrast.above
-    if often < 0.6:
-        return "hardly any difference"
-    return f"{'higher' if higher else 'lower'} where not passed, in {percent(often)} of pairs"
+def superiority(comparison: KeyComparison) -> str:
+    """Returns how well the values of a key separate the surveys that did not pass from those that passed."""
+    higher = comparison.superiority >= 0.5
+    probability = comparison.superiority if higher else 1 - comparison.superiority
+    if probability < 0.6:
+        return "no clear difference"
+    return f"{'higher' if higher else 'lower'} if not passed, in {percent(probability)} of pairs"
 
 
-def interval_note(found: Findings) -> str:
-    """What the intervals take for independent."""
-    n = len(np.unique(found.units))
-    if n == found.rows.num_rows:
-        return "The intervals take the surveys for independent of each other."
-    return f"The intervals take the {n} {found.unit_name}s for independent of each other, surveys of one for alike."
-
-
-def floors(study: Study) -> str:
-    """How many floors and draws of noise the surveys share."""
-    plan = study.sampling
-    if not plan.paired:
-        return "Each draw of the samples has seeds of its own: floor and noise differ."
-    same = f"the same {plan.seeds} seeds" if plan.seeds > 1 else f"one seed ({plan.seed})"
+def independence_note(analysis: StudyAnalysis) -> str:
+    """Returns which surveys the confidence intervals assume to be independent."""
+    n = len(np.unique(analysis.clusters))
+    if n == analysis.rows.num_rows:
+        return "The confidence intervals assume that the surveys are independent."
+    name = analysis.cluster_name
     return (
-        f"All samples share {same}, so that settings are compared on the same floor in the same noise; what another "
-        "floor would do, more seeds show."
+        f"The confidence intervals assume that the {n} {name}s are independent; surveys of the same {name} may be "
+        "correlated."
+    )
+
+
+def seeds_note(study: Study) -> str:
+    """Returns which surveys share their floor and noise, i.e. their seeds."""
+    sampling = study.sampling
+    if not sampling.paired:
+        return "Each design point has its own seeds, i.e. its own floor and noise."
+    same = f"the same {sampling.seeds} seeds" if sampling.seeds > 1 else f"the same seed ({sampling.seed})"
+    return (
+        f"All samples use {same}, so that they are compared on the same floor and with the same noise; more seeds show "
+        "the variation between floors."
     )

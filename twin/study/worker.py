@@ -1,7 +1,7 @@
-"""Processes that fly: each takes a function and its task and sends back what came of it; a crew hands them out.
+"""Worker processes that run one task at a time, and a thread-safe pool of them.
 
-A survey draws with OpenGL and computes in compiled code: it can take its process down, or hang where no exception
-reaches it. So it runs in a process that can be killed and replaced, and the program that watches it lives on.
+A survey renders with OpenGL and runs compiled code, which can terminate its process or hang where no exception can
+interrupt it. Every task therefore runs in a process that can be killed and replaced.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-#: One survey a core: what would share its work among all cores is told not to (0: Mesa draws in the calling thread).
-THREADS = {
+#: Environment of a worker: one thread per library, as there is one worker per core (LP_NUM_THREADS=0: Mesa renders in
+#: the calling thread).
+SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -31,151 +32,154 @@ THREADS = {
 }
 
 
-class Limits(NamedTuple):
-    """How long a task may take [s], and how often it is tried again where its process died."""
+class TaskLimits(NamedTuple):
+    """Maximum run time of a task [s], and the number of retries after its process was killed."""
 
     timeout_s: float = 3600.0
     retries: int = 2
 
 
 class Reply(NamedTuple):
-    """What came of a task: its result, or why there is none."""
+    """Reply of a worker: the value that the task returned, or the reason why there is none.
 
-    kind: Literal["done", "crashed", "hung", "killed"]
+    `kind`: "done"; "raised" for an exception; "timeout"; "killed" if the process ended or was killed.
+    """
+
+    kind: Literal["done", "raised", "timeout", "killed"]
     value: Any = None
     reason: str = ""
 
 
 class Worker:
-    """One process that answers tasks, on the processor of this number where one is given."""
+    """One worker process, pinned to a CPU core if one is given."""
 
-    def __init__(self, processor: int | None = None) -> None:
-        self.processor = processor
-        self._pipe, theirs = multiprocessing.Pipe()
-        self._words = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process)
+    def __init__(self, core: int | None = None) -> None:
+        self.core = core
+        self._pipe, child_end = multiprocessing.Pipe()
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from twin.study import worker; worker.main({theirs.fileno()}, {processor})"],
-            env=os.environ | THREADS | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            pass_fds=[theirs.fileno()],
+            [sys.executable, "-c", f"from twin.study import worker; worker.main({child_end.fileno()}, {core})"],
+            env=os.environ | SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            pass_fds=[child_end.fileno()],
             stdin=subprocess.DEVNULL,
-            stdout=self._words,
-            stderr=self._words,
-            start_new_session=True,  # Ctrl-C is for the study, which ends its surveys itself
+            stdout=self._output,
+            stderr=self._output,
+            start_new_session=True,  # Ctrl-C reaches only the main process, which closes its workers itself
         )
-        theirs.close()
+        child_end.close()
 
-    def ask(self, request: bytes, timeout_s: float) -> Reply:
-        """What came of the task; a process that hung or died is gone afterwards."""
+    def run(self, request: bytes, timeout_s: float) -> Reply:
+        """Returns the reply to a pickled (function, task); the process is killed after a timeout."""
         try:
             self._pipe.send_bytes(request)
             if self._pipe.poll(timeout_s):
                 return pickle.loads(self._pipe.recv_bytes())
         except (EOFError, OSError):
             self.kill()
-            return Reply("killed", reason=self._death())
+            return Reply("killed", reason=self._exit_reason())
         self.kill()
-        return Reply("hung", reason=f"did not end within {timeout_s:g} s")
+        return Reply("timeout", reason=f"did not finish within {timeout_s:g} s")
 
     def kill(self) -> None:
-        """Kills the process, if it is still there; any thread may, and one that asks is answered "killed"."""
+        """Kills the process if it still runs. Thread-safe; a concurrent `run` returns a reply of kind "killed"."""
         self._process.kill()
         self._process.wait()
 
-    def end(self) -> None:
-        """Kills the process and closes the pipe to it: for the one thread that holds this worker."""
+    def close(self) -> None:
+        """Kills the process and closes the pipe to it; only for the thread that owns this worker."""
         self.kill()
         self._pipe.close()
 
-    def _death(self) -> str:
-        """How the process died: the signal or the status, and its last words."""
+    def _exit_reason(self) -> str:
+        """Returns the signal or exit status of the process, with the last line of its output."""
         code = self._process.returncode
-        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-        self._words.seek(0)
-        words = self._words.read().decode(errors="replace").split("\n\n")[0].strip().splitlines()
-        return f"its process was {how}" + (f": {words[-1]}" if words else "")
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
+        self._output.seek(0)
+        lines = self._output.read().decode(errors="replace").split("\n\n")[0].strip().splitlines()
+        return f"worker process was {how}" + (f": {lines[-1]}" if lines else "")
 
 
-class Crew:
-    """Worker processes kept from task to task; as many as are asked at a time, each on a processor of its own."""
+class WorkerPool:
+    """Thread-safe pool of worker processes, which are reused; there are as many as there are concurrent tasks."""
 
-    def __init__(self, processors: Sequence[int | None] = ()) -> None:
-        self._free = list(processors)  # of which no worker has been made yet
+    def __init__(self, cores: Sequence[int | None] = ()) -> None:
+        self._free_cores = list(cores)
         self._idle: list[Worker] = []
         self._busy: set[Worker] = set()
-        self._lock, self._over = threading.Lock(), False
+        self._lock, self._closed = threading.Lock(), False
 
-    def end(self) -> None:
-        """Kills all workers; whoever waits for one is told so."""
+    def close(self) -> None:
+        """Kills all workers; concurrent calls of `run` return a reply of kind "killed"."""
         with self._lock:
-            self._over = True
+            self._closed = True
             idle, self._idle = self._idle, []
             busy = list(self._busy)
         for worker in idle:
-            worker.end()
+            worker.close()
         for worker in busy:
-            worker.kill()  # who asked it ends it: a pipe closed by two threads would close another's file
+            worker.kill()  # its own thread closes the pipe: closing it twice could close a file of another thread
 
-    def work(self, function: Callable[[Any], Any], task: Any, limits: Limits) -> tuple[Reply, int]:
-        """The reply to a task, and the number of attempts: only a process that died is tried again."""
+    def run(self, function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
+        """Returns the reply to a task and the number of attempts; only a killed process leads to another attempt."""
         request = pickle.dumps((function, task))
         attempts = 0
         while True:
             attempts += 1
-            reply = self._ask(request, limits.timeout_s)
-            if reply.kind != "killed" or attempts > limits.retries or self._over:
+            reply = self._run_once(request, limits.timeout_s)
+            if reply.kind != "killed" or attempts > limits.retries or self._closed:
                 return reply, attempts
 
-    def _ask(self, request: bytes, timeout_s: float) -> Reply:
+    def _run_once(self, request: bytes, timeout_s: float) -> Reply:
         with self._lock:
-            if self._over:
-                return Reply("killed", reason="the study is over")
-            worker = self._idle.pop() if self._idle else Worker(self._free.pop(0) if self._free else None)
+            if self._closed:
+                return Reply("killed", reason="the worker pool is closed")
+            worker = self._idle.pop() if self._idle else Worker(self._free_cores.pop(0) if self._free_cores else None)
             self._busy.add(worker)
-        reply = worker.ask(request, timeout_s)
+        reply = worker.run(request, timeout_s)
         with self._lock:
             self._busy.discard(worker)
-            kept = reply.kind == "done" and not self._over
-            if kept:
+            reusable = reply.kind == "done" and not self._closed
+            if reusable:
                 self._idle.append(worker)
             else:
-                self._free.append(worker.processor)
-        if not kept:
-            worker.end()  # also after a crash: who knows what it left behind
+                self._free_cores.append(worker.core)
+        if not reusable:
+            worker.close()  # also after an exception, which may leave the process in an undefined state
         return reply
 
 
-def describe(error: BaseException) -> str:
-    """An exception in a line: kind, words, and the place in the program."""
+def describe_exception(error: BaseException) -> str:
+    """Returns an exception in one line: its type, its message, and the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    words = " ".join(str(error).split())
-    return f"{type(error).__name__}{': ' if words else ''}{words}{place}"
+    source = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    message = " ".join(str(error).split())
+    return f"{type(error).__name__}{': ' if message else ''}{message}{source}"
 
 
-def main(pipe: int, processor: int | None) -> None:
-    """The process that flies: answers each pickled (function, task) with a pickled `Reply`, until nobody listens."""
-    if processor is not None:
-        os.sched_setaffinity(0, {processor})
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+def main(pipe: int, core: int | None) -> None:
+    """Runs the worker process: answers each pickled (function, task) with a pickled `Reply` until the pipe closes."""
+    if core is not None:
+        os.sched_setaffinity(0, {core})
+    threading.Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
     connection = Connection(pipe)
     while True:
         try:
             request = connection.recv_bytes()
         except (EOFError, OSError):
             return
-        connection.send_bytes(_answer(request))
+        connection.send_bytes(_run_request(request))
 
 
-def _answer(request: bytes) -> bytes:
+def _run_request(request: bytes) -> bytes:
     try:
         function, task = pickle.loads(request)
         return pickle.dumps(Reply("done", function(task)))
-    except BaseException as error:  # whatever it was, the next task gets its chance
-        return pickle.dumps(Reply("crashed", reason=describe(error)))
+    except BaseException as error:  # any failure is a reply: the process must survive it
+        return pickle.dumps(Reply("raised", reason=describe_exception(error)))
 
 
-def _end_with(parent: int) -> None:
-    """Ends this process soon after the one that asked for it."""
+def _exit_with_parent(parent: int) -> None:
+    """Ends this process within a second after its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)

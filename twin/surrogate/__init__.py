@@ -1,1 +1,1 @@
-"""The fast surrogate: the same survey with measurements drawn from calibrated error models in place of images."""
+"""Surrogate surveys: measurements are sampled from a fitted error model instead of estimated from rendered images."""

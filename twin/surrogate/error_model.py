@@ -1,6 +1,7 @@
-"""What the measurements of a survey err by, fitted to rendered surveys.
+"""Error model of the surrogate: standard errors and success rates of the image measurements of a survey.
 
-All errors follow one number: the least deviation with which noise lets a patch be placed (Cramer-Rao, `conditions`).
+All of them are functions of one number, the Cramer-Rao lower bound of a patch's position in an image
+(see `matchability`). The parameters are fitted to rendered surveys.
 """
 
 from __future__ import annotations
@@ -10,77 +11,98 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Law(NamedTuple):
-    """A deviation that has a floor and grows with the Cramer-Rao bound c: sqrt(floor^2 + (rise c)^2)."""
+class SigmaLaw(NamedTuple):
+    """Standard deviation as a function of the Cramer-Rao bound c: sqrt(floor_px^2 + (slope c)^2).
 
-    floor: float
-    rise: float
+    Args:
+        floor_px: standard deviation in noise-free images [px].
+        slope: asymptotic ratio of the standard deviation to the bound.
+    """
+
+    floor_px: float
+    slope: float
 
     def __call__(self, bound_px: float) -> float:
-        return float(np.hypot(self.floor, self.rise * bound_px))
+        """Returns the standard deviation [px]."""
+        return float(np.hypot(self.floor_px, self.slope * bound_px))
 
 
-class Share(NamedTuple):
-    """A share that is `most` in good conditions and falls to half of it where the bound is `half_px`."""
+class FractionLaw(NamedTuple):
+    """Fraction as a function of the Cramer-Rao bound c: maximum / (1 + (c / half_px)^exponent).
 
-    most: float
+    Args:
+        maximum: fraction in noise-free images.
+        half_px: bound at which the fraction is half the maximum [px].
+        exponent: steepness of the decrease.
+    """
+
+    maximum: float
     half_px: float
-    power: float
+    exponent: float
 
     def __call__(self, bound_px: float) -> float:
-        return float(self.most / (1 + (bound_px / self.half_px) ** self.power))
+        """Returns the fraction."""
+        return float(self.maximum / (1 + (bound_px / self.half_px) ** self.exponent))
 
 
 class ErrorModel(NamedTuple):
-    """Errors of what images tell.
+    """Parameters of the measurement errors.
+
+    An estimator reports a standard deviation (sigma) that may differ from the standard deviation of its errors. Fields
+    named `..._sigma_px` model the reported one, fields named `..._error_ratio` the ratio of the true one to it.
 
     Args:
-        bound_px: (least, greatest) Cramer-Rao bound of the calibration.
-        points: share of `estimate.points` that a keyframe finds.
-        place_px: claimed deviation of a patch's place in one image.
-        place_excess: true over claimed deviation of these.
-        lamps: by how much patches err more where lamps that move along light the floor: the square of `place_excess`
-            grows by that of this times their share of the light.
-        matched: share of the points in view of another keyframe that are found there.
-        correlation: by how much points are fewer than they seem, as `matching.correlation` tells.
-        steady: how much of a place's deviation in the earlier images is the same in whatever link it is looked for.
-        apart: by how much patches are claimed to be placed worse from farther off: the variance of a match grows by the
-            square of this times the way between two keyframes, in depths.
-        relief: by what part of what the floor under a patch lies out of its plane (`conditions`) the patch seems to
-            move, the same for every match of that piece of the floor, so that it adds up along a path. With g the
-            gradient of the texture and d by how much a pixel lies out, a patch moves by (sum g g')^-1 sum g g' d of the
-            way. Stereo, along the rows, weighs d by the square of g's part along them and so knows what a way along
-            them does to the columns. What is left is as much across either way, by the product of both parts, and
-            twice as much (for a texture alike in all directions) in the rows by a way across them.
-        common_px: deviation of a bias that all points of a link share.
-        f2f_px: claimed deviation of a flow vector from frame to frame.
-        f2f_excess: true over claimed deviation of a frame's motion.
-        f2f_undone: share of a frame's error that the next frame undoes: both are measured against the same points.
-        mosaic_px: claimed deviation of a vector to the mosaic, as if as many as from frame to frame told it.
-        mosaic_excess: true over claimed deviation of a correction.
-        depth_px: claimed deviation of a pixel's filtered depth [px of disparity].
-        depth_excess: true over claimed deviation of these.
-        lateral_px: deviation of the surface sideways that all views of it share.
-        complete: share of the cells in view whose depth is known.
+        bound_range_px: smallest and largest Cramer-Rao bound of the surveys that the model was fitted to.
+        point_fraction: number of matched stereo points of a keyframe, as a fraction of `estimate.points`.
+        match_sigma_px: reported standard deviation of a patch's position in one image.
+        match_error_ratio: true over reported standard deviation of that position.
+        lamp_error_growth: growth of the match error under lamps that move with the vehicle: the square of
+            `match_error_ratio` is multiplied by 1 + (lamp_error_growth * lamps' share of the light)^2.
+        match_fraction: fraction of the points in view of another keyframe that are matched there.
+        match_covariance_inflation: factor on the covariance of a link, for matches of overlapping patches are
+            correlated; see `matching.variance_inflation`.
+        match_bias_fraction: fraction of the standard deviation in the earlier stereo pair of a link that is a bias of
+            that pair, common to all of its links. The remainder is independent from link to link.
+        distance_growth: growth of the reported match variance with the distance between two keyframes: the variance
+            is multiplied by 1 + (distance_growth * distance / depth)^2.
+        relief_gain: error of a match due to relief within the patch, per pixel of unevenness (see `matchability`) and
+            per unit of distance / depth. It is the same for all matches of one piece of the floor, so it accumulates
+            along a path. With g the image gradient and d the parallax of a pixel relative to the patch's plane, least
+            squares matching shifts a patch by (sum g g')^-1 sum g g' d times the baseline. Stereo matching weights d
+            by the squared row component of g and thereby explains the column shift due to a baseline along the rows.
+            The remainder is a shift across the baseline, of equal gain for both directions, and a row shift due to a
+            baseline across the rows, of twice that gain for isotropic texture.
+        common_bias_px: standard deviation of a bias that all points of a link share.
+        f2f_sigma_px: reported standard deviation of a frame-to-frame flow vector.
+        f2f_error_ratio: true over reported standard deviation of a frame-to-frame motion.
+        f2f_anticorrelation: fraction of a frame's error that the next frame cancels (a moving-average process of order
+            one), because both are measured relative to the same points.
+        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as that of a flow
+            vector with as many vectors as from frame to frame.
+        mosaic_error_ratio: true over reported standard deviation of a registration.
+        depth_sigma_px: reported standard deviation of a pixel's filtered depth [px of disparity].
+        depth_error_ratio: true over reported standard deviation of that depth.
+        lateral_sigma_px: standard deviation of a lateral shift of the surface that all views of it share.
+        map_completeness: fraction of the cells in view whose depth is known.
     """
 
-    bound_px: tuple[float, float] = (0.0, 1.0)
-    points: Share = Share(0.9, 1.0, 4.0)
-    place_px: Law = Law(0.02, 1.0)
-    place_excess: float = 1.05
-    lamps: float = 0.0
-    matched: Share = Share(0.97, 1.0, 4.0)
-    correlation: float = 1.5
-    steady: float = 0.8
-    apart: float = 0.0
-    relief: float = 0.0
-    common_px: float = 0.005
-    f2f_px: Law = Law(0.05, 1.0)
-    f2f_excess: float = 1.4
-    f2f_undone: float = 0.3
-    mosaic_px: Law = Law(0.2, 1.0)
-    mosaic_excess: float = 2.0
-    depth_px: Law = Law(0.05, 1.0)
-    depth_excess: float = 1.0
-    lateral_px: float = 0.2
-    complete: Share = Share(0.999, 2.0, 4.0)
+    bound_range_px: tuple[float, float] = (0.0, 1.0)
+    point_fraction: FractionLaw = FractionLaw(0.9, 1.0, 4.0)
+    match_sigma_px: SigmaLaw = SigmaLaw(0.02, 1.0)
+    match_error_ratio: float = 1.05
+    lamp_error_growth: float = 0.0
+    match_fraction: FractionLaw = FractionLaw(0.97, 1.0, 4.0)
+    match_covariance_inflation: float = 1.5
+    match_bias_fraction: float = 0.8
+    distance_growth: float = 0.0
+    relief_gain: float = 0.0
+    common_bias_px: float = 0.005
+    f2f_sigma_px: SigmaLaw = SigmaLaw(0.05, 1.0)
+    f2f_error_ratio: float = 1.4
+    f2f_anticorrelation: float = 0.3
+    mosaic_sigma_px: SigmaLaw = SigmaLaw(0.2, 1.0)
+    mosaic_error_ratio: float = 2.0
+    depth_sigma_px: SigmaLaw = SigmaLaw(0.05, 1.0)
+    depth_error_ratio: float = 1.0
+    lateral_sigma_px: float = 0.2
+    map_completeness: FractionLaw = FractionLaw(0.999, 2.0, 4.0)

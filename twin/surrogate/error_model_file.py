@@ -1,4 +1,4 @@
-"""The error model on disk: a TOML file with the fit, how well it fits, and the range in which it holds."""
+"""TOML file of an error model: its parameters, the misfit of the fit, and the range of the surveys fitted to."""
 
 from __future__ import annotations
 
@@ -9,75 +9,123 @@ from pathlib import Path
 from typing import Any
 
 from twin.errors import TwinError
-from twin.surrogate.error_model import ErrorModel, Law, Share
+from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
 
-SHIPPED = Path(__file__).with_name("error_model.toml")
-_SLACK = 1.5  # the bound may be so many times outside before the surrogate warns
+DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
+_RANGE_FACTOR = 1.5  # factor by which a bound may lie outside the fitted range without a warning
+#: Current names of keys by their former names.
+_RENAMED = {
+    "surveys": "n_surveys",
+    "bound_px": "bound_range_px",
+    "points": "point_fraction",
+    "place_px": "match_sigma_px",
+    "place_excess": "match_error_ratio",
+    "lamps": "lamp_error_growth",
+    "matched": "match_fraction",
+    "correlation": "match_covariance_inflation",
+    "steady": "match_bias_fraction",
+    "apart": "distance_growth",
+    "relief": "relief_gain",
+    "common_px": "common_bias_px",
+    "f2f_px": "f2f_sigma_px",
+    "f2f_excess": "f2f_error_ratio",
+    "f2f_undone": "f2f_anticorrelation",
+    "mosaic_px": "mosaic_sigma_px",
+    "mosaic_excess": "mosaic_error_ratio",
+    "depth_px": "depth_sigma_px",
+    "depth_excess": "depth_error_ratio",
+    "lateral_px": "lateral_sigma_px",
+    "complete": "map_completeness",
+    "floor": "floor_px",
+    "rise": "slope",
+    "most": "maximum",
+    "power": "exponent",
+}
 
 
 @dataclass(frozen=True)
 class FittedErrorModel:
-    """An error model and where it comes from.
+    """Error model with the record of its fit.
 
     Args:
-        model: of the errors.
-        surveys: rendered surveys that it was fitted to.
-        misfit: by name, the root mean square of the logarithm of what was measured over what the model says.
+        model: fitted parameters.
+        n_surveys: number of rendered surveys that the model was fitted to.
+        misfit: root mean square over the surveys of ln(measured / model), by the name of the parameter.
     """
 
     model: ErrorModel
-    surveys: int
+    n_surveys: int
     misfit: Mapping[str, float]
 
-    def outside(self, nearest_px: float, farthest_px: float) -> str:
-        """Why a survey whose Cramer-Rao bounds lie in this range is not covered; "" if it is."""
-        least, most = self.model.bound_px
-        if least / _SLACK <= nearest_px and farthest_px <= most * _SLACK:
+    def coverage_warning(self, smallest_px: float, largest_px: float) -> str:
+        """Returns a warning if the Cramer-Rao bounds of a survey lie outside the fitted range, "" if not."""
+        fitted_smallest, fitted_largest = self.model.bound_range_px
+        if fitted_smallest / _RANGE_FACTOR <= smallest_px and largest_px <= fitted_largest * _RANGE_FACTOR:
             return ""
         return (
-            f"images whose patches can be placed to {nearest_px:.3g} to {farthest_px:.3g} px: the surrogate was "
-            f"calibrated from {least:.3g} to {most:.3g} px"
+            f"matching precision of {smallest_px:.3g} to {largest_px:.3g} px is outside the range of "
+            f"{fitted_smallest:.3g} to {fitted_largest:.3g} px that the error model was fitted to"
         )
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
-    """Reads a calibration; the shipped one if None.
+    """Reads an error model from a file, or the project's own if None.
 
     Raises:
-        TwinError: no such file, or it is not a calibration.
+        TwinError: the file does not exist, is not an error model, or uses former names.
     """
-    path = SHIPPED if path is None else Path(path)
+    path = DEFAULT_FILE if path is None else Path(path)
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        _check_names(path, tree)
         model = ErrorModel(**{name: _value(name, tree["model"][name]) for name in ErrorModel._fields})
-        return FittedErrorModel(model, int(tree["surveys"]), dict(tree["misfit"]))
+        return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]))
     except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
-        raise TwinError("imaging.error_model", f"{path}: {error!r}", "a file that `twin fit-surrogate` wrote") from None
+        raise _invalid(path, repr(error)) from None
 
 
-def save(calibration: FittedErrorModel, path: Path) -> None:
-    """Writes what `load` reads."""
+def save(fitted: FittedErrorModel, path: Path) -> None:
+    """Writes an error model to a file that `load` reads."""
     lines = [
-        "# Errors of what images tell, fitted to rendered surveys by `twin fit-surrogate`; see error_model.py.",
-        f"surveys = {calibration.surveys}",
+        "# Error model of the surrogate, fitted to rendered surveys by `twin fit-surrogate`; see error_model.py.",
+        f"n_surveys = {fitted.n_surveys}",
         "",
         "[misfit]  # root mean square of ln(measured / model)",
-        *(f"{name} = {value:.4g}" for name, value in calibration.misfit.items()),
+        *(f"{name} = {value:.4g}" for name, value in fitted.misfit.items()),
         "",
         "[model]",
-        *(f"{name} = {_text(value)}" for name, value in calibration.model._asdict().items()),
+        *(f"{name} = {_text(value)}" for name, value in fitted.model._asdict().items()),
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def _check_names(path: Path, tree: Mapping[str, Any]) -> None:
+    """Raises an error that lists the keys of a file that were renamed."""
+    renamed = [f"{name} was renamed to {_RENAMED[name]}" for name in dict.fromkeys(_keys(tree)) if name in _RENAMED]
+    if renamed:
+        raise _invalid(path, ", ".join(renamed))
+
+
+def _keys(tree: Mapping[str, Any]) -> list[str]:
+    """Returns the keys of a table and of all tables within it."""
+    return [key for name, value in tree.items() for key in (name, *(_keys(value) if isinstance(value, dict) else ()))]
+
+
+def _invalid(path: Path, problem: str) -> TwinError:
+    """Returns the error for a file that is not an error model."""
+    return TwinError("imaging.error_model", f"{path}: {problem}", "a file written by `twin fit-surrogate`")
+
+
 def _value(name: str, given: Any) -> Any:
+    """Converts a TOML value to the type of the parameter `name`."""
     kind = type(ErrorModel._field_defaults[name])
-    if kind in (Law, Share):
+    if kind in (SigmaLaw, FractionLaw):
         return kind(**{key: float(given[key]) for key in kind._fields})
     return tuple(map(float, given)) if kind is tuple else float(given)
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, Law | Share):
+    """Returns a parameter as TOML."""
+    if isinstance(value, SigmaLaw | FractionLaw):
         return "{ " + ", ".join(f"{key} = {number:.4g}" for key, number in value._asdict().items()) + " }"
     return str([float(f"{v:.4g}") for v in value]) if isinstance(value, tuple) else f"{value:.4g}"

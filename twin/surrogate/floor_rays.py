@@ -1,4 +1,4 @@
-"""Where a camera's rays meet the floor, without OpenGL: a few hundred rays a keyframe in place of an image."""
+"""Ray casting against the floor without OpenGL, for the few hundred rays that a surrogate keyframe needs."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ from twin.core.records import StereoRig
 
 Depth = NDArray[np.float32]
 
-_MOST_STEPS = 200
-_TOUCH_M = 1e-4  # a ray this close has met the floor
+_MAX_STEPS = 200
+_TOLERANCE_M = 1e-4  # height above the floor at which a ray counts as an intersection
 
 
-class Floor:
-    """The floor's triangles, ready to be met by rays.
+class FloorRayCaster:
+    """Ray caster against the triangles of a terrain.
 
-    A ray walks by the gap between itself and the floor below it, cut by the steepest slope so that it passes through
-    nothing (sphere tracing, Hart 1996, over a height field).
+    Sphere tracing over a height field (Hart 1996): each step is the height of the ray above the floor, divided by the
+    fastest rate at which this height can shrink for the steepest slope of the terrain, so that no step crosses the
+    floor.
     """
 
     def __init__(self, terrain: Terrain):
         height = np.ascontiguousarray(terrain.height_m, np.float64)
         rise, run = (float(np.abs(np.diff(height, axis=k)).max()) for k in (0, 1))
-        self._ground = (
+        self._height_field = (
             height, terrain.spacing_m, terrain.west_m, terrain.south_m, terrain.highest_m,
             float(np.hypot(rise, run)) / terrain.spacing_m,
         )  # fmt: skip
 
     def depth_at(self, pixels: Array, world_from_camera: Array, rig: StereoRig) -> Array:
-        """Depth (n,) along the optical axis [m] at pixels (n, 2); inf where no floor is met."""
-        return _depth_at(self._ground, pixels, world_from_camera, rig.focal_px, rig.cx_px, rig.cy_px)
+        """Returns the depth (n,) along the optical axis [m] at pixels (n, 2); inf where a ray misses the floor."""
+        return _depth_at(self._height_field, pixels, world_from_camera, rig.focal_px, rig.cx_px, rig.cy_px)
 
     def depth(self, world_from_camera: Array, rig: StereoRig) -> Depth:
-        """Depth (height_px, width_px) along the optical axis [m]; inf where no floor is met."""
+        """Returns the depth image (height_px, width_px) along the optical axis [m]; inf where a ray hits nothing."""
         grid = np.indices((rig.height_px, rig.width_px), dtype=np.float64)
         pixels = np.stack([grid[1].ravel(), grid[0].ravel()], axis=1)
         depth = self.depth_at(pixels, world_from_camera, rig)
@@ -44,17 +45,17 @@ class Floor:
 
 
 @njit(cache=True, nogil=True)
-def _depth_at(ground, pixels, pose, focal, cx, cy):
+def _depth_at(height_field, pixels, pose, focal, cx, cy):
     depth = np.empty(len(pixels))
     for k in range(len(pixels)):
-        depth[k] = meet(ground, pose, (pixels[k, 0] - cx) / focal, (pixels[k, 1] - cy) / focal)
+        depth[k] = _ray_depth(height_field, pose, (pixels[k, 0] - cx) / focal, (pixels[k, 1] - cy) / focal)
     return depth
 
 
 @njit(cache=True, nogil=True)
-def meet(ground, pose, a, b):
-    """Depth along the axis of a camera at which its ray through (a, b, 1) meets the floor; inf where it does not."""
-    height, spacing, west, south, highest, steepest = ground
+def _ray_depth(height_field, pose, a, b):
+    """Returns the depth at which the camera ray through (a, b, 1) intersects the floor; inf if it does not."""
+    height, spacing, west, south, highest, steepest = height_field
     dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
     dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
     dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
@@ -62,12 +63,12 @@ def meet(ground, pose, a, b):
         return np.inf
     closing = -dz + steepest * np.sqrt(dx * dx + dy * dy)
     depth = max(0.0, (highest - pose[2, 3]) / dz)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         floor = _height_at(height, spacing, west, south, pose[0, 3] + depth * dx, pose[1, 3] + depth * dy)
         gap = pose[2, 3] + depth * dz - floor
         if np.isnan(gap):
             return np.inf
-        if gap < _TOUCH_M:
+        if gap < _TOLERANCE_M:
             return depth
         depth += gap / closing
     return np.inf
@@ -75,7 +76,7 @@ def meet(ground, pose, a, b):
 
 @njit(cache=True, nogil=True, inline="always")
 def _height_at(height, spacing, west, south, x, y):
-    """As `Terrain.height_at`: linear on the two triangles of a cell; NaN outside."""
+    """Compiled kernel of `Terrain.height_at`: linear on the two triangles of a cell, NaN outside the terrain."""
     col, row = (x - west) / spacing, (y - south) / spacing
     rows, cols = height.shape
     if not (0 <= col <= cols - 1 and 0 <= row <= rows - 1):

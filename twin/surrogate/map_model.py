@@ -1,7 +1,7 @@
-"""The map without images: which cells of the floor a keyframe shows, and what its depth filter hands over of them.
+"""Model of the depth map: the grid cells that a keyframe sees, and the heights that its depth filter estimates.
 
-A cell of the grid stands for the pixels that show it. It is seen where it lies in both images and faces the camera; a
-cliff that hides what is behind it is not looked for.
+A grid cell represents the pixels that show it. A cell is visible if it projects into both images; occlusion by relief
+is not modelled.
 """
 
 from __future__ import annotations
@@ -16,41 +16,43 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
-from twin.estimate.mapping.surface import Patch
+from twin.estimate.mapping.surface import HeightPatch
 
 Map = NDArray[np.float32]
 
 
 class CellErrors(NamedTuple):
-    """What a depth filter leaves in the cells that it hands over.
+    """Errors of filtered depth, by grid cell and by depth.
 
     Args:
-        shared: (rows, cols) standard normal: what all views of a cell err by sideways.
-        lost: (rows, cols) even between 0 and 1: those above `complete` stay unknown.
-        lateral_px: deviation sideways.
-        depths_m: (m,) rising, for which the following are given.
-        depth_px, claimed_px: (m,) deviation of the depth, and its claim [px of disparity].
-        complete: (m,) share of the cells whose depth is known.
+        lateral_noise: (rows, cols) standard normal numbers of the lateral error that all views of a cell share.
+        dropout: (rows, cols) uniform numbers in [0, 1); a cell above `completeness` stays unknown.
+        lateral_sigma_px: standard deviation of the lateral error.
+        depths_m: (m,) ascending depths at which the following are given.
+        depth_error_px: (m,) true standard deviation of the depth [px of disparity].
+        depth_sigma_px: (m,) reported standard deviation of the depth [px of disparity].
+        completeness: (m,) fraction of the cells whose depth is known.
     """
 
-    shared: Map
-    lost: Map
-    lateral_px: float
+    lateral_noise: Map
+    dropout: Map
+    lateral_sigma_px: float
     depths_m: Array
-    depth_px: Array
-    claimed_px: Array
-    complete: Array
+    depth_error_px: Array
+    depth_sigma_px: Array
+    completeness: Array
 
 
-class Chart:
-    """The floor by the cells of a grid.
+class MapModel:
+    """True floor as a grid, from which the height patches of keyframes are sampled.
 
     Args:
-        height_m: (rows, cols) true height at their centres.
-        rig: true camera.
+        grid: grid of the map.
+        height_m: (rows, cols) true height at the cell centres.
+        rig: true calibration.
 
     Attributes:
-        seen: (rows, cols) cells that were marked.
+        seen: (rows, cols) cells that at least one keyframe saw; modified in geotransform by `mark_seen`.
     """
 
     def __init__(self, grid: MapGrid, height_m: Map, rig: StereoRig):
@@ -58,67 +60,73 @@ class Chart:
         down, east = np.gradient(np.asarray(height_m, np.float64), grid.cell_m)
         self._slope = np.stack([east, -down], axis=-1).astype(np.float32)
         self._lowest_m = float(np.nanmin(height_m))
-        self._place = (grid.west_m, grid.north_m, grid.cell_m)
+        self._geotransform = (grid.west_m, grid.north_m, grid.cell_m)
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px - 1), float(rig.height_px - 1), rig.baseline_m,
         )  # fmt: skip
 
     @property
     def steepness(self) -> Map:
-        """(rows, cols) slope of the floor."""
+        """Magnitude of the floor's gradient (rows, cols)."""
         return np.hypot(*np.moveaxis(self._slope, -1, 0))
 
-    def see(self, world_from_camera: Array) -> None:
-        """Marks the cells that a keyframe at this true pose sees with both cameras."""
+    def mark_seen(self, world_from_camera: Array) -> None:
+        """Marks the cells that both cameras of a keyframe at this true pose (4, 4) see."""
         window = self._window(world_from_camera)
         camera_from_world = geometry.inverse(world_from_camera)
-        _mark(self.seen, self.height_m, self._place, self._camera, camera_from_world, *window)
+        _mark(self.seen, self.height_m, self._geotransform, self._camera, camera_from_world, *window)
 
-    def hand_over(
+    def sample_patch(
         self,
         true: Array,
         next_true: Array | None,
-        believed: Array,
+        estimated: Array,
         cov: Array,
         errors: CellErrors,
         rng: np.random.Generator,
-    ) -> Patch | None:
-        """What the filter of a keyframe knows of those cells that the next keyframe does not see.
+    ) -> HeightPatch | None:
+        """Samples the height patch of a keyframe: the cells that it sees and the next keyframe does not see.
 
         Args:
-            true, next_true: (4, 4) true poses of the keyframe and the next one; None where there is none.
-            believed: (4, 4) its estimated pose, with cov (6, 6).
-            errors: of its cells.
-            rng: stream of what this view alone errs by.
+            true: (4, 4) true pose of the keyframe.
+            next_true: (4, 4) true pose of the next keyframe; None for the last one.
+            estimated: (4, 4) estimated pose of the keyframe.
+            cov: (6, 6) covariance of the estimated pose.
+            errors: errors of the filtered depth.
+            rng: random generator of the errors of this view alone.
+
+        Returns:
+            the patch, or None if the view does not overlap the grid.
         """
         row, end_row, col, end_col = self._window(true)
         if row >= end_row or col >= end_col:
             return None
         shape = (end_row - row, end_col - col)
         height = np.full(shape, np.nan, np.float32)
-        variance, common = height.copy(), height.copy()
-        last = next_true is None
-        camera_from_world = np.stack([geometry.inverse(true), geometry.inverse(true if last else next_true)])
-        shift = believed @ camera_from_world[0]
-        turn = geometry.adjoint(geometry.pose(believed[:3, :3], np.zeros(3)))
-        depth_m = _hand_over(
-            height, variance, common, self.height_m, self._slope, self._place, self._camera, camera_from_world, last,
-            shift, believed[:3, 3].copy(), turn @ cov @ turn.T, rng.standard_normal(shape, np.float32),
-            errors, row, col,
+        variance, systematic = height.copy(), height.copy()
+        is_last = next_true is None
+        camera_from_world = np.stack([geometry.inverse(true), geometry.inverse(true if is_last else next_true)])
+        estimated_from_true = estimated @ camera_from_world[0]
+        rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
+        depth_m = _sample_patch(
+            height, variance, systematic, self.height_m, self._slope, self._geotransform, self._camera,
+            camera_from_world, is_last, estimated_from_true, estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
+            rng.standard_normal(shape, np.float32), errors, row, col,
         )  # fmt: skip
-        lateral = surface.LATERAL_PX * depth_m / self._rig.focal_px
-        return Patch(row, col, height, variance, common, np.zeros((*shape, 2), np.float32), lateral)
+        lateral = surface.LATERAL_SIGMA_PX * depth_m / self._rig.focal_px
+        return HeightPatch(row, col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral)
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Rows and columns (first, end) that the view reaches on the lowest floor."""
+        """Returns (first row, end row, first column, end column) of the view's footprint on the lowest floor height."""
         size = (self.grid.rows, self.grid.cols)
-        return _window(world_from_camera, self._camera, self._place, self._lowest_m, size)
+        return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
 
 @njit(cache=True, nogil=True)
-def _window(pose, camera, place, lowest, size):
+def _window(pose, camera, geotransform, lowest, size):
     focal, cx, cy, _, _, _ = camera
-    west, north, cell = place
+    """Compiled kernel of `MapModel._window`."""
+    west, north, cell = geotransform
     rows, cols = size
     x_low = x_high = pose[0, 3]
     y_low = y_high = pose[1, 3]
@@ -127,7 +135,7 @@ def _window(pose, camera, place, lowest, size):
         dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
         dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
         dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
-        if dz >= -0.1:  # the horizon is in view: look at everything
+        if dz >= -0.1:  # the horizon is in view: take the whole grid
             return 0, rows, 0, cols
         far = (lowest - pose[2, 3]) / dz
         x_low, x_high = min(x_low, pose[0, 3] + far * dx), max(x_high, pose[0, 3] + far * dx)
@@ -139,7 +147,7 @@ def _window(pose, camera, place, lowest, size):
 
 @njit(cache=True, nogil=True, inline="always")
 def _depth_in(camera_from_world, camera, x, y, z):
-    """Depth of a point in the left camera where both images show it, else -1."""
+    """Returns the depth of a point in the left camera; -1 if it is outside either image."""
     focal, cx, cy, right, bottom, baseline = camera
     m = camera_from_world
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -153,8 +161,9 @@ def _depth_in(camera_from_world, camera, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def _mark(seen, height, place, camera, camera_from_world, row, end_row, col, end_col):
-    west, north, cell = place
+def _mark(seen, height, geotransform, camera, camera_from_world, row, end_row, col, end_col):
+    """Sets `seen` for the cells of a window that project into both images."""
+    west, north, cell = geotransform
     for i in range(row, end_row):
         y = north - (i + 0.5) * cell
         for j in range(col, end_col):
@@ -164,51 +173,54 @@ def _mark(seen, height, place, camera, camera_from_world, row, end_row, col, end
 
 
 @njit(cache=True, nogil=True)
-def _hand_over(
-    out, variance, common, height, slope, place, camera, camera_from_world, last, shift, eye, cov, own, errors, row,
-    col,
+def _sample_patch(
+    out, variance, systematic, height, slope, geotransform, camera, camera_from_world, is_last, estimated_from_true,
+    position, cov, depth_noise, errors, row, col,
 ):  # fmt: skip
-    """Fills the patch's heights and variances; returns the mean depth."""
-    west, north, cell = place
+    """Writes heights and variances of a patch to `out`, `variance` and `systematic`; returns the mean depth."""
+    (west, north, cell), m = geotransform, estimated_from_true
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
         y = north - (i + 0.5) * cell
         for j in range(col, col + out.shape[1]):
             x, z = west + (j + 0.5) * cell, height[i, j]
             depth = _depth_in(camera_from_world[0], camera, x, y, z)
-            if depth < 0 or (not last and _depth_in(camera_from_world[1], camera, x, y, z) > 0):
+            if depth < 0 or (not is_last and _depth_in(camera_from_world[1], camera, x, y, z) > 0):
                 continue
-            k, share = _between(errors.depths_m, depth)
-            if errors.lost[i, j] > _mixed(errors.complete, k, share):
+            k, fraction = _interval(errors.depths_m, depth)
+            if errors.dropout[i, j] > _interpolate(errors.completeness, k, fraction):
                 continue
             sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
-            # where this bit of floor is believed to be, and the surface there brought back to the cell's centre
-            px = shift[0, 0] * x + shift[0, 1] * y + shift[0, 2] * z + shift[0, 3]
-            py = shift[1, 0] * x + shift[1, 1] * y + shift[1, 2] * z + shift[1, 3]
-            pz = shift[2, 0] * x + shift[2, 1] * y + shift[2, 2] * z + shift[2, 3]
+            # estimated position of this surface element, and the height of its plane at the cell's centre
+            px = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+            py = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+            pz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
             value = pz - sx * (px - x) - sy * (py - y)
             per_px = depth * depth / (camera[0] * camera[5])
             steep = np.sqrt(sx * sx + sy * sy)
-            value += per_px * _mixed(errors.depth_px, k, share) * own[i - row, j - col]
-            value += steep * errors.lateral_px * depth / camera[0] * errors.shared[i, j]
+            value += per_px * _interpolate(errors.depth_error_px, k, fraction) * depth_noise[i - row, j - col]
+            value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
-            variance[i - row, j - col] = (per_px * _mixed(errors.claimed_px, k, share)) ** 2
-            common[i - row, j - col] = surface.pose_part(x - eye[0], y - eye[1], z - eye[2], sx, sy, cov)
-            common[i - row, j - col] += (surface.LATERAL_PX * depth / camera[0] * steep) ** 2
+            variance[i - row, j - col] = (per_px * _interpolate(errors.depth_sigma_px, k, fraction)) ** 2
+            systematic[i - row, j - col] = surface.pose_variance(
+                x - position[0], y - position[1], z - position[2], sx, sy, cov
+            )
+            systematic[i - row, j - col] += (surface.LATERAL_SIGMA_PX * depth / camera[0] * steep) ** 2
             total += depth
             count += 1
     return total / max(count, 1)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _between(rising, value):
-    """The last but one index at whose number the value is, and the share of the way to the next; ends hold."""
+def _interval(ascending, value):
+    """Returns the index of the interval that contains a value, and the fraction within it, clamped to [0, 1]."""
     k = 0
-    while k < len(rising) - 2 and value > rising[k + 1]:
+    while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1
-    return k, min(max((value - rising[k]) / (rising[k + 1] - rising[k]), 0.0), 1.0)
+    return k, min(max((value - ascending[k]) / (ascending[k + 1] - ascending[k]), 0.0), 1.0)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mixed(numbers, k, share):
-    return (1 - share) * numbers[k] + share * numbers[k + 1]
+def _interpolate(values, k, fraction):
+    """Interpolates linearly within interval k."""
+    return (1 - fraction) * values[k] + fraction * values[k + 1]

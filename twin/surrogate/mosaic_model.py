@@ -1,4 +1,4 @@
-"""Which keyframe's view the mosaic shows where: the oldest one, as in the real mosaic."""
+"""Model of the mosaic: which keyframe each floor cell was first seen by, as the mosaic keeps the oldest view."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 
 _CELL_M = 0.1
-_LEAST_SHARE = 0.1  # of the view that must have been laid before
+_MIN_COVERAGE = 0.1  # fraction of the view that the mosaic has to cover for a registration
 
-Cells = NDArray[np.int64]  #: of the floor: column and row in one number
+Cells = NDArray[np.int64]  #: floor cells: column and row packed into one integer
 
 
 @njit(cache=True, nogil=True)
-def cells_of(pose, points, baseline):
-    """The cell (n,) of each of points (n, 3), normalised (x, y, disparity), of a camera at (4, 4)."""
+def floor_cells(pose, points, baseline):
+    """Returns the floor cell (n,) of each of the points (n, 3), normalised (x, y, disparity), of a camera at (4, 4)."""
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -30,37 +30,44 @@ def cells_of(pose, points, baseline):
     return cells
 
 
-class Shares(NamedTuple):
-    """Numbers of keyframes, rising; where they are believed to be (n, 4, 4), and their parts (n,) of a view."""
+class MosaicView(NamedTuple):
+    """Keyframes that the mosaic consists of within a view.
+
+    Args:
+        numbers: numbers of the keyframes, ascending.
+        estimated: (n, 4, 4) poses at which they were added to the mosaic.
+        fractions: (n,) fraction of the covered part of the view that shows each of them.
+    """
 
     numbers: list[int]
-    believed: Array
-    parts: Array
+    estimated: Array
+    fractions: Array
 
 
-class Owners:
-    """Keyframes by the cells of floor that they laid first."""
+class MosaicModel:
+    """Keyframes by the floor cells that they were the first to show."""
 
     def __init__(self) -> None:
-        self._owner: dict[int, int] = {}
-        self._believed: dict[int, Array] = {}
+        self._first_keyframe: dict[int, int] = {}
+        self._estimated: dict[int, Array] = {}
 
     def clear(self) -> None:
-        self._owner.clear()
-        self._believed.clear()
+        """Removes all keyframes."""
+        self._first_keyframe.clear()
+        self._estimated.clear()
 
-    def lay(self, number: int, believed: Array, cells: Cells) -> None:
-        """Lays a keyframe where nothing is yet, at its believed pose (4, 4)."""
-        self._believed[number] = believed
+    def add(self, number: int, estimated: Array, cells: Cells) -> None:
+        """Adds a keyframe with its estimated pose (4, 4); cells that are already covered keep their keyframe."""
+        self._estimated[number] = estimated
         for cell in cells.tolist():
-            self._owner.setdefault(cell, number)
+            self._first_keyframe.setdefault(cell, number)
 
-    def shares(self, cells: Cells) -> Shares | None:
-        """Of the keyframes that laid what is in view; None where too little is."""
-        counts = Counter(map(self._owner.get, cells.tolist()))
+    def view(self, cells: Cells) -> MosaicView | None:
+        """Returns the keyframes that the mosaic shows in these cells; None if it covers too few of them."""
+        counts = Counter(map(self._first_keyframe.get, cells.tolist()))
         counts.pop(None, None)
-        if counts.total() < _LEAST_SHARE * len(cells):
+        if counts.total() < _MIN_COVERAGE * len(cells):
             return None
         numbers = sorted(number for number in counts if number is not None)
-        parts = np.array([counts[number] for number in numbers]) / counts.total()
-        return Shares(numbers, np.array([self._believed[number] for number in numbers]), parts)
+        fractions = np.array([counts[number] for number in numbers]) / counts.total()
+        return MosaicView(numbers, np.array([self._estimated[number] for number in numbers]), fractions)

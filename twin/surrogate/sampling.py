@@ -1,4 +1,4 @@
-"""Measured motions as they are drawn, compiled: frame to frame, between keyframes, against a mosaic."""
+"""Sampling of measured motions: frame to frame, between keyframes, and relative to the mosaic (compiled)."""
 
 from __future__ import annotations
 
@@ -9,83 +9,91 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
 
-LEAST_POINTS = 6  # for a motion
+MIN_POINTS = 6  # for a motion
 
 
 @njit(cache=True, nogil=True)
-def moved(errors, last, now, numbers, last_numbers):
-    """The motion (4, 4) from one true pose to the next as F2F tells it, with an error by standard normal numbers (6,).
+def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
+    """Samples the frame-to-frame motion (4, 4) between two true poses (4, 4).
 
     Args:
-        last_numbers: those of the motion before.
+        errors: `FrameErrors`.
+        normals, previous_normals: (6,) standard normal numbers of this motion and of the one before it.
     """
     error = np.zeros(6)
     for i in range(6):
         for k in range(6):
-            error[i] += errors.root[i, k] * (numbers[k] - errors.undone * last_numbers[k])
-    return geometry.compose(geometry.compose(geometry.inverse(last), now), geometry.exp(error))
+            error[i] += errors.root[i, k] * (normals[k] - errors.anticorrelation * previous_normals[k])
+    return geometry.compose(geometry.compose(geometry.inverse(previous_pose), pose), geometry.exp(error))
 
 
 @njit(cache=True, nogil=True)
-def link(
-    points, here, there, relief, numbers, there_pose, here_pose, camera, cov, root, steady, relief_size, common, apart,
-    common_claim, correlation,
+def sample_link(
+    points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
+    bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation,
 ):  # fmt: skip
-    """How many points two keyframes both see, and the motion (4, 4) between them with its claimed covariance (6, 6).
+    """Samples the motion between two keyframes.
 
     Args:
-        points: (n, 3) of the later keyframe.
-        here: (n, 3) standard normal: what the later pair errs by at these points.
-        there: (rows, cols, 3) the same of the earlier pair, over its image.
-        relief: (f, f, 2) standard normal: what the floor makes matches err by, the same whoever matches there.
-        numbers: (n + 1, 3) standard normal: what it errs by in this match alone, and a bias that all points share.
-        there_pose, here_pose: (4, 4) true poses.
-        cov, root: (3, 3) claimed covariance of a point in either pair, root of the true one.
-        steady: share of the earlier pair in what a match errs by; the rest is its own.
-        relief_size: deviation of what relief makes it err by for every depth that the two are apart.
-        common, common_claim: deviation of the bias, and the one claimed.
-        apart: by how much a match is claimed to err more for every depth that the two are apart.
+        points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
+        later_noise: (n, 3) standard normal numbers of the later pair's errors at these points.
+        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier pair's biases, over its image.
+        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, over the floor (repeated).
+        normals: (n + 1, 3) standard normal numbers of this link alone: of its points, and of their common bias.
+        earlier_pose, later_pose: (4, 4) true poses.
+        camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
+        cov: (3, 3) reported covariance of a point in each pair.
+        error_root: (3, 3) square root of the true covariance of a point in each pair.
+        bias_fraction: fraction of the earlier pair's standard deviation that is a bias common to all of its links.
+        relief_sigma: standard deviation of the error due to relief per unit of distance / depth.
+        common_bias: true standard deviation of the common bias.
+        distance_growth: growth of the reported variance with distance / depth, see `ErrorModel`.
+        common_sigma: reported standard deviation of the common bias.
+        inflation: factor on the reported covariance due to correlated matches.
+
+    Returns:
+        number of points that both keyframes see, motion earlier_from_later (4, 4), its reported covariance (6, 6).
     """
     focal, cx, cy, width, height, margin, baseline = camera
-    there_from_here, bias = geometry.inverse(there_pose) @ here_pose, numbers[-1] * common
-    seen, _, _ = observation_equations.transfer(points, there_from_here, baseline)
+    earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
+    transferred, _, _ = observation_equations.transfer(points, earlier_from_later, baseline)
     inverse_depth = np.mean(points[:, 2]) / baseline
-    way, cell_m = inverse_depth * there_from_here[:3, 3], width / focal / there.shape[1] / inverse_depth
-    n, passing, farther = 0, np.sqrt(1 - steady * steady), apart**2 * np.sum(way**2)
+    distance = inverse_depth * earlier_from_later[:3, 3]  # in units of depth
+    cell_m = width / focal / earlier_noise.shape[1] / inverse_depth
+    n, independent, growth = 0, np.sqrt(1 - bias_fraction * bias_fraction), distance_growth**2 * np.sum(distance**2)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
-        u, v = seen[k, 0] * focal + cx, seen[k, 1] * focal + cy
-        if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[k, 2] >= margin:
-            cell = there[int(v / height * there.shape[0]), int(u / width * there.shape[1])]
-            row, col = _floor_cell(here_pose, points[k], baseline, cell_m, len(relief))
-            askew, along = relief_size * relief[row, col, 0], relief_size * relief[row, col, 1]
+        u, v = transferred[k, 0] * focal + cx, transferred[k, 1] * focal + cy
+        if margin <= u < width - margin and margin <= v < height - margin and u - focal * transferred[k, 2] >= margin:
+            pair_bias = earlier_noise[int(v / height * earlier_noise.shape[0]), int(u / width * earlier_noise.shape[1])]
+            row, col = _floor_cell(later_pose, points[k], baseline, cell_m, len(relief_noise))
+            cross, along = relief_sigma * relief_noise[row, col, 0], relief_sigma * relief_noise[row, col, 1]
             for r in range(3):
-                a[n, r], b[n, r] = seen[k, r] + bias[r], points[k, r]
+                a[n, r], b[n, r] = transferred[k, r] + bias[r], points[k, r]
                 for c in range(r + 1):
-                    a[n, r] += root[r, c] * (steady * cell[c] + passing * numbers[k, c])
-                    b[n, r] += root[r, c] * here[k, c]
-            a[n, 0] += way[1] * askew
-            a[n, 1] += way[0] * askew + 2 * way[1] * along
+                    a[n, r] += error_root[r, c] * (bias_fraction * pair_bias[c] + independent * normals[k, c])
+                    b[n, r] += error_root[r, c] * later_noise[k, c]
+            a[n, 0] += distance[1] * cross
+            a[n, 1] += distance[0] * cross + 2 * distance[1] * along
             n += 1
-    a, b, farther_cov = a[:n], b[:n], cov * (1 + farther)
-    covs, farther_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
+    a, b, earlier_cov = a[:n], b[:n], cov * (1 + growth)
+    later_covs, earlier_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for k in range(n):
-        geometry.put(covs[k], cov)
-        geometry.put(farther_covs[k], farther_cov)
-    error, _, by_motion, information, _ = observation_equations.linearised(
-        a, b, b, farther_covs, covs, there_from_here, baseline
-    )
-    normal, right, by_common = observation_equations.reduced(error, by_motion, information, np.ones(n))
-    if n < LEAST_POINTS:
-        return n, there_from_here, normal
+        geometry.put(later_covs[k], cov)
+        geometry.put(earlier_covs[k], earlier_cov)
+    measured = observation_equations.PairMeasurements(a, b, earlier_covs, later_covs)
+    observations = observation_equations.linearise(measured, b, earlier_from_later, baseline)
+    normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, np.ones(n))
+    if n < MIN_POINTS:
+        return n, earlier_from_later, normal
     inverse = np.linalg.inv(normal)
-    shared = inverse @ by_common * common_claim
-    return n, there_from_here @ geometry.exp(inverse @ right), inverse * correlation + shared @ shared.T
+    common = inverse @ bias_jacobian * common_sigma
+    return n, earlier_from_later @ geometry.exp(inverse @ right), inverse * inflation + common @ common.T
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _floor_cell(pose, point, baseline, cell_m, n):
-    """Row and column of the floor's cell that a camera measures at (x, y, disparity), of n that repeat."""
+    """Returns row and column, modulo n, of the floor cell at (x, y, disparity) in a camera."""
     depth = baseline / point[2]
     x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
     y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
@@ -93,20 +101,33 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 
 
 @njit(cache=True, nogil=True)
-def unit_motion(points: Array, baseline: float, n_weight: float) -> tuple[Array, Array]:
-    """Covariance (6, 6), and its root, of a motion by eq. (2) where so many points like these (n, 3) err by one."""
+def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple[Array, Array]:
+    """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its square root.
+
+    Least squares of Negahdaripour & Madjidi (2003), eq. (2), with `n_effective` flow vectors of unit standard deviation
+    distributed as these points (n, 3), normalised (x, y, disparity).
+    """
     n = len(points)
-    rows = observation_equations.image_motion(points[:, 0], points[:, 1], baseline / points[:, 2])
-    normal, _ = observation_equations.normal_equations(rows, np.full(n, n_weight / n), np.zeros((n, 2)))
+    jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
+    normal, _ = observation_equations.normal_equations(jacobian, np.full(n, n_effective / n), np.zeros((n, 2)))
     cov = np.ascontiguousarray(np.linalg.inv(normal))
     return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
 
 
 @njit(cache=True, nogil=True)
-def mosaic_offset(believed, true, shares, now, world_from_camera):
-    """What a mosaic of keyframes at poses (n, 4, 4), laid where they were believed to be, says of a predicted pose."""
-    predicted_from_world, offset = geometry.inverse(world_from_camera), np.zeros(6)
-    for k in range(len(shares)):
-        told = believed[k] @ geometry.inverse(true[k]) @ now
-        offset += shares[k] * geometry.log(predicted_from_world @ told)
-    return offset
+def mosaic_correction(estimated, true, fractions, true_pose, predicted_pose):
+    """Returns the error-free correction (6,) of a predicted pose by registration with the mosaic.
+
+    The mosaic shows each keyframe displaced by the error of the pose at which it was added; the correction is the mean
+    over the keyframes in view.
+
+    Args:
+        estimated, true: (n, 4, 4) estimated and true poses of the keyframes in view.
+        fractions: (n,) fraction of the view that shows each of them.
+        true_pose, predicted_pose: (4, 4) true and predicted pose of the frame to register.
+    """
+    predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)
+    for k in range(len(fractions)):
+        in_mosaic = estimated[k] @ geometry.inverse(true[k]) @ true_pose
+        correction += fractions[k] * geometry.log(predicted_from_world @ in_mosaic)
+    return correction

@@ -1,1 +1,1 @@
-"""Fits the surrogate's error model to rendered surveys."""
+"""Fit of the surrogate's error model to rendered surveys."""

@@ -1,4 +1,9 @@
-"""From what witnesses noted on rendered surveys to the error model: every claim and every error is matched in turn."""
+"""Fit of the error model to the statistics of rendered surveys.
+
+Reported standard deviations are fitted by the medians of their ratios to the surrogate's, error ratios by those of
+squared errors in units of the reported covariance: medians, so that a few failed measurements have no effect. Every
+survey has the same weight.
+"""
 
 from __future__ import annotations
 
@@ -7,173 +12,212 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from twin.surrogate.error_model import ErrorModel, Law, Share
-from twin.surrogate_fit.witness import RELIEF, STEADY
+from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN
 
-_LINK_PARTS = ("images", "patches", "relief")
-_THIRDS_ERR = 0.1  # of the squared errors of a third of a survey's links, relative
+_SOURCES = ("images", "patches", "relief")
+_RELATIVE_SIGMA = 0.1  # relative standard error of the mean squared error of a third of a survey's links
 
-Notes = Mapping[str, Sequence[float]]
+#: Samples of one survey by name, see `ComparisonVision`.
+SurveyStatistics = Mapping[str, Sequence[float]]
 
 
-def fitted(surveys: Sequence[Notes], model: ErrorModel) -> ErrorModel:
-    """The model that would have answered these surveys as the images did; `model` is the one that was compared.
+def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> ErrorModel:
+    """Returns the error model that reproduces the measurements of rendered surveys.
 
-    Deviations are matched by the medians of ratios, excesses by those of squared errors in their own claims, so that a
-    few failures do not rule; each survey counts the same.
+    Args:
+        surveys: statistics of each survey.
+        compared: error model of the surrogate in these comparisons.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
 
-    def ratio(name: str) -> np.ndarray:
+    def median(name: str) -> np.ndarray:
         return np.array([np.median(s[name]) for s in surveys])
 
-    frames_err = np.sqrt(ratio("f2f_nees") / ratio("f2f_nees_surrogate"))
-    place_px = ratio("place_ratio") * [model.place_px(b) for b in bounds]
-    place = _law(bounds, place_px)
-    f2f = _law(bounds, ratio("f2f_claim") * [model.f2f_px(b) for b in bounds])
-    mosaic = _law(bounds, ratio("mosaic_claim") * [model.mosaic_px(b) for b in bounds])
-    apart, link_claims = _apart(surveys, model.apart)
-    widened = float(np.median(link_claims / ratio("place_ratio")))
-    patches, relief, steady = _link_parts(surveys, model.relief)
-    place_excess, lamps = _by_lamps(patches / ratio("place_ratio"), ratio("lamp_share"))
-    depth, lateral = (np.sqrt(x) for x in zip(*(_map_parts(s, "") for s in surveys), strict=True))
-    claimed = [np.sqrt(_map_parts(s, "_claimed")[0]) for s in surveys]
-    depth_px = [model.depth_px(b) * share for b, share in zip(bounds, claimed, strict=True)]
-    in_claims = ratio("mosaic_difference") - model.mosaic_excess**2
-    return model._replace(
-        bound_px=(float(bounds.min()), float(bounds.max())),
-        points=_share(bounds, ratio("points")),
-        place_px=place,
-        place_excess=place_excess,
-        lamps=lamps,
-        matched=_share(bounds, np.minimum(ratio("link_matched") * [model.matched(b) for b in bounds], 1.0)),
-        correlation=model.correlation * widened**2,
-        steady=steady,
-        apart=apart,
-        relief=relief,
-        f2f_px=f2f,
-        f2f_excess=model.f2f_excess * float(np.median(frames_err)),
-        f2f_undone=float(np.median([_undone(s) for s in surveys])),
-        mosaic_px=mosaic,
-        depth_px=_law(bounds, np.array(depth_px)),
-        depth_excess=model.depth_excess * float(np.median(depth / claimed)),
-        lateral_px=model.lateral_px * float(np.sqrt(np.mean(lateral**2))),
-        complete=_share(bounds, ratio("map_known")),
-        mosaic_excess=float(np.sqrt(np.median(np.maximum(in_claims, 0.01) / ratio("mosaic_claim") ** 2))),
+    f2f_ratios = np.sqrt(median("f2f_nees") / median("f2f_nees_surrogate"))
+    match_sigmas_px = median("match_sigma_ratio") * [compared.match_sigma_px(b) for b in bounds]
+    match_sigma_px = _fit_sigma_law(bounds, match_sigmas_px)
+    f2f_sigma_px = _fit_sigma_law(bounds, median("f2f_sigma_ratio") * [compared.f2f_sigma_px(b) for b in bounds])
+    mosaic_sigmas_px = median("mosaic_sigma_ratio") * [compared.mosaic_sigma_px(b) for b in bounds]
+    mosaic_sigma_px = _fit_sigma_law(bounds, mosaic_sigmas_px)
+    distance_growth, link_ratios = _fit_distance_growth(surveys, compared.distance_growth)
+    inflation = float(np.median(link_ratios / median("match_sigma_ratio")))
+    patch_ratios, relief_gain, bias_fraction = _fit_link_errors(surveys, compared.relief_gain)
+    match_error_ratio, lamp_error_growth = _fit_lamp_growth(
+        patch_ratios / median("match_sigma_ratio"), median("lamp_share")
+    )
+    depth, lateral = (np.sqrt(x) for x in zip(*(_fit_map_variances(s, "error") for s in surveys), strict=True))
+    reported = [np.sqrt(_fit_map_variances(s, "sigma")[0]) for s in surveys]
+    depth_sigmas_px = [compared.depth_sigma_px(b) * ratio for b, ratio in zip(bounds, reported, strict=True)]
+    mosaic_chi2 = median("mosaic_difference_nees") - compared.mosaic_error_ratio**2
+    return compared._replace(
+        bound_range_px=(float(bounds.min()), float(bounds.max())),
+        point_fraction=_fit_fraction_law(bounds, median("point_fraction")),
+        match_sigma_px=match_sigma_px,
+        match_error_ratio=match_error_ratio,
+        lamp_error_growth=lamp_error_growth,
+        match_fraction=_fit_fraction_law(
+            bounds, np.minimum(median("link_point_ratio") * [compared.match_fraction(b) for b in bounds], 1.0)
+        ),
+        match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
+        match_bias_fraction=bias_fraction,
+        distance_growth=distance_growth,
+        relief_gain=relief_gain,
+        f2f_sigma_px=f2f_sigma_px,
+        f2f_error_ratio=compared.f2f_error_ratio * float(np.median(f2f_ratios)),
+        f2f_anticorrelation=float(np.median([_fit_anticorrelation(s) for s in surveys])),
+        mosaic_sigma_px=mosaic_sigma_px,
+        depth_sigma_px=_fit_sigma_law(bounds, np.array(depth_sigmas_px)),
+        depth_error_ratio=compared.depth_error_ratio * float(np.median(depth / reported)),
+        lateral_sigma_px=compared.lateral_sigma_px * float(np.sqrt(np.mean(lateral**2))),
+        map_completeness=_fit_fraction_law(bounds, median("map_completeness")),
+        mosaic_error_ratio=float(np.sqrt(np.median(np.maximum(mosaic_chi2, 0.01) / median("mosaic_sigma_ratio") ** 2))),
     )
 
 
-def misfit(surveys: Sequence[Notes], compared: ErrorModel, model: ErrorModel) -> dict[str, float]:
-    """Root mean square over surveys of the logarithm of each claim over what the model says, by name."""
-    names = {"place_px": "place_ratio", "f2f_px": "f2f_claim", "mosaic_px": "mosaic_claim"}
-    return {law: _spread(surveys, ratio, getattr(compared, law), getattr(model, law)) for law, ratio in names.items()}
+def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted: ErrorModel) -> dict[str, float]:
+    """Returns the root mean square over surveys of ln(reported / fitted standard deviation), by field of the model."""
+    ratios = {
+        "match_sigma_px": "match_sigma_ratio",
+        "f2f_sigma_px": "f2f_sigma_ratio",
+        "mosaic_sigma_px": "mosaic_sigma_ratio",
+    }
+    return {
+        field: _rms_log_ratio(surveys, ratio, getattr(compared, field), getattr(fitted, field))
+        for field, ratio in ratios.items()
+    }
 
 
-def _spread(surveys: Sequence[Notes], ratio: str, compared: Law, law: Law) -> float:
+def _rms_log_ratio(surveys: Sequence[SurveyStatistics], ratio: str, compared: SigmaLaw, fitted: SigmaLaw) -> float:
+    """Returns the root mean square over surveys of ln(reported / fitted standard deviation)."""
     bounds = [np.median(s["bound_px"]) for s in surveys]
-    logs = [np.log(np.median(s[ratio]) * compared(b) / law(b)) for s, b in zip(surveys, bounds, strict=True)]
+    logs = [np.log(np.median(s[ratio]) * compared(b) / fitted(b)) for s, b in zip(surveys, bounds, strict=True)]
     return float(np.sqrt(np.mean(np.square(logs))))
 
 
-def _law(bounds: np.ndarray, deviations: np.ndarray) -> Law:
-    """Least squares of the logarithms."""
+def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
+    """Fits a law to the standard deviations (n,) at bounds (n,) by least squares of their logarithms."""
 
-    def off(x: np.ndarray) -> np.ndarray:
-        return np.log(np.hypot(x[0], x[1] * bounds) / deviations)
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
 
-    found = least_squares(off, [deviations.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
-    return Law(float(found.x[0]), float(found.x[1]))
-
-
-def _share(bounds: np.ndarray, shares: np.ndarray) -> Share:
-    def off(x: np.ndarray) -> np.ndarray:
-        return np.array([Share(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - shares
-
-    start = [min(float(shares.max()), 0.999), np.log(4 * bounds.max())]
-    found = least_squares(off, start, bounds=([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())]))
-    return Share(float(found.x[0]), float(np.exp(found.x[1])), 4.0)
+    solution = least_squares(residuals, [sigmas.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
+    return SigmaLaw(float(solution.x[0]), float(solution.x[1]))
 
 
-def _undone(notes: Notes) -> float:
-    """From by how much less the motion over an interval errs than its n frames would, were they independent.
+def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
+    """Fits maximum and half-maximum bound of a law with exponent 4 to the fractions (n,) at bounds (n,)."""
 
-    Where each undoes the share u of the last one's error, (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) of it is left.
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
+
+    start = [min(float(fractions.max()), 0.999), np.log(4 * bounds.max())]
+    limits = ([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())])
+    solution = least_squares(residuals, start, bounds=limits)
+    return FractionLaw(float(solution.x[0]), float(np.exp(solution.x[1])), 4.0)
+
+
+def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
+    """Fits the anticorrelation of consecutive frames to the error of the motion over n frames.
+
+    Where each frame cancels the fraction u of the previous error, the variance over n frames is
+    (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) of that of n independent frames.
     """
-    n = float(np.median(notes["f2f_frames"]))
-    left = np.median(notes["f2f_interval"]) / np.median(notes["f2f_nees"])
+    n = float(np.median(statistics["f2f_interval_frames"]))
+    ratio = np.median(statistics["f2f_interval_nees"]) / np.median(statistics["f2f_nees"])
     u = np.linspace(-1.0, 1.0, 2001)
-    return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - left))])
+    return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - ratio))])
 
 
-def _link_parts(surveys: Sequence[Notes], own_relief: float) -> tuple[np.ndarray, float, float]:
-    """By how much links err in all: as multiples of what patches (n,) and relief alone do, and what is steady of these.
+def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) -> tuple[np.ndarray, float, float]:
+    """Separates the errors of links into those of patch matching, of relief, and of the bias of a keyframe.
 
-    Relief's share grows with the way, that of patches does not: within each survey, links are compared by thirds of
-    their ways. Over a smooth floor that tells nothing, so that the relief of before counts as well, as known to itself.
-    What is steady about a keyframe lets a link of the path undo what the one before it erred by, as it is the earlier
-    one of the second and the later one of the first; relief lets it err the same way again. (Links around three
-    keyframes tell nothing of it: those from one keyframe err alike.)
+    Errors due to relief grow with the distance between the keyframes, errors of patch matching do not: the squared
+    errors of each survey are averaged over thirds of the links by distance, and the gain of relief is fitted to all
+    thirds of all surveys. Over a smooth floor they do not determine it, so the gain of the compared model enters as one
+    more observation. The bias of a keyframe makes the errors of consecutive links cancel, because the keyframe is the
+    later one of the first link and the earlier one of the second; relief makes them equal. (Loops of three keyframes do
+    not determine the bias, because links from the same keyframe have correlated errors.)
+
+    Args:
+        surveys: statistics of n surveys.
+        compared_gain: relief gain of the compared model.
+
+    Returns:
+        ratio (n,) of the patch errors to those of the model with patch errors alone, relief gain, bias fraction.
     """
-    thirds = np.array([_squares_by_way(s) for s in surveys])
+    thirds = np.array([_squared_errors_by_distance(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
-    own = max(own_relief / RELIEF, 0.5) ** 2
-    effects, wanted = [np.array([_THIRDS_ERR / own])], [np.array([_THIRDS_ERR])]
-    for patch, more in zip(by_patches / images, by_relief / images, strict=True):
-        left = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # by patches
-        effects.append(left @ more)
-        wanted.append(left.sum(axis=1))
+    prior = max(compared_gain / RELIEF_GAIN, 0.5) ** 2
+    effects, observed = [np.array([_RELATIVE_SIGMA / prior])], [np.array([_RELATIVE_SIGMA])]
+    for patch, relief_effect in zip(by_patches / images, by_relief / images, strict=True):
+        projection = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # eliminates the patch errors
+        effects.append(projection @ relief_effect)
+        observed.append(projection.sum(axis=1))
     effect = np.concatenate(effects)
-    relief = max(float(effect @ np.concatenate(wanted) / (effect @ effect)), 0.0)
+    relief = max(float(effect @ np.concatenate(observed) / (effect @ effect)), 0.0)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
-    chains = np.array([[np.mean(s[f"chain_{name}"]) for name in _LINK_PARTS] for s in surveys])
-    steady = STEADY * np.sum((chains[:, 0] - relief * chains[:, 2]) / patches) / np.sum(chains[:, 1])
-    return np.sqrt(patches), RELIEF * float(np.sqrt(relief)), float(np.clip(steady, 0.0, 0.98))
+    products = np.array([[np.mean(s[f"consecutive_product_{name}"]) for name in _SOURCES] for s in surveys])
+    bias = BIAS_FRACTION * np.sum((products[:, 0] - relief * products[:, 2]) / patches) / np.sum(products[:, 1])
+    return np.sqrt(patches), RELIEF_GAIN * float(np.sqrt(relief)), float(np.clip(bias, 0.0, 0.98))
 
 
-def _by_lamps(excess: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """True over claimed deviation of patches without lamps, and by how much it grows with their share of the light.
+def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
+    """Returns the error ratio of patches without lamps, and its growth with the lamps' share of the light.
 
-    Least squares of the relative errors of squares.
+    Least squares of the relative errors of the squared error ratios (n,).
     """
-    effects = np.column_stack([np.ones_like(excess), lamp_share**2]) / excess[:, None] ** 2
-    alike, more = nnls(effects, np.ones(len(excess)))[0]
-    return float(np.sqrt(alike)), float(np.sqrt(more / max(alike, 1e-6)))
+    effects = np.column_stack([np.ones_like(error_ratios), lamp_share**2]) / error_ratios[:, None] ** 2
+    constant, growth = nnls(effects, np.ones(len(error_ratios)))[0]
+    return float(np.sqrt(constant)), float(np.sqrt(growth / max(constant, 1e-6)))
 
 
-def _squares_by_way(notes: Notes) -> np.ndarray:
-    """(3, 3) squared errors of links near, farther and far: of the images, by patches and by relief alone.
+def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
+    """Returns mean squared link errors (3, 3): thirds of the links by distance, columns as `_SOURCES`.
 
-    The mean of 19 in 20.
+    The largest twentieth of each is left out.
     """
-    errors = np.column_stack([notes[f"link_{name}"] for name in _LINK_PARTS])
-    thirds = (np.sort(errors[third], axis=0) for third in np.array_split(np.argsort(notes["link_apart"]), 3))
+    errors = np.column_stack([statistics[f"link_nees_{name}"] for name in _SOURCES])
+    order = np.argsort(statistics["link_distance"])
+    thirds = (np.sort(errors[third], axis=0) for third in np.array_split(order, 3))
     return np.array([third[: len(third) - len(third) // 20].mean(axis=0) for third in thirds])
 
 
-def _apart(surveys: Sequence[Notes], own: float) -> tuple[float, np.ndarray]:
-    """How fast claims of links grow with the way between their keyframes, and their ratio (n,) at none, by survey.
+def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: float) -> tuple[float, np.ndarray]:
+    """Fits the growth of the reported link covariance with the distance between the keyframes.
 
-    One of the two pairs is placed by the match, so that (1 + (apart way)^2 / 2) is what a link's variance grows by.
+    Only the earlier pair's variance grows, so that of a link is multiplied by 1 + (growth * distance)^2 / 2.
+
+    Returns:
+        growth, ratio (n,) of the reported standard deviations at distance zero by survey.
     """
-    ways = [np.square(s["link_apart"]) / 2 for s in surveys]
-    claims = [2 * np.log(s["link_claim"]) + np.log1p(own**2 * way) for s, way in zip(surveys, ways, strict=True)]
+    half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
+    log_variances = [
+        2 * np.log(s["link_sigma_ratio"]) + np.log1p(compared_growth**2 * half_square)
+        for s, half_square in zip(surveys, half_squares, strict=True)
+    ]
 
-    def off(x: np.ndarray) -> list[np.ndarray]:
-        return [claim - np.log1p(x[0] ** 2 * way) for claim, way in zip(claims, ways, strict=True)]
+    def log_ratios(x: np.ndarray) -> list[np.ndarray]:
+        return [log - np.log1p(x[0] ** 2 * half) for log, half in zip(log_variances, half_squares, strict=True)]
 
-    def around(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([(rest - np.median(rest)) / np.sqrt(len(rest)) for rest in off(x)])
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([(ratios - np.median(ratios)) / np.sqrt(len(ratios)) for ratios in log_ratios(x)])
 
-    found = least_squares(around, [max(own, 1.0)], bounds=([0.0], [30.0]), loss="soft_l1", f_scale=0.02).x
-    return float(found[0]), np.exp([np.median(rest) / 2 for rest in off(found)])
+    start = [max(compared_growth, 1.0)]
+    solution = least_squares(residuals, start, bounds=([0.0], [30.0]), loss="soft_l1", f_scale=0.02).x
+    return float(solution[0]), np.exp([np.median(ratios) / 2 for ratios in log_ratios(solution)])
 
 
-def _map_parts(notes: Notes, what: str) -> np.ndarray:
-    """(2,) by how much the variances by depth and by sideways error have to grow for level and steep cells to agree."""
-    names = [name for name in ("level", "steep") if f"map_{name}_images{what}" in notes]
+def _fit_map_variances(statistics: SurveyStatistics, quantity: str) -> np.ndarray:
+    """Returns the factors (2,) on depth and lateral variance that reproduce the variances of level and steep cells.
+
+    Args:
+        quantity: "error" or "sigma".
+    """
+    names = [name for name in ("level", "steep") if f"map_{quantity}_{name}_images" in statistics]
     images, pose, depth, lateral = (
-        np.array([notes[f"map_{name}_{whose}{what}"][0] for name in names])
-        for whose in ("images", "pose", "depth", "lateral")
+        np.array([statistics[f"map_{quantity}_{name}_{source}"][0] for name in names])
+        for source in ("images", "pose", "depth", "lateral")
     )
     effects = np.stack([depth - pose, lateral - pose], axis=1) / images[:, None]
     return nnls(effects, np.maximum(1 - pose / images, 0))[0]

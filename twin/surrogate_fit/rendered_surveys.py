@@ -1,4 +1,4 @@
-"""Fit of the surrogate: rendered surveys are flown beside a witness, and the model is fitted to its notes."""
+"""Rendered surveys that collect statistics of the comparison with the surrogate, and the fit to them."""
 
 from __future__ import annotations
 
@@ -10,68 +10,69 @@ from twin import survey
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted, TwinError
 from twin.scenario.model import Scenario
-from twin.session.conclusion import make_map
+from twin.session.assembly import image_vision, navigator_with
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
-from twin.surrogate.surrogate_world import vision_beside
-from twin.surrogate_fit.fit import Notes, fitted, misfit
-from twin.surrogate_fit.witness import Witness
-from twin.world.mission import Mission, prepare
+from twin.surrogate.surrogate_world import surrogate_vision
+from twin.surrogate_fit.comparison import ComparisonVision
+from twin.surrogate_fit.fit import SurveyStatistics, fit_error_model, log_misfit
+from twin.world.mission import prepare
 from twin.world.rendered_world import RenderedWorld
 
-_NOTES = "witness.json"
-_LEAST_SURVEYS = 2
+_FILE = "surrogate_comparison.json"
+_MIN_SURVEYS = 2
 
 
-def fit_to(notes: Sequence[Notes], model: ErrorModel) -> FittedErrorModel:
-    """The calibration of `model`, refined by what was noted beside it.
+def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> FittedErrorModel:
+    """Returns the error model fitted to rendered surveys.
+
+    Args:
+        surveys: statistics of each survey; those of aborted surveys are ignored.
+        compared: error model of the surrogate in these comparisons.
 
     Raises:
-        TwinError: too few surveys got as far as a map.
+        TwinError: too few surveys are complete.
     """
-    whole = [n for n in notes if "chain_images" in n and "map_level_images" in n]
-    if len(whole) < _LEAST_SURVEYS:
-        raise TwinError("calibrate", f"{len(whole)} surveys were flown to their end", f"at least {_LEAST_SURVEYS}")
-    found = fitted(whole, model)
-    return FittedErrorModel(found, len(whole), misfit(whole, model, found))
+    complete = [s for s in surveys if "consecutive_product_images" in s and "map_error_level_images" in s]
+    if len(complete) < _MIN_SURVEYS:
+        raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
+    fitted = fit_error_model(complete, compared)
+    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted))
 
 
-def note(scenario: Scenario, folder: Path, model: ErrorModel) -> Notes:
-    """What a witness notes on a rendered survey; taken from the folder where the same was flown beside this model."""
-    return _taken(scenario, folder, model) or _fly(scenario, folder, model)
+def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
+    """Returns the statistics of a rendered survey, from its folder if they are there for the same error model."""
+    return _load(scenario, folder, compared) or _fly(scenario, folder, compared)
 
 
-def _taken(scenario: Scenario, folder: Path, model: ErrorModel) -> Notes | None:
-    """The notes of the same survey flown before."""
+def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics | None:
+    """Returns the statistics in a folder; None if there are none of this scenario and error model."""
     try:
-        kept = json.loads((folder / _NOTES).read_text(encoding="utf-8"))
+        saved = json.loads((folder / _FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    same = kept["scenario_hash"] == scenario.fingerprint() and kept["model"] == repr(model)
-    return kept["notes"] if same else None
+    same = saved["scenario_hash"] == scenario.fingerprint() and saved["model"] == repr(compared)
+    return saved["statistics"] if same else None
 
 
-def _fly(scenario: Scenario, folder: Path, model: ErrorModel) -> Notes:
-    """A rendered survey with a witness; an aborted one tells what it saw so far."""
-    mission, watch = prepare(scenario), Stopwatch()
+def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
+    """Flies a rendered survey and saves its statistics; those of an aborted survey are incomplete."""
+    mission, stopwatch = prepare(scenario), Stopwatch()
     folder.mkdir(parents=True, exist_ok=True)
-    with RenderedWorld(mission, watch) as world:
-        witness = _witness(mission, world, folder, model)
-        navigator = survey.make_navigator(mission, witness, watch)
-        try:
-            survey.fly(mission, world, navigator, lambda *_: None)
-            result = navigator.finish()
-            make_map(mission, navigator, result, lambda _: None)
-        except SurveyAborted:
-            pass
-    text = json.dumps({"scenario_hash": scenario.fingerprint(), "model": repr(model), "notes": witness.notes})
-    (folder / _NOTES).write_text(text, encoding="utf-8")
-    return witness.notes
+    with RenderedWorld(mission, stopwatch) as world:
 
+        def true_pose():
+            return world.world_from_camera
 
-def _witness(mission: Mission, world: RenderedWorld, folder: Path, model: ErrorModel) -> Witness:
-    def truth():
-        return world.world_from_camera
-
-    surrogate = vision_beside(mission, model, truth, Stopwatch())
-    return Witness(survey.image_vision(mission, folder, world.watch), surrogate, truth)
+        surrogate = surrogate_vision(mission, compared, true_pose, Stopwatch())
+        vision = ComparisonVision(image_vision(mission, folder, stopwatch), surrogate, true_pose)
+        with navigator_with(mission, vision, stopwatch) as navigator:
+            try:
+                survey.fly(mission, world, navigator, lambda *_: None)
+                result = navigator.finish()
+                navigator.build_map(result, mission.grid, lambda _: None)
+            except SurveyAborted:
+                pass
+    saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": vision.statistics}
+    (folder / _FILE).write_text(json.dumps(saved), encoding="utf-8")
+    return vision.statistics

@@ -1,4 +1,4 @@
-"""Which cells of the floor the survey truly saw, with both cameras."""
+"""Map cells that at least one keyframe observed with both cameras, from the true depth images."""
 
 from __future__ import annotations
 
@@ -10,23 +10,32 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid, StereoRig
 
-#: Neighbouring pixels whose depths differ by more than this share are an occluding edge, not a slope: at 0.2 deg a
-#: pixel a slope of 86 deg still counts.
+#: Four neighbouring pixels whose depths differ by more than this share are an occluding edge and not a surface. At
+#: 0.2 deg per pixel, a slope of 86 deg is still a surface.
 EDGE_SHARE = 0.05
-#: Slack of the agreement of left and right depth, as a share of depth.
-AGREE_SHARE = 0.005
-_ROWS = 64
+#: Tolerance of the left-right depth comparison, as a share of the depth.
+DEPTH_TOLERANCE = 0.005
+_ROWS_PER_CALL = 64
 
 
 class Coverage:
-    """Accumulates `seen` (rows, cols): cells whose centre lies in a quad of pixels that both cameras see."""
+    """Observed cells of a grid.
+
+    `seen` (rows, cols) bool is modified in place by `add`: a cell is observed if its centre lies within a quad of four
+    neighbouring left pixels that the right camera sees as well.
+    """
 
     def __init__(self, grid: MapGrid, rig: StereoRig) -> None:
         self.grid, self.rig = grid, rig
         self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
 
     def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
-        """Marks what a keyframe saw: true pose (4, 4), true depths (height, width) along the optical axis [m]."""
+        """Marks the cells that a keyframe observes.
+
+        Args:
+            world_from_left: (4, 4) true pose of the left camera.
+            depth_left, depth_right: (height, width) true depth along the optical axis [m].
+        """
         grid, rig = self.grid, self.rig
         camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.baseline_m)
         raster = (grid.west_m, grid.north_m, grid.cell_m)
@@ -36,17 +45,24 @@ class Coverage:
 
 
 def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
-    """(rows, cols) true height at the cell centres [m]; `height_at(x, y)` takes and gives arrays of one shape."""
+    """Returns the true height at the cell centres (rows, cols) [m].
+
+    Args:
+        height_at: returns the heights at arrays x and y of equal shape [m].
+    """
     x, y = grid.centres()
     height = np.empty((grid.rows, grid.cols), np.float32)
-    for row in range(0, grid.rows, _ROWS):  # a large grid at once would take many times its memory
-        height[row : row + _ROWS] = height_at(*np.meshgrid(x, y[row : row + _ROWS]))
+    for row in range(0, grid.rows, _ROWS_PER_CALL):  # in blocks: the coordinates take several times the grid's memory
+        height[row : row + _ROWS_PER_CALL] = height_at(*np.meshgrid(x, y[row : row + _ROWS_PER_CALL]))
     return height
 
 
 @njit(cache=True, nogil=True)
 def _mark_seen(seen, raster, pose, camera, left, right):
-    """Two rows of floor points at a time: each pixel's point [cells], then every quad between four visible pixels."""
+    """Compiled kernel of `Coverage.add`.
+
+    Projects two image rows of pixels onto the grid at a time and marks the quads between four visible pixels.
+    """
     height, width = left.shape
     col, row = np.zeros((2, width)), np.zeros((2, width))
     visible = np.zeros((2, width), dtype=np.bool_)
@@ -71,20 +87,24 @@ def _mark_seen(seen, raster, pose, camera, left, right):
 
 @njit(cache=True, nogil=True)
 def _in_both(u, v, left, right, camera):
-    """A left pixel is seen by both if its projection is in the right image and lies between the depths around it."""
+    """Returns whether both cameras see the point of a left pixel.
+
+    They do if its projection lies in the right image and its depth lies between the depths of the two right pixels
+    next to the projection, within the tolerance.
+    """
     z = left[v, u]
     if not (z > 0 and z < np.inf):
         return False
     k = int(np.floor(u - camera[0] * camera[3] / z))
     if k < 0 or k + 1 >= right.shape[1]:
         return False
-    a, b, slack = right[v, k], right[v, k + 1], AGREE_SHARE * z
+    a, b, slack = right[v, k], right[v, k + 1], DEPTH_TOLERANCE * z
     return min(a, b) - slack <= z <= max(a, b) + slack
 
 
 @njit(cache=True, nogil=True)
 def _floor_cell(u, v, z, pose, camera, raster):
-    """Column and row of the point that a pixel sees; whole numbers are cell centres."""
+    """Returns column and row of the point of a pixel (u, v) with depth z; integers are cell centres."""
     xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
     x = pose[0, 0] * xc + pose[0, 1] * yc + pose[0, 2] * z + pose[0, 3]
     y = pose[1, 0] * xc + pose[1, 1] * yc + pose[1, 2] * z + pose[1, 3]
@@ -93,6 +113,7 @@ def _floor_cell(u, v, z, pose, camera, raster):
 
 @njit(cache=True, nogil=True)
 def _is_surface(left, u, v):
+    """Returns whether the depths of four neighbouring pixels belong to one surface, without an occluding edge."""
     a, b, c, d = left[v, u], left[v, u + 1], left[v + 1, u], left[v + 1, u + 1]
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     return high - low <= EDGE_SHARE * low
@@ -100,7 +121,7 @@ def _is_surface(left, u, v):
 
 @njit(cache=True, nogil=True)
 def _mark_triangle(seen, ca, ra, cb, rb, cc, rc):
-    """Marks the cells whose centre lies in a triangle of points (column, row); the edges count as inside."""
+    """Marks the cells whose centre lies in or on the edge of a triangle of points (column, row)."""
     row0, row1 = max(0, int(np.ceil(min(ra, rb, rc)))), min(seen.shape[0] - 1, int(np.floor(max(ra, rb, rc))))
     col0, col1 = max(0, int(np.ceil(min(ca, cb, cc)))), min(seen.shape[1] - 1, int(np.floor(max(ca, cb, cc))))
     for r in range(row0, row1 + 1):

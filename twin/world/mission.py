@@ -1,4 +1,4 @@
-"""What is to be flown, checked before anything is: scenario, floor, plan and the cells of the map."""
+"""The mission: scenario, floor, plan and map grid, checked before anything is flown."""
 
 from __future__ import annotations
 
@@ -11,24 +11,30 @@ from numpy.typing import NDArray
 import terrains
 from controllers import lawnmower, loops, segments
 from controllers.forecast import least_clearance
-from controllers.survey_plan import PlanFault, SurveyPlan, SurveyRequest
+from controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.lamps import daylight_at, lights_of_eye
-from twin.imaging.true_cameras import View, make_view
-from twin.imaging.water import medium
+from twin.imaging.illumination import Illumination, illumination_of
+from twin.imaging.lamps import light_sources_in_camera
+from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
 from twin.scenario.model import BeaconConfig, CalibrationErrorConfig, Scenario, SensorConfig, Source
 from twin.simulate.autopilot import top_speed_mps
 
-#: Between places along the path at which a lamp is looked for in the floor.
+#: Step along the path at which the clearance of a lamp above the floor is checked.
 LAMP_STEP_M = 0.02
 
 
 class Step(NamedTuple):
-    """One frame of the survey: where the left camera shall be, whether it is a keyframe, whether it keeps station."""
+    """One planned frame.
+
+    Args:
+        reference: planned pose and velocity of the left camera.
+        keyframe: whether the frame is a keyframe.
+        holding: whether the vehicle keeps station.
+    """
 
     reference: segments.Reference
     keyframe: bool
@@ -37,12 +43,12 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """Frames that follow one another: a sequence of steps.
+    """Consecutive planned frames, a sequence of steps.
 
     Args:
-        reference: of the left camera, at each.
-        keyframe: (n,) bool.
-        holding: whether they keep station.
+        reference: planned pose and velocity of the left camera at each frame.
+        keyframe: (n,) bool, whether each frame is a keyframe.
+        holding: whether the vehicle keeps station.
     """
 
     reference: segments.Reference
@@ -65,25 +71,26 @@ class Mission:
     plan: SurveyPlan
     rig: StereoRig
     grid: MapGrid
-    view: View
+    true_cameras: TrueCameras
+    illumination: Illumination
 
     @property
     def start(self) -> Array:
-        """(4, 4) reference position: world_from_camera where the survey begins, level, bow to the east."""
+        """(4, 4) world_from_camera at the start of the survey, the reference position: level, bow to the east."""
         return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
 
     @property
     def start_of_body(self) -> Array:
-        """(4, 4) world_from_body there."""
+        """(4, 4) world_from_body at the start of the survey."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
     def fly(self, track: int) -> Course:
-        """The frames of a track (from 1); every N-th is a keyframe, and the last one."""
+        """Returns the frames of a track (from 1); every N-th frame and the last one are keyframes."""
         times_s, keyframes = self.plan.frames_of_track(track)
         return Course(self.plan.references(track, times_s), keyframes, holding=False)
 
     def hold(self, track: int) -> Course:
-        """The frames of half the station keeping after a track."""
+        """Returns the frames of half the station keeping after a track (from 1)."""
         n = self._n_holding
         end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
         return Course(end, np.zeros(n, np.bool_), holding=True)
@@ -94,7 +101,7 @@ class Mission:
 
     @property
     def n_frames(self) -> int:
-        """Frames of the whole survey."""
+        """Number of frames of the whole survey."""
         return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
     @property
@@ -104,57 +111,60 @@ class Mission:
 
 
 def prepare(scenario: Scenario) -> Mission:
-    """Loads the floor and plans the survey.
+    """Loads the floor, plans the survey and checks both.
 
     Raises:
-        ScenarioError: all that stands in the way, each with file and line.
+        ScenarioError: every reason why the survey cannot be flown, each with file and line.
     """
-    faults: list[str] = []
+    errors: list[str] = []
     source = scenario.source
-    terrain = _attempt(lambda: load_terrain(scenario), source, faults)
-    plan = _attempt(lambda: make_plan(scenario), source, faults)
-    _attempt(lambda: _check_speed(scenario), source, faults)
-    _attempt(lambda: _check_current(scenario), source, faults)
+    terrain = _attempt(lambda: load_terrain(scenario), source, errors)
+    plan = _attempt(lambda: make_plan(scenario), source, errors)
+    _attempt(lambda: _check_speed(scenario), source, errors)
+    _attempt(lambda: _check_current(scenario), source, errors)
     if (sensor := scenario.sensor) is not None:
-        _attempt(lambda: _check_exposure(sensor), source, faults)
+        _attempt(lambda: _check_exposure(sensor), source, errors)
         for key, time_ms in (("exposure_max_ms", sensor.exposure_max_ms), ("readout_ms", sensor.readout_ms)):
-            _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, faults)
-    view = _attempt(lambda: make_view(scenario), source, faults)
-    _attempt(lambda: _check_light(scenario), source, faults)
-    _attempt(lambda: _check_surrogate(scenario), source, faults)
-    _attempt(lambda: check_require(scenario.require), source, faults)
-    _attempt(lambda: _check_beacons_listed(scenario), source, faults)
+            _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, errors)
+    true_cameras = _attempt(lambda: make_true_cameras(scenario), source, errors)
+    illumination = _attempt(lambda: _illumination(scenario), source, errors)
+    _attempt(lambda: _check_surrogate(scenario), source, errors)
+    _attempt(lambda: check_require(scenario.require), source, errors)
+    _attempt(lambda: _check_beacons_listed(scenario), source, errors)
     if terrain is not None:
         for k, beacon in enumerate(scenario.beacons):
-            _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, faults)
+            _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, errors)
     if terrain is not None and plan is not None:
-        _attempt(lambda: _check_room(scenario, terrain, plan), source, faults)
+        _attempt(lambda: _check_clearance(scenario, terrain, plan), source, errors)
         for k in range(len(scenario.lamps)):
-            _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, faults)
-    if faults or terrain is None or plan is None or view is None:
-        raise ScenarioError(faults)
-    return Mission(scenario, terrain, plan, scenario.believed_rig(), _grid(scenario, plan), view)
+            _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, errors)
+    if errors or terrain is None or plan is None or true_cameras is None or illumination is None:
+        raise ScenarioError(errors)
+    grid = _grid(scenario, plan)
+    return Mission(scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination)
 
 
-def _attempt(build, source: Source, faults: list[str]):
-    """What `build` returns, or None with its fault told."""
+def _attempt(build, source: Source, errors: list[str]):
+    """Returns what `build` returns, or None and appends its error to the list."""
     try:
         return build()
-    except (terrains.TerrainFault, PlanFault) as fault:
-        faults.append(source.fault(TwinError(fault.field, fault.problem, fault.allowed)))
-    except TwinError as fault:
-        faults.append(source.fault(fault))
+    except TwinError as error:
+        errors.append(source.describe(error))
     return None
 
 
 def load_terrain(scenario: Scenario) -> terrains.Terrain:
-    """The floor of the scenario, generated or read."""
+    """Generates or reads the floor of a scenario.
+
+    Raises:
+        TwinError: the floor cannot be generated or read.
+    """
     t = scenario.terrain
     if t.kind != "file":
         if t.height_file or t.texture_file:
             key = "height_file" if t.height_file else "texture_file"
-            raise TwinError(f"terrain.{key}", f"is not read by a generated floor ({t.kind})", 'terrain.kind = "file"')
-        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # nobody looks at it
+            raise TwinError(f"terrain.{key}", f"has no effect on a generated floor (terrain.kind = {t.kind!r})", 'terrain.kind = "file"')
+        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # without images the texture is not needed
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
@@ -167,7 +177,11 @@ _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 
 
 def make_plan(scenario: Scenario) -> SurveyPlan:
-    """The plan of the scenario."""
+    """Plans the survey of a scenario.
+
+    Raises:
+        TwinError: no plan satisfies the scenario.
+    """
     p, rig = scenario.plan, scenario.believed_rig()
     request = SurveyRequest(
         p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
@@ -177,7 +191,7 @@ def make_plan(scenario: Scenario) -> SurveyPlan:
 
 
 def _check_speed(scenario: Scenario) -> None:
-    """The vehicle can fly as fast as planned: along the bow, on loops in every direction."""
+    """Checks that the thrusters reach the planned speed: along the bow, and on loops in every direction."""
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
@@ -190,24 +204,24 @@ def _check_speed(scenario: Scenario) -> None:
 
 
 def _check_surrogate(scenario: Scenario) -> None:
-    """The surrogate knows noise, light and geometry; what else befalls images it would silently leave out."""
+    """Rejects effects that the surrogate does not model."""
     if scenario.imaging.fidelity == "rendered":
         return
     plain = scenario.port.kind == "none" and scenario.calibration_error == CalibrationErrorConfig()
-    absent = {"port, calibration": not plain, "snow": scenario.snow.density_per_m3 > 0}
+    absent = {"port, calibration_error": not plain, "snow": scenario.snow.density_per_m3 > 0}
     for section, given in absent.items():
         if given:
-            raise TwinError("imaging.fidelity", f"'surrogate' knows nothing of [{section}]", '"rendered"')
+            raise TwinError("imaging.fidelity", f"'surrogate' does not model [{section}]", '"rendered"')
 
 
 def _check_beacons_listed(scenario: Scenario) -> None:
-    """Where beacons aid, there are some."""
+    """Checks that a survey that is aided by beacons has some."""
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
         raise TwinError("navigation.aiding", "'beacons': the scenario has none", "with a [[beacons]] position_m")
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
-    """The beacon stands on the floor or above it."""
+    """Checks that a beacon is on the floor or above it."""
     x, y, z = beacon.position_m
     floor_m = float(terrain.height_at(x, y))
     if np.isnan(floor_m):
@@ -217,23 +231,24 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
             f"x {terrain.west_m:.2f} to {east:.2f}, y {terrain.south_m:.2f} to {north:.2f} m",
         )  # fmt: skip
     if z < floor_m:
-        raise TwinError(f"beacons.{number}.position_m", f"z {z:g} lies in the floor", f"above {floor_m:.3f} m")
+        raise TwinError(f"beacons.{number}.position_m", f"z {z:g} is below the floor", f"above {floor_m:.3f} m")
 
 
 def _check_current(scenario: Scenario) -> None:
-    """A current moves a hull, not a carrier."""
+    """Rejects a current on a kinematic vehicle, which it does not move."""
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
-        raise TwinError("current.velocity_mps", "moves no kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
+        raise TwinError("current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
 
 
-def _check_light(scenario: Scenario) -> None:
-    """Water, daylight and beams are what they should be."""
-    daylight = daylight_at(scenario.sun, medium(scenario.water), scenario.plan.altitude_m)
-    lights_of_eye(scenario.believed_rig(), scenario.lamps, daylight, 0)
+def _illumination(scenario: Scenario) -> Illumination:
+    """Returns water and daylight; raises TwinError where they or the beam of a lamp are invalid."""
+    illumination = illumination_of(scenario)
+    light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
+    return illumination
 
 
 def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """The lamp stays above the floor, bow to the east, all along the path."""
+    """Checks that a lamp stays above the floor along the whole path, bow to the east."""
     corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
     offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
@@ -242,13 +257,13 @@ def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
     if (least := above.min()) < 0:
         raise TwinError(
-            f"lamps.{number}.position_m", f"lies {-least:.2f} m in the floor at x {x[above.argmin()]:.1f},"
+            f"lamps.{number}.position_m", f"is {-least:.2f} m below the floor at x {x[above.argmin()]:.1f},"
             f" y {y[above.argmin()]:.1f}", f"{scenario.lamps[number].position_m[2] - least:.2f} up or more",
         )  # fmt: skip
 
 
 def _check_exposure(sensor: SensorConfig) -> None:
-    """The limits of exposure are in order."""
+    """Checks the order of the exposure limits."""
     if sensor.exposure_min_ms > sensor.exposure_max_ms:
         raise TwinError(
             "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
@@ -257,7 +272,7 @@ def _check_exposure(sensor: SensorConfig) -> None:
 
 
 def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
-    """What the sensor does for a frame is done before the next."""
+    """Checks that a time of the sensor fits into the frame interval."""
     if time_ms > 1000 / frame_rate_hz:
         raise TwinError(
             f"sensor.{key}", f"{time_ms:g}: longer than a frame",
@@ -265,8 +280,8 @@ def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
         )  # fmt: skip
 
 
-def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """The plan stays over the floor and clear of it."""
+def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+    """Checks that the path stays over the terrain with enough clearance."""
     size = terrain.size_m
     if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
         shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
@@ -287,7 +302,7 @@ def _check_room(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan)
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
-    """Cells that cover all that the plan can see at the reference plane, and half a metre more."""
+    """Returns the grid of the map: all that the plan shows of the reference plane, and a margin of half a metre."""
     corners = plan.outline()[:, :2]
     across_m, along_m = plan.footprint_m
     margin = np.array([along_m, across_m]) / 2 + 0.5

@@ -1,42 +1,43 @@
-"""Left of the wall: vehicle, floor, light, sensors; frames come out, thruster commands go in, truth is kept beside."""
+"""The simulated world of a survey: thruster commands in, frames out, and a record of the ground truth."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.growing_array import Rows
+from twin.core.growing_array import GrowingArray
 from twin.core.records import Frame, Image, StereoRig, Trajectory, Truth
-from twin.estimate.pipeline import Navigator
-from twin.estimate.stereo_vision import Vision
-from twin.simulate.carrier import Carrier
-from twin.simulate.free_body import FreeBody
+from twin.core.timing import StageTimer
+from twin.simulate.kinematic_vehicle import KinematicVehicle
+from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import true_heights
 from twin.world.mission import Course, Mission, Step
 from twin.world.pilot import PilotOfEstimates
 
 if TYPE_CHECKING:
-    from twin.simulate.vehicle import Vehicle
+    from twin.simulate.mujoco_vehicle import MujocoVehicle
 
-#: Streams of randomness, in this order for ever: a draw of one never depends on another.
+#: Random streams in the order in which seeds are spawned: appending one leaves the draws of the others unchanged.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
 
-
-Watch = Callable[[str], AbstractContextManager[None]]
-#: Flies the frames of a course from this one on, up to the next keyframe; returns the next frame.
-Glide = Callable[[Course, int], int]
+#: Advances the closed loop from frame k of a course towards the next keyframe; returns the next frame.
+FastForward = Callable[[Course, int], int]
 
 
 class CameraImages(NamedTuple):
-    """What the cameras give: images (H, W, 3), and true depth (H, W) of the left one [m] for those who ask."""
+    """Camera images of one instant.
+
+    Args:
+        left, right: (H, W, 3) uint8 RGB; the right one at keyframes.
+        depth_m: returns the true depth (H, W) of the left image [m].
+    """
 
     left: Image
     right: Image | None
@@ -47,18 +48,16 @@ class World(ABC):
     """The simulated world of a mission. Use as a context manager.
 
     Attributes:
-        vision: answers the questions of the method itself, where nothing is rendered; None: ask the images.
-        warnings: what the user should know of this world.
+        warnings: limitations of this world that the user should know.
     """
 
-    vision: Vision | None = None
     warnings: tuple[str, ...] = ()
 
     def __init__(
-        self, mission: Mission, watch: Watch, vehicle: Vehicle | FreeBody | Carrier, sensors: NavigationSensors
+        self, mission: Mission, stopwatch: StageTimer, vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle, sensors: NavigationSensors
     ):
-        self.mission, self.watch, self.vehicle, self.sensors = mission, watch, vehicle, sensors
-        self._true_poses = Rows(4, 4)
+        self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
+        self._true_poses = GrowingArray(4, 4)
         self._courses: list[tuple[Array, bool, int]] = []  # planned positions (n, 3), station keeping, track
 
     def __enter__(self) -> Self:
@@ -69,53 +68,59 @@ class World(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Gives back what the world held."""
+        """Releases the resources of the world."""
 
     @abstractmethod
-    def look(self, step: Step) -> CameraImages:
-        """What the cameras see now."""
+    def capture(self, step: Step) -> CameraImages:
+        """Returns the images of the cameras at the present pose."""
 
     @abstractmethod
     def seen(self) -> NDArray[np.bool_]:
-        """(rows, cols) cells of the map that at least one keyframe truly saw with both cameras."""
+        """Returns the cells of the map (rows, cols) that both cameras saw in at least one keyframe."""
 
     @property
     def world_from_camera(self) -> Array:
         """(4, 4) true pose of the left camera."""
         return left_camera(self.vehicle, self.mission.rig)
 
-    def begin(self, course: Course, track: int) -> None:
-        """The frames that follow are those of this course, all of them unless the survey breaks off."""
+    def start_course(self, course: Course, track: int) -> None:
+        """Starts a course: the frames that follow are its frames, all of them unless the survey is aborted."""
         self._courses.append((course.reference.position, course.holding, track))
 
     def observe(self, step: Step) -> Frame:
-        """What the vehicle sees now; the truth of it is kept here."""
-        index, sight = len(self), self.look(step)
+        """Returns the frame of the present pose and records its ground truth."""
+        index, images = len(self), self.capture(step)
         self.record(self.world_from_camera)
         time_s = index / self.mission.rig.frame_rate_hz
-        depth_m = sight.depth_m if step.keyframe else None
+        depth_m = images.depth_m if step.keyframe else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
-        return Frame(index, time_s, sight.left, sight.right, readings)
+        return Frame(index, time_s, images.left, images.right, readings, keyframe=step.keyframe)
 
     def act(self, command: Array) -> None:
-        """One frame of physics under a pilot's command."""
-        with self.watch("physics"):
+        """Simulates the physics of one frame interval under a pilot's command."""
+        with self.stopwatch("physics"):
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:
-        """Frames so far."""
+        """Returns the number of frames so far."""
         return len(self._true_poses)
 
     def record(self, poses: Array) -> None:
-        """Keeps the truth of one frame or more: true poses (4, 4) or (n, 4, 4)."""
-        self._true_poses.add(poses)
+        """Records the true poses of one frame (4, 4) or several (n, 4, 4)."""
+        self._true_poses.append(poses)
 
-    def glide(self, navigator: Navigator, pilot: PilotOfEstimates) -> Glide | None:
-        """The closed loop over many frames at once, for a world that needs no image of them; None: frame by frame."""
-        return None
+    def fast_forward(self, navigator: Any, pilot: PilotOfEstimates) -> FastForward:
+        """Returns a function that advances the closed loop over frames without images.
+
+        This one advances no frame; a world without images overrides it.
+
+        Args:
+            navigator: the estimator in the loop.
+        """
+        return lambda course, k: k
 
     def truth(self) -> Truth:
-        """All that the judge needs."""
+        """Returns the ground truth of the survey so far."""
         n, courses = len(self), [(np.empty((0, 3)), False, 0), *self._courses]
         lengths = [len(positions) for positions, _, _ in courses]
         return Truth(
@@ -128,12 +133,12 @@ class World(ABC):
         )
 
 
-def left_camera(vehicle: Vehicle | FreeBody | Carrier, rig: StereoRig) -> Array:
-    """(4, 4) world_from_camera of the left one, where the vehicle is now."""
+def left_camera(vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle, rig: StereoRig) -> Array:
+    """Returns the true world_from_camera (4, 4) of the left camera."""
     return geometry.compose(vehicle.world_from_body, rig.body_from_camera)
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
-    """Every stream of randomness of a survey by name."""
+    """Returns the random streams of a survey by name."""
     seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}

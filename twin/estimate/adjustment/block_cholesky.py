@@ -1,11 +1,14 @@
-"""Cholesky factors of a sparse symmetric matrix of 6 x 6 blocks, and as much of its inverse as they tell.
+"""Supernodal Cholesky factorisation of a sparse symmetric matrix of 6 x 6 blocks, and blocks of its inverse.
 
-Supernodal and right-looking (Davis 2006, chapter 4): a panel of nodes that is done subtracts its square from the panels
-after it, so that beside the panels nothing is kept.
+Factorisation is right-looking (Davis 2006, chapter 4): a finished panel subtracts its outer product from the panels
+after it, so no memory is needed in addition to the panels. A finished panel stores L1^-1 above L2, where L1 is the
+triangle of its own rows and L2 the rows below.
 
-Marginals by Takahashi et al. (1973): from the last panel back, of W = L2 L1^-1 with L1 the panel's triangle, L2 the
-rows below it, cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. The panels after it hold
-all of cov(below) by then, in the place of their part of the factor.
+Blocks of the inverse follow Takahashi et al. (1973), from the last panel to the first. With W = L2 L1^-1,
+cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. All of cov(below) is by then stored in
+later panels, where it has replaced their part of the factor.
+
+In the kernels, s is the `SymbolicFactor`, p a panel and `_D` the size of a block.
 """
 
 from __future__ import annotations
@@ -18,141 +21,156 @@ from numba import njit
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.adjustment.elimination import BLOCK as _D
-from twin.estimate.adjustment.elimination import Structure
+from twin.estimate.adjustment.elimination import SymbolicFactor
 
-_LEAST_PIVOT = 1e-13  # of what stood on the diagonal: less is rounding, the node is not held
+_MIN_RELATIVE_PIVOT = 1e-13  # of the original diagonal entry; a smaller pivot is rounding: the matrix is singular
 
 
-class Factor(NamedTuple):
-    """L1^-1 over L2 of each panel, in one long array."""
+class CholeskyFactor(NamedTuple):
+    """Cholesky factor: L1^-1 above L2 of each panel, in one long array."""
 
-    structure: Structure
+    symbolic: SymbolicFactor
     panels: Array
 
     def solve(self, right: Array) -> Array:
-        """(n, 6) the solution for a right side (n, 6)."""
-        s = self.structure
+        """Returns the solution (n, 6) for a right-hand side (n, 6)."""
+        s = self.symbolic
         x = np.empty_like(right)
-        x[s.place] = right
-        _substitute(s, self.panels, x.reshape(-1))
-        return x[s.place]
+        x[s.permutation] = right
+        _solve_in_place(s, self.panels, x.reshape(-1))
+        return x[s.permutation]
 
-    def marginal(self, node: int) -> Array:
-        """(6, 6) block of the inverse: of y = L^-1 e with e the node's columns, y'y; only the panels above meet e."""
-        s = self.structure
-        right, found = np.zeros((len(s.place), _D, _D)), np.zeros((_D, _D))
-        right[s.place[node]] = np.eye(_D)
-        panel: int | None = int(s.panel_of[s.place[node]])
+    def inverse_block(self, node: int) -> Array:
+        """Returns the diagonal block (6, 6) of the inverse at a node.
+
+        It is y'y with y = L^-1 e and e the columns of the node in the identity. Only the ancestors of the node's panel
+        in the elimination tree contribute.
+        """
+        s = self.symbolic
+        right, block = np.zeros((len(s.permutation), _D, _D)), np.zeros((_D, _D))
+        right[s.permutation[node]] = np.eye(_D)
+        panel: int | None = int(s.panel_of[s.permutation[node]])
         while panel is not None:
-            inverse, rest = self._panel(panel)
-            y = inverse @ right[s.first[panel] : s.first[panel + 1]].reshape(-1, _D)
-            right[s.below_of(panel)] -= (rest @ y).reshape(-1, _D, _D)
-            found += y.T @ y
-            panel = s.above(panel)
-        return found
+            inverse_triangle, below = self._panel(panel)
+            y = inverse_triangle @ right[s.panel_start[panel] : s.panel_start[panel + 1]].reshape(-1, _D)
+            right[s.rows_below(panel)] -= (below @ y).reshape(-1, _D, _D)
+            block += y.T @ y
+            panel = s.parent(panel)
+        return block
 
-    def into_marginals(self) -> Array:
-        """(n, 6, 6) all blocks on the inverse's diagonal. They take the place of the factor, which is used up."""
-        s = self.structure
-        found = np.empty((len(s.place), _D, _D))
-        _invert(s, self.panels, found)
-        return found[s.place]
+    def invert_in_place(self) -> Array:
+        """Returns all diagonal blocks (n, 6, 6) of the inverse. Overwrites the factor, which cannot be used again."""
+        s = self.symbolic
+        blocks = np.empty((len(s.permutation), _D, _D))
+        _invert(s, self.panels, blocks)
+        return blocks[s.permutation]
 
     def _panel(self, panel: int) -> tuple[Array, Array]:
-        """L1^-1 and L2."""
-        matrix = _panel_of(self.structure, self.panels, panel)
+        """Returns L1^-1 and L2 of a panel."""
+        matrix = _panel_matrix(self.symbolic, self.panels, panel)
         own = matrix.shape[1]
         return matrix[:own], matrix[own:]
 
 
-class Matrix(NamedTuple):
-    """A symmetric matrix, its blocks in the panels of the factor that it will become."""
+class BlockMatrix(NamedTuple):
+    """Symmetric block matrix, stored in the panels of its future Cholesky factor. Panels are modified in place."""
 
-    structure: Structure
+    symbolic: SymbolicFactor
     panels: Array
 
     @classmethod
-    def room(cls, structure: Structure) -> Matrix:
-        """One of this pattern; what is in it is not defined."""
-        return cls(structure, np.empty(structure.at[-1]))
+    def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
+        """Returns a matrix with this sparsity pattern and uninitialised values."""
+        return cls(symbolic, np.empty(symbolic.offset[-1]))
 
     def clear(self) -> None:
         """Sets all blocks to zero."""
         self.panels[:] = 0.0
 
     def add(self, first: int, blocks: Array) -> None:
-        """Adds blocks (k, 6, 6) of the pairs from this one on."""
-        _add(self.structure, first, blocks, self.panels)
+        """Adds blocks (k, 6, 6) to the off-diagonal blocks first, first + 1, ... in the order given to `analyse`."""
+        _add(self.symbolic, first, blocks, self.panels)
 
-    def factorise(self, diagonal: Array) -> Factor:
-        """Its factor, with these blocks (n, 6, 6) on the diagonal. It takes the place of the matrix, which is used up.
+    def factorise(self, diagonal: Array) -> CholeskyFactor:
+        """Returns the Cholesky factor. Overwrites the matrix, which has to be cleared and filled before the next use.
+
+        Args:
+            diagonal: (n, 6, 6) diagonal blocks.
 
         Raises:
-            LinAlgError: it is not positive definite, to rounding.
+            LinAlgError: the matrix is not positive definite to rounding.
         """
-        s, whole = self.structure, np.empty((len(diagonal), _D))
-        whole[s.place] = np.diagonal(diagonal, axis1=1, axis2=2)
-        _put_diagonal(s, diagonal, self.panels)
-        if not _eliminate(s, whole.reshape(-1), self.panels):
+        s, original = self.symbolic, np.empty((len(diagonal), _D))
+        original[s.permutation] = np.diagonal(diagonal, axis1=1, axis2=2)
+        _set_diagonal(s, diagonal, self.panels)
+        if not _factorise(s, original.reshape(-1), self.panels):
             raise np.linalg.LinAlgError("the matrix is not positive definite")
-        return Factor(s, self.panels)
+        return CholeskyFactor(s, self.panels)
 
 
 @njit(cache=True, nogil=True)
-def _put_diagonal(s, diagonal, panels):
+def _set_diagonal(s, diagonal, panels):
+    """Copies the diagonal blocks (n, 6, 6) into the panels."""
     for k in range(len(diagonal)):
-        p = s.panel_of[s.place[k]]
-        x = s.place[k] - s.first[p]
-        geometry.put(_panel_of(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
+        p = s.panel_of[s.permutation[k]]
+        x = s.permutation[k] - s.panel_start[p]
+        geometry.put(_panel_matrix(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
 
 
 @njit(cache=True, nogil=True)
 def _add(s, start, blocks, panels):
+    """Adds blocks (k, 6, 6) to the off-diagonal blocks from number `start` on."""
     for k in range(len(blocks)):
-        row, column = s.pairs[start + k]
+        row, column = s.off_diagonal[start + k]
         p = s.panel_of[column]
-        width, x = s.first[p + 1] - s.first[p], column - s.first[p]
-        y, panel = row - s.first[p], _panel_of(s, panels, p)
+        width, x = s.panel_start[p + 1] - s.panel_start[p], column - s.panel_start[p]
+        y, panel = row - s.panel_start[p], _panel_matrix(s, panels, p)
         if y >= width:
-            y = width + np.searchsorted(s.rows[s.below[p] : s.below[p + 1]], row)
+            y = width + np.searchsorted(s.rows[s.row_start[p] : s.row_start[p + 1]], row)
         for i in range(_D):
             for j in range(_D):
-                panel[_D * y + i, _D * x + j] += blocks[k, j, i] if s.turned[start + k] else blocks[k, i, j]
+                panel[_D * y + i, _D * x + j] += blocks[k, j, i] if s.transposed[start + k] else blocks[k, i, j]
 
 
 @njit(cache=True, nogil=True)
-def _panel_of(s, panels, p):
-    """A panel as a matrix."""
-    return panels[s.at[p] : s.at[p + 1]].reshape(-1, _D * (s.first[p + 1] - s.first[p]))
+def _panel_matrix(s, panels, p):
+    """Returns a panel as a matrix, a view."""
+    return panels[s.offset[p] : s.offset[p + 1]].reshape(-1, _D * (s.panel_start[p + 1] - s.panel_start[p]))
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(s, whole, panels):
-    """Turns each panel into L1^-1 over L2; whether every node is held, by the diagonal (6 n,) as it was."""
-    for p in range(len(s.first) - 1):
-        n, panel = _D * (s.first[p + 1] - s.first[p]), _panel_of(s, panels, p)
+def _factorise(s, original, panels):
+    """Replaces each panel by L1^-1 above L2. Returns False if the matrix is singular.
+
+    Args:
+        original: (6 n,) diagonal entries of the matrix, by position.
+    """
+    for p in range(len(s.panel_start) - 1):
+        n, panel = _D * (s.panel_start[p + 1] - s.panel_start[p]), _panel_matrix(s, panels, p)
         inverse = np.zeros((n, n))
-        if not _invert_root(panel[:n], whole[_D * s.first[p] : _D * s.first[p + 1]], inverse):
+        if not _invert_root(panel[:n], original[_D * s.panel_start[p] : _D * s.panel_start[p + 1]], inverse):
             return False
         geometry.put(panel[:n], inverse)
         if len(panel) > n:
-            rest, places = np.dot(panel[n:], inverse.T), s.rows[s.below[p] : s.below[p + 1]]
-            geometry.put(panel[n:], rest)
+            below, positions = np.dot(panel[n:], inverse.T), s.rows[s.row_start[p] : s.row_start[p + 1]]
+            geometry.put(panel[n:], below)
             start = 0
-            while start < len(places):
-                end, above, at = _next_above(s, places, start)
-                square = np.dot(rest[_D * start :], rest[_D * start : _D * end].T)
-                _subtract(square, at, _panel_of(s, panels, above))
+            while start < len(positions):
+                end, ancestor, at = _next_ancestor(s, positions, start)
+                product = np.dot(below[_D * start :], below[_D * start : _D * end].T)
+                _subtract(product, at, _panel_matrix(s, panels, ancestor))
                 start = end
     return True
 
 
 @njit(cache=True, nogil=True)
-def _invert_root(matrix, whole, inverse):
-    """Fills `inverse` (n, n) with that of the lower triangular root of a matrix (n, n), of which the lower half counts.
+def _invert_root(matrix, original, inverse):
+    """Computes the inverse of the Cholesky root of a dense matrix, row by row. Returns False if it is singular.
 
-    Row by row: what the rows before leave of a row is its part of the root. False where a pivot is but rounding of what
-    had been on the diagonal (n,).
+    Args:
+        matrix: (n, n), only the lower triangle is read.
+        original: (n,) diagonal of the matrix before elimination; a pivot that is small in comparison is rounding.
+        inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
@@ -164,7 +182,7 @@ def _invert_root(matrix, whole, inverse):
         pivot = matrix[i, i]
         for m in range(i):
             pivot -= root[i, m] * root[i, m]
-        if not pivot > _LEAST_PIVOT * whole[i]:
+        if not pivot > _MIN_RELATIVE_PIVOT * original[i]:
             return False
         per_pivot = 1 / np.sqrt(pivot)
         for k in range(i):
@@ -177,38 +195,49 @@ def _invert_root(matrix, whole, inverse):
 
 
 @njit(cache=True, nogil=True)
-def _next_above(s, places, start):
-    """The end of those places below a panel, rising from `start`, that one panel has; which panel, and its rows of all.
+def _next_ancestor(s, positions, start):
+    """Finds the panel that holds positions[start], and where all remaining positions are stored in that panel.
 
-    Rows (len(places) - start,) are counted in blocks: of its own places and of those below it.
+    Args:
+        positions: (m,) positions below a panel, ascending.
+
+    Returns:
+        end: positions[start:end] belong to the panel itself, the others are below it.
+        panel: its number.
+        at: (m - start,) block row of each remaining position in that panel.
     """
-    p, end = s.panel_of[places[start]], start
-    while end < len(places) and places[end] < s.first[p + 1]:
+    p, end = s.panel_of[positions[start]], start
+    while end < len(positions) and positions[end] < s.panel_start[p + 1]:
         end += 1
-    at, row = np.empty(len(places) - start, np.int64), s.below[p]
-    for k in range(start, len(places)):
+    at, row = np.empty(len(positions) - start, np.int64), s.row_start[p]
+    for k in range(start, len(positions)):
         if k < end:
-            at[k - start] = places[k] - s.first[p]
+            at[k - start] = positions[k] - s.panel_start[p]
         else:
-            while s.rows[row] != places[k]:
+            while s.rows[row] != positions[k]:
                 row += 1
-            at[k - start] = s.first[p + 1] - s.first[p] + row - s.below[p]
+            at[k - start] = s.panel_start[p + 1] - s.panel_start[p] + row - s.row_start[p]
     return end, p, at
 
 
 @njit(cache=True, nogil=True)
-def _subtract(square, at, panel):
-    """Takes blocks (lower half) from those of a panel in these rows, the first of which are also the columns."""
+def _subtract(product, at, panel):
+    """Subtracts the lower triangle of `product` from a panel.
+
+    Args:
+        product: (6 m, 6 w) blocks.
+        at: (m,) block rows in the panel; the first w are also the block columns.
+    """
     for b in range(len(at)):
-        for a in range(min(b + 1, square.shape[1] // _D)):
+        for a in range(min(b + 1, product.shape[1] // _D)):
             for i in range(_D):
                 for k in range(_D):
-                    panel[_D * at[b] + i, _D * at[a] + k] -= square[_D * b + i, _D * a + k]
+                    panel[_D * at[b] + i, _D * at[a] + k] -= product[_D * b + i, _D * a + k]
 
 
 @njit(cache=True, nogil=True)
-def _picked(panel, at, width):
-    """Blocks of a panel in these rows, so many of which, the first, are also the columns."""
+def _gather(panel, at, width):
+    """Returns a copy (6 m, 6 width) of the blocks in the block rows `at` (m,) and the block columns at[:width]."""
     part = np.empty((_D * len(at), _D * width))
     for b in range(len(at)):
         for a in range(width):
@@ -220,48 +249,52 @@ def _picked(panel, at, width):
 
 @njit(cache=True, nogil=True)
 def _invert(s, panels, diagonal):
-    """Turns L1^-1 over L2 of each panel into the inverse's blocks there, and fills those on its diagonal (n, 6, 6)."""
-    for p in range(len(s.first) - 2, -1, -1):
-        panel, width = _panel_of(s, panels, p), s.first[p + 1] - s.first[p]
+    """Replaces the factor by the blocks of the inverse with the same sparsity pattern.
+
+    Args:
+        diagonal: (n, 6, 6), filled with the diagonal blocks by position.
+    """
+    for p in range(len(s.panel_start) - 2, -1, -1):
+        panel, width = _panel_matrix(s, panels, p), s.panel_start[p + 1] - s.panel_start[p]
         n = _D * width
         own = np.dot(panel[:n].T, panel[:n])
         if len(panel) > n:
-            weight, places = np.dot(panel[n:], panel[:n]), s.rows[s.below[p] : s.below[p + 1]]
-            across, start = np.zeros_like(weight), 0
-            while start < len(places):
-                end, above, at = _next_above(s, places, start)
-                part = _picked(_panel_of(s, panels, above), at, end - start)
-                onwards, here = across[_D * start :], across[_D * start : _D * end]
-                onwards += np.dot(part, weight[_D * start : _D * end])
-                if end < len(places):
-                    here += np.dot(part[_D * (end - start) :].T, weight[_D * end :])
+            weight, positions = np.dot(panel[n:], panel[:n]), s.rows[s.row_start[p] : s.row_start[p + 1]]
+            product, start = np.zeros_like(weight), 0  # cov(below) W
+            while start < len(positions):
+                end, ancestor, at = _next_ancestor(s, positions, start)
+                part = _gather(_panel_matrix(s, panels, ancestor), at, end - start)
+                remaining, current = product[_D * start :], product[_D * start : _D * end]
+                remaining += np.dot(part, weight[_D * start : _D * end])
+                if end < len(positions):
+                    current += np.dot(part[_D * (end - start) :].T, weight[_D * end :])
                 start = end
-            own += np.dot(weight.T, across)
-            geometry.put(panel[n:], -across)
+            own += np.dot(weight.T, product)
+            geometry.put(panel[n:], -product)
         geometry.put(panel[:n], own)
         for k in range(width):
-            geometry.put(diagonal[s.first[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
+            geometry.put(diagonal[s.panel_start[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
 
 
 @njit(cache=True, nogil=True)
-def _substitute(s, panels, x):
-    """Solves in place, x (6 n,) by place: forwards by L, backwards by its transpose."""
-    for p in range(len(s.first) - 1):
-        own = x[_D * s.first[p] : _D * s.first[p + 1]]
-        panel = _panel_of(s, panels, p)
+def _solve_in_place(s, panels, x):
+    """Replaces the right-hand side x (6 n,), by position, by the solution: forward and backward substitution."""
+    for p in range(len(s.panel_start) - 1):
+        own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
+        panel = _panel_matrix(s, panels, p)
         geometry.put(own, np.dot(panel[: len(own)], own))
         if len(panel) > len(own):
-            known = np.dot(panel[len(own) :], own)
-            for k in range(s.below[p], s.below[p + 1]):
+            product = np.dot(panel[len(own) :], own)
+            for k in range(s.row_start[p], s.row_start[p + 1]):
                 for i in range(_D):
-                    x[_D * s.rows[k] + i] -= known[_D * (k - s.below[p]) + i]
-    for p in range(len(s.first) - 2, -1, -1):
-        own = x[_D * s.first[p] : _D * s.first[p + 1]]
-        panel = _panel_of(s, panels, p)
+                    x[_D * s.rows[k] + i] -= product[_D * (k - s.row_start[p]) + i]
+    for p in range(len(s.panel_start) - 2, -1, -1):
+        own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
+        panel = _panel_matrix(s, panels, p)
         if len(panel) > len(own):
-            later = np.empty(len(panel) - len(own))
-            for k in range(s.below[p], s.below[p + 1]):
+            below = np.empty(len(panel) - len(own))
+            for k in range(s.row_start[p], s.row_start[p + 1]):
                 for i in range(_D):
-                    later[_D * (k - s.below[p]) + i] = x[_D * s.rows[k] + i]
-            own -= np.dot(panel[len(own) :].T, later)
+                    below[_D * (k - s.row_start[p]) + i] = x[_D * s.rows[k] + i]
+            own -= np.dot(panel[len(own) :].T, below)
         geometry.put(own, np.dot(panel[: len(own)].T, own))

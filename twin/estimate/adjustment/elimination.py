@@ -1,7 +1,7 @@
-"""Who is eliminated when: the order in which a sparse symmetric matrix is factored, and where its factors lie.
+"""Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
-Nodes that follow one another in the elimination with the same nodes after them share a panel, a dense matrix of their
-columns. The order is the least degree that SuperLU finds.
+The order is SuperLU's multiple minimum degree on A' + A. Consecutive nodes of that order with nearly the same sparsity
+pattern below the diagonal form a supernode, which is stored as one dense matrix of their columns, a panel.
 """
 
 from __future__ import annotations
@@ -16,119 +16,141 @@ from scipy.sparse.linalg import splu
 
 Indices = NDArray[np.int64]
 
-BLOCK = 6  # numbers of a node: rows and columns of a block
-_WIDEST = 12  # nodes of a panel: its triangle is inverted by plain loops
-_ZEROS = 8  # blocks that a node may bring into a panel for nothing
+BLOCK = 6  # rows and columns of a block: degrees of freedom of a pose
+_MAX_PANEL_NODES = 12  # the triangle of a panel is inverted by plain loops, which are slow for larger matrices
+_MAX_EXTRA_BLOCKS = 8  # explicit zero blocks that merging a node into a panel may add
 
 
-class Structure(NamedTuple):
-    """Where everything lies, of one pattern; places count nodes in the order of their elimination.
+class SymbolicFactor(NamedTuple):
+    """Sparsity pattern and memory layout of a Cholesky factor. Positions count nodes in elimination order.
 
     Args:
-        place: (n,) of each node.
-        first: (s + 1,) first place of each panel.
-        below, rows: places below panel s are rows[below[s] : below[s + 1]], rising.
-        at: (s + 1,) where panels begin in one long array; (own + below, own) blocks each, row by row.
-        panel_of: (n,) by place.
-        pairs: (m, 2) row and column of each block off the diagonal, by place, the row later.
-        turned: (m,) which of them are given the other way round.
+        permutation: (n,) position of each node.
+        panel_start: (s + 1,) panel p holds the positions panel_start[p] to panel_start[p + 1] - 1.
+        row_start, rows: the positions below panel p are rows[row_start[p] : row_start[p + 1]], ascending.
+        offset: (s + 1,) start of each panel in one long array; a panel is row-major, (own + below, own) blocks.
+        panel_of: (n,) panel of each position.
+        off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
+        transposed: (m,) true where a block has to be transposed because its nodes are eliminated in reverse order.
     """
 
-    place: Indices
-    first: Indices
-    below: Indices
+    permutation: Indices
+    panel_start: Indices
+    row_start: Indices
     rows: Indices
-    at: Indices
+    offset: Indices
     panel_of: Indices
-    pairs: Indices
-    turned: NDArray[np.bool_]
+    off_diagonal: Indices
+    transposed: NDArray[np.bool_]
 
-    def below_of(self, panel: int) -> Indices:
-        """Places below a panel, rising."""
-        return self.rows[self.below[panel] : self.below[panel + 1]]
+    def rows_below(self, panel: int) -> Indices:
+        """Returns the positions below a panel, ascending."""
+        return self.rows[self.row_start[panel] : self.row_start[panel + 1]]
 
-    def above(self, panel: int) -> int | None:
-        """The panel of the first node below: eliminated later, it knows of all others below."""
-        below = self.below_of(panel)
+    def parent(self, panel: int) -> int | None:
+        """Returns the parent of a panel in the elimination tree, None for a root.
+
+        The parent holds the first position below the panel, and its own rows include all others.
+        """
+        below = self.rows_below(panel)
         return int(self.panel_of[below[0]]) if len(below) else None
 
 
-def analyse(n: int, i: Indices, j: Indices) -> Structure:
-    """The structure of a matrix of n x n blocks with blocks (i, j) (m,) off the diagonal; a pair may come twice."""
-    place = _least_degree(n, i, j)
-    panels = _panels(n, np.minimum(place[i], place[j]), np.maximum(place[i], place[j]))
-    again = np.empty(n, np.int64)  # a panel's nodes one after the other
-    again[[node for own, _ in panels for node in own]] = np.arange(n)
-    place = again[place]
-    first = np.cumsum([0] + [len(own) for own, _ in panels])
-    rows = [np.sort(again[after]) for _, after in panels]
-    below = np.cumsum([0] + [len(row) for row in rows])
-    width = np.diff(first)
-    at = np.cumsum(np.append(0, BLOCK * BLOCK * width * (width + np.diff(below))))
-    pairs = np.column_stack([np.maximum(place[i], place[j]), np.minimum(place[i], place[j])])
-    panel_of = np.repeat(np.arange(len(panels)), width)
-    every_row = np.concatenate([np.empty(0, np.int64), *rows])
-    return Structure(place, first, below, every_row, at, panel_of, pairs, place[i] < place[j])
+def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
+    """Returns the symbolic factor of a matrix of n x n blocks.
+
+    Args:
+        i, j: (m,) nodes of the off-diagonal blocks (i, j); a pair may occur more than once.
+    """
+    permutation = _minimum_degree(n, i, j)
+    panels = _supernodes(n, np.minimum(permutation[i], permutation[j]), np.maximum(permutation[i], permutation[j]))
+    renumbered = np.empty(n, np.int64)  # makes the nodes of a panel consecutive
+    renumbered[[node for own, _ in panels for node in own]] = np.arange(n)
+    permutation = renumbered[permutation]
+    panel_start = np.cumsum([0] + [len(own) for own, _ in panels])
+    rows = [np.sort(renumbered[below]) for _, below in panels]
+    row_start = np.cumsum([0] + [len(row) for row in rows])
+    width = np.diff(panel_start)
+    offset = np.cumsum(np.append(0, BLOCK * BLOCK * width * (width + np.diff(row_start))))
+    row, column = np.maximum(permutation[i], permutation[j]), np.minimum(permutation[i], permutation[j])
+    return SymbolicFactor(
+        permutation=permutation,
+        panel_start=panel_start,
+        row_start=row_start,
+        rows=np.concatenate([np.empty(0, np.int64), *rows]),
+        offset=offset,
+        panel_of=np.repeat(np.arange(len(panels)), width),
+        off_diagonal=np.column_stack([row, column]),
+        transposed=permutation[i] < permutation[j],
+    )
 
 
-def _least_degree(n: int, i: Indices, j: Indices) -> Indices:
-    """(n,) place of each node in the order of least degree."""
+def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
+    """Returns the position (n,) of each node in the minimum-degree order."""
     off = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     pattern = ((off + off.T) > 0).astype(np.float64)
     dominant = sparse.diags_array(np.asarray(pattern.sum(axis=1)).ravel() + 1.0)
-    found = splu((pattern + dominant).tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
-    return found.perm_c.astype(np.int64)
+    decomposition = splu((pattern + dominant).tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
+    return decomposition.perm_c.astype(np.int64)
 
 
-def _panels(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
-    """Nodes of each panel and those below it, of pairs of nodes in an order of elimination."""
+def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
+    """Returns the nodes of each supernode and the nodes below it.
+
+    Args:
+        early, late: (m,) nodes of each off-diagonal block, numbered in elimination order, early < late.
+    """
     order = np.argsort(early, kind="stable")
-    at, after = _fill(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
-    count = np.diff(at).tolist()
-    parent = [int(after[at[node]]) if count[node] else -1 for node in range(n)]
+    start, below = _fill_in(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
+    count = np.diff(start).tolist()
+    parent = [int(below[start[node]]) if count[node] else -1 for node in range(n)]
     panels: list[list[int]] = []
-    home = [0] * n
+    panel_of = [0] * n
     for node in reversed(range(n)):
-        above = panels[home[parent[node]]] if parent[node] >= 0 else []
-        follows = above and above[-1] == parent[node] and len(above) < _WIDEST
-        if follows and len(above) + count[above[0]] - count[node] <= _ZEROS:
-            home[node] = home[parent[node]]
-            above.append(node)
+        candidate = panels[panel_of[parent[node]]] if parent[node] >= 0 else []
+        extends = candidate and candidate[-1] == parent[node] and len(candidate) < _MAX_PANEL_NODES
+        if extends and len(candidate) + count[candidate[0]] - count[node] <= _MAX_EXTRA_BLOCKS:
+            panel_of[node] = panel_of[parent[node]]
+            candidate.append(node)
         else:
-            home[node] = len(panels)
+            panel_of[node] = len(panels)
             panels.append([node])
-    return [(own[::-1], after[at[own[0]] : at[own[0] + 1]]) for own in reversed(panels)]
+    return [(own[::-1], below[start[own[0]] : start[own[0] + 1]]) for own in reversed(panels)]
 
 
 @njit(cache=True, nogil=True)
-def _fill(n, start, later):
-    """Those after each node that its elimination joins: after[at[k] : at[k + 1]], rising.
+def _fill_in(n, start, later):
+    """Returns the rows of each column of the factor, fill-in included (Davis 2006, chapter 4).
 
-    Its own neighbours after it, later[start[k] : start[k + 1]], and those of all nodes whose first it is.
+    The rows of column k are below[at[k] : at[k + 1]], ascending: its own later neighbours, later[start[k] :
+    start[k + 1]], and the rows of its children in the elimination tree except k itself.
+
+    Returns:
+        at (n + 1,) and below.
     """
-    at, after, met = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
-    last_under, one_before = np.full(n, -1), np.full(n, -1)  # of the nodes whose first each is
+    at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
+    last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists
     for node in range(n):
         end = at[node]
-        if len(after) < end + n:
-            grown = np.empty(2 * len(after) + n, np.int64)
+        if len(below) < end + n:
+            grown = np.empty(2 * len(below) + n, np.int64)
             for k in range(end):
-                grown[k] = after[k]
-            after = grown
+                grown[k] = below[k]
+            below = grown
         for k in range(start[node], start[node + 1]):
-            if met[later[k]] != node:
-                met[later[k]], after[end] = node, later[k]
+            if marked_by[later[k]] != node:
+                marked_by[later[k]], below[end] = node, later[k]
                 end += 1
-        under = last_under[node]
-        while under >= 0:
-            for k in range(at[under] + 1, at[under + 1]):
-                if met[after[k]] != node:
-                    met[after[k]], after[end] = node, after[k]
+        child = last_child[node]
+        while child >= 0:
+            for k in range(at[child] + 1, at[child + 1]):
+                if marked_by[below[k]] != node:
+                    marked_by[below[k]], below[end] = node, below[k]
                     end += 1
-            under = one_before[under]
-        after[at[node] : end].sort()
+            child = previous_sibling[child]
+        below[at[node] : end].sort()
         at[node + 1] = end
         if end > at[node]:
-            first = after[at[node]]
-            one_before[node], last_under[first] = last_under[first], node
-    return at, after[: at[n]]
+            parent = below[at[node]]
+            previous_sibling[node], last_child[parent] = last_child[parent], node
+    return at, below[: at[n]]

@@ -1,11 +1,12 @@
-"""Pose graphs: the poses X that agree best with the motions Z measured between them, the core of the alignment (P15).
+"""Factor graph of poses and its maximum-likelihood solution, the core of the global alignment (P15).
 
-F(X) = sum over links of rho(|log(Z_ij^-1 X_i^-1 X_j)|), lengths in units of the link's covariance, and over what is
-said of single poses; rho is r^2 / 2, or Huber's function. Gauss-Newton minimises it, damped (Marquardt) where its step
-leads up. Errors of poses are motions in their own axes, X exp(d).
+The cost is F(X) = sum over motions of rho(|log(Z_ij^-1 X_i^-1 X_j)|), with the residual whitened by the covariance of
+the measured motion Z_ij, plus the cost of factors of single poses. rho(r) is r^2 / 2 or Huber's loss. F is minimised
+by Gauss-Newton, with Levenberg-Marquardt damping after a step that increased the cost. Increments of poses are motions
+in the camera's own axes, X exp(d).
 
-What pairs share with all others (the scale of a log) is one unknown more, which borders the matrix of the poses: first
-the poses as if it were known, then its own equation.
+One scalar parameter may be shared by all binary factors (the scale error of the DVL). It borders the normal equations
+of the poses by one row and column, which are eliminated by the Schur complement.
 """
 
 from __future__ import annotations
@@ -19,81 +20,97 @@ from scipy import sparse
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.links import Link, Links, inverses
+from twin.core.links import Link, Links, symmetric_inverses
 from twin.estimate.adjustment import block_cholesky, elimination
 from twin.estimate.adjustment.elimination import Indices
 
-#: A step that lowers F as the linear equations foretell, but for so little, ends the search: what the next one could
-#: gain is of that size or less, which moves no pose by more than 0.05 of its standard deviation.
-_BEYOND_LINEAR = 5e-4
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-6  # of the diagonal
-_TOGETHER = 4096  # pairs whose derivatives are held at a time
+#: A step that raises the cost by more than this is rejected. The search ends when the decrease by an undamped step
+#: agrees with the prediction of the linear model to this tolerance. The next step could then gain about as much, which
+#: moves no pose by more than 0.05 of its standard deviation.
+_COST_TOLERANCE = 5e-4
+_INITIAL_DAMPING, _MIN_DAMPING = 1e-4, 1e-6  # relative to the diagonal
+_BATCH = 4096  # binary factors whose Jacobians are in memory at a time
 
 
-class Single(NamedTuple):
-    """What is said of one pose each.
+class UnaryFactors(NamedTuple):
+    """Factors of one kind that each constrain one pose.
 
     Args:
-        at: (m,) which.
-        information: (m, d, d).
-        observe: residuals (m, d) of poses (m, 4, 4).
-        derive: of poses and residuals the derivatives (m, d, 6) by the poses' motions.
+        pose_index: (m,) index of the constrained pose.
+        information: (m, d, d) information matrices.
+        residuals: function of the poses (m, 4, 4) that returns residuals (m, d).
+        jacobians: function of poses and residuals that returns the Jacobians (m, d, 6) by the increment of the pose.
     """
 
-    at: Indices
+    pose_index: Indices
     information: Array
-    observe: Callable[[Array], Array]
-    derive: Callable[[Array, Array], Array]
+    residuals: Callable[[Array], Array]
+    jacobians: Callable[[Array, Array], Array]
 
 
-class Pairs(NamedTuple):
-    """What is said of the motion between two poses each.
+class BinaryFactors(NamedTuple):
+    """Factors of one kind that each constrain the relative pose of two nodes.
 
     Args:
-        i, j: (m,) which.
-        information: (m, d, d).
-        observe: residuals (m, d) of i_from_j (m, 4, 4) and what is shared.
-        derive: of these three the derivatives (m, d, 6) by the motions of j, (m, d) by what is shared, or None.
-        huber: residual [standard deviations] from which one counts linearly; None: squares throughout.
+        i, j: (m,) indices of the poses.
+        information: (m, d, d) information matrices.
+        residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
+        jacobians: function of i_from_j, the shared parameter and the residuals that returns the Jacobians (m, d, 6) by
+            the increment of pose j, and (m, d) by the shared parameter or None if the factors do not depend on it.
+        huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
 
     i: Indices
     j: Indices
     information: Array
-    observe: Callable[[Array, float], Array]
-    derive: Callable[[Array, float, Array], tuple[Array, Array | None]]
+    residuals: Callable[[Array, float], Array]
+    jacobians: Callable[[Array, float, Array], tuple[Array, Array | None]]
     huber: float | None = None
 
 
-class Graph(NamedTuple):
-    """All that is said of n poses; deviation of what pairs share, about 0 (None: nothing is shared)."""
+class FactorGraph(NamedTuple):
+    """Factors of n poses and the prior standard deviation of the shared parameter, whose mean is 0 (None: no such)."""
 
-    n: int
-    singles: Sequence[Single]
-    pairs: Sequence[Pairs]
+    n_poses: int
+    unary: Sequence[UnaryFactors]
+    binary: Sequence[BinaryFactors]
     shared_sigma: float | None = None
 
 
-class State(NamedTuple):
-    """Poses (n, 4, 4), and what pairs share."""
+class GraphState(NamedTuple):
+    """Values of all unknowns of a factor graph: poses (n, 4, 4) and the shared parameter. Not modified in place."""
 
     poses: Array
     shared: float = 0.0
 
 
-class _Seen(NamedTuple):
-    """A graph at a state: F, residuals (m, d) of singles; of pairs residuals and weights (m,); their chi2 (m,)."""
+class _Evaluation(NamedTuple):
+    """A factor graph evaluated at a state.
 
-    state: State
+    Args:
+        cost: F.
+        unary: residuals (m, d) of each kind of unary factors.
+        binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
+        chi2: squared whitened residuals (m,) of each kind of binary factors.
+    """
+
+    state: GraphState
     cost: float
-    singles: list[Array]
-    pairs: list[tuple[Array, Array]]
+    unary: list[Array]
+    binary: list[tuple[Array, Array]]
     chi2: list[Array]
 
 
-class _System(NamedTuple):
-    """Normal equations beside the blocks between poses: blocks (n, 6, 6) on the diagonal, gradient (n, 6); border
-    (n, 6), corner and gradient of what is shared."""
+class _NormalEquations(NamedTuple):
+    """Normal equations without the off-diagonal blocks of the poses.
+
+    Args:
+        diagonal: (n, 6, 6) diagonal blocks.
+        gradient: (n, 6) gradient of F by the poses.
+        border: (n, 6) second derivatives by poses and shared parameter.
+        corner: second derivative by the shared parameter; 0: there is no such parameter.
+        shared_gradient: gradient of F by the shared parameter.
+    """
 
     diagonal: Array
     gradient: Array
@@ -102,188 +119,196 @@ class _System(NamedTuple):
     shared_gradient: float
 
 
-class Optimum(NamedTuple):
-    """The state that minimises F, the value of F, whether it was reached, and the equations of the last step.
+class Solution(NamedTuple):
+    """Minimum of the cost of a factor graph.
 
     Args:
-        chi2: (m,) squared residuals of each pairs in units of their covariance, before their weights.
-        factor: of the poses' matrix.
-        border: (n, 6) its solution for the border, and what the shared unknown's own equation then holds; None: nothing
-            is shared.
+        state: poses and shared parameter at the minimum.
+        cost: F at the minimum.
+        chi2: (m,) squared whitened residuals of each kind of binary factors, without robust weights.
+        converged: false if the iterations ended before the minimum was reached.
+        cholesky: factor of the normal matrix of the poses, undamped.
+        border: (n, 6) derivative of the poses by the shared parameter, and the marginal information of that parameter;
+            None: there is no shared parameter.
     """
 
-    state: State
+    state: GraphState
     cost: float
     chi2: list[Array]
-    reached: bool
-    factor: block_cholesky.Factor
+    converged: bool
+    cholesky: block_cholesky.CholeskyFactor
     border: tuple[Array, float] | None
 
-    def into_marginals(self) -> Array:
-        """(n, 6, 6) covariance of all poses [rotation, translation] (rad, m), each in its own axes.
+    def marginals_in_place(self) -> Array:
+        """Returns the marginal covariances (n, 6, 6) of all poses, [rotation, translation] (rad, m) in camera axes.
 
-        They take the place of the factor, which is used up.
+        Overwrites the Cholesky factor: no marginal can be computed afterwards.
         """
-        return self._with_shared(self.factor.into_marginals(), slice(None))
+        return self._add_shared(self.cholesky.invert_in_place(), slice(None))
 
     def marginal(self, k: int) -> Array:
-        """(6, 6) of one."""
-        return self._with_shared(self.factor.marginal(k)[None], slice(k, k + 1))[0]
+        """Returns the marginal covariance (6, 6) of pose k."""
+        return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
-    def _with_shared(self, covs: Array, rows: slice) -> Array:
+    def _add_shared(self, covs: Array, rows: slice) -> Array:
+        """Adds the covariance that the uncertainty of the shared parameter causes."""
         if self.border is None:
             return covs
         by_shared, information = self.border
         return covs + by_shared[rows, :, None] * by_shared[rows, None, :] / information
 
 
-def optimise(graph: Graph, start: State, iterations: int = 100) -> Optimum:
-    """The nearest minimum.
+def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
+    """Returns the local minimum of the cost that is reached from `start`.
 
     Args:
-        iterations: at most; at least one.
+        max_iterations: largest number of linear solves, at least one.
 
     Raises:
-        LinAlgError: the graph does not hold every pose.
+        LinAlgError: the factors do not constrain every pose.
     """
-    nobody = np.empty(0, np.int64)
-    i, j = np.concatenate([nobody, *(p.i for p in graph.pairs)]), np.concatenate([nobody, *(p.j for p in graph.pairs)])
-    matrix = block_cholesky.Matrix.room(elimination.analyse(graph.n, i, j))
-    seen, damping, reached = _look(graph, start), 0.0, False
+    empty = np.empty(0, np.int64)
+    i, j = np.concatenate([empty, *(f.i for f in graph.binary)]), np.concatenate([empty, *(f.j for f in graph.binary)])
+    matrix = block_cholesky.BlockMatrix.allocate(elimination.analyse(graph.n_poses, i, j))
+    current, damping, converged = _evaluate(graph, start), 0.0, False
     while True:
-        system = _equations(graph, seen, matrix)
-        step = _step(matrix, system, damping)
-        moved = State(_moved(seen.state.poses, step.poses), seen.state.shared + step.shared)
-        expected = -0.5 * (np.sum(system.gradient * step.poses) + system.shared_gradient * step.shared)
-        after, iterations = _look(graph, moved), iterations - 1
-        if after.cost <= seen.cost + _BEYOND_LINEAR:
-            reached = damping == 0 and abs(seen.cost - after.cost - expected) < _BEYOND_LINEAR
-            seen, damping = after, damping / 10 if damping > _LEAST_DAMPING else 0.0
+        equations = _linearise(graph, current, matrix)
+        step = _solve(matrix, equations, damping)
+        trial = GraphState(_retract(current.state.poses, step.poses), current.state.shared + step.shared)
+        expected = -0.5 * (np.sum(equations.gradient * step.poses) + equations.shared_gradient * step.shared)
+        after, max_iterations = _evaluate(graph, trial), max_iterations - 1
+        if after.cost <= current.cost + _COST_TOLERANCE:
+            converged = damping == 0 and abs(current.cost - after.cost - expected) < _COST_TOLERANCE
+            current, damping = after, damping / 10 if damping > _MIN_DAMPING else 0.0
         else:
-            damping = max(10 * damping, _FIRST_DAMPING)
-        if reached or iterations <= 0:
+            damping = max(10 * damping, _INITIAL_DAMPING)
+        if converged or max_iterations <= 0:
             break
-    if step.damping:  # covariances are those of the equations as they are
-        step = _step(matrix, _equations(graph, seen, matrix), 0.0)
-    return Optimum(seen.state, seen.cost, seen.chi2, reached, step.factor, step.border)
+    if step.damping:  # marginal covariances are those of the undamped equations
+        step = _solve(matrix, _linearise(graph, current, matrix), 0.0)
+    return Solution(current.state, current.cost, current.chi2, converged, step.cholesky, step.border)
 
 
 class _Step(NamedTuple):
-    """The solution of damped equations, the factor of the poses' matrix, and the border as `Optimum` has it."""
+    """Increments that solve the damped normal equations; `cholesky` and `border` as in `Solution`."""
 
     damping: float
     poses: Array
     shared: float
-    factor: block_cholesky.Factor
+    cholesky: block_cholesky.CholeskyFactor
     border: tuple[Array, float] | None
 
 
-def _step(matrix: block_cholesky.Matrix, system: _System, damping: float) -> _Step:
-    """Solves the bordered equations by the block below the corner; uses the matrix up."""
-    diagonal = system.diagonal
+def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
+    """Solves the bordered normal equations by the Schur complement of the corner. Overwrites the matrix."""
+    diagonal = equations.diagonal
     if damping:
         axes = np.arange(6)
         diagonal = diagonal.copy()
         diagonal[:, axes, axes] *= 1 + damping
     try:
-        factor = matrix.factorise(diagonal)
+        cholesky = matrix.factorise(diagonal)
     except np.linalg.LinAlgError:
-        raise np.linalg.LinAlgError("not every pose is held") from None
-    poses = factor.solve(-system.gradient)
-    if not system.corner:
-        return _Step(damping, poses, 0.0, factor, None)
-    by_shared = -factor.solve(system.border)
-    information = system.corner + float(np.sum(system.border * by_shared))
-    shared = (-system.shared_gradient - float(np.sum(system.border * poses))) / information
-    return _Step(damping, poses + by_shared * shared, shared, factor, (by_shared, information))
+        raise np.linalg.LinAlgError("the factors do not constrain every pose") from None
+    poses = cholesky.solve(-equations.gradient)
+    if not equations.corner:
+        return _Step(damping, poses, 0.0, cholesky, None)
+    by_shared = -cholesky.solve(equations.border)
+    information = equations.corner + float(np.sum(equations.border * by_shared))
+    shared = (-equations.shared_gradient - float(np.sum(equations.border * poses))) / information
+    return _Step(damping, poses + by_shared * shared, shared, cholesky, (by_shared, information))
 
 
-def _look(graph: Graph, state: State) -> _Seen:
-    """What the graph is at a state."""
+def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
+    """Returns cost, residuals and robust weights of a factor graph at a state."""
     cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
-    singles, pairs, chi2 = [], [], []
-    for single in graph.singles:
-        residuals = single.observe(state.poses[single.at])
-        cost += float(_squares(residuals, single.information).sum()) / 2
-        singles.append(residuals)
-    for pair in graph.pairs:
-        residuals = pair.observe(_between(state.poses, pair.i, pair.j), state.shared)
-        chi2.append(_squares(residuals, pair.information))
-        losses, weights = _robust(chi2[-1], pair.huber)
+    unary, binary, chi2 = [], [], []
+    for factors in graph.unary:
+        residuals = factors.residuals(state.poses[factors.pose_index])
+        cost += float(_squared_norms(residuals, factors.information).sum()) / 2
+        unary.append(residuals)
+    for factors in graph.binary:
+        residuals = factors.residuals(_relative_poses(state.poses, factors.i, factors.j), state.shared)
+        chi2.append(_squared_norms(residuals, factors.information))
+        losses, weights = _robust_loss(chi2[-1], factors.huber)
         cost += float(losses.sum())
-        pairs.append((residuals, weights))
-    return _Seen(state, cost, singles, pairs, chi2)
+        binary.append((residuals, weights))
+    return _Evaluation(state, cost, unary, binary, chi2)
 
 
-def _robust(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Losses (m,) and weights (m,) of squared residuals."""
+def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
+    """Returns losses (m,) and weights (m,) of squared whitened residuals (m,)."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)
-    within = length <= huber
-    weights = np.where(within, 1.0, huber / np.maximum(length, huber))
-    return np.where(within, chi2 / 2, huber * (length - huber / 2)), weights
+    inlier = length <= huber
+    weights = np.where(inlier, 1.0, huber / np.maximum(length, huber))
+    return np.where(inlier, chi2 / 2, huber * (length - huber / 2)), weights
 
 
-def _equations(graph: Graph, seen: _Seen, matrix: block_cholesky.Matrix) -> _System:
-    """Normal equations of all residuals; the blocks between poses go into the matrix."""
-    diagonal, gradient, border = np.zeros((graph.n, 6, 6)), np.zeros((graph.n, 6)), np.zeros((graph.n, 6))
+def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.BlockMatrix) -> _NormalEquations:
+    """Returns the normal equations of all factors; fills `matrix` with the off-diagonal blocks."""
+    n = graph.n_poses
+    diagonal, gradient, border = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, 6))
     corner = 0.0 if graph.shared_sigma is None else graph.shared_sigma**-2
-    shared_gradient = corner * seen.state.shared
-    done = 0
+    shared_gradient = corner * current.state.shared
+    n_added = 0
     matrix.clear()
-    for single, residuals in zip(graph.singles, seen.singles, strict=True):
-        by_pose = single.derive(seen.state.poses[single.at], residuals)
-        weighted = turned(by_pose) @ single.information
-        diagonal += _summed(graph.n, single.at, weighted @ by_pose)
-        gradient += _summed(graph.n, single.at, times(weighted, residuals))
-    for pair, every in zip(graph.pairs, seen.pairs, strict=True):
-        for first in range(0, len(pair.i), _TOGETHER):
-            some = slice(first, first + _TOGETHER)
-            i, j, information = pair.i[some], pair.j[some], pair.information[some]
-            residuals, weights = (of_all[some] for of_all in every)
-            i_from_j = _between(seen.state.poses, i, j)
-            by_j, by_shared = pair.derive(i_from_j, seen.state.shared, residuals)
-            across = np.empty((len(i), 6, 6))
-            _add_pairs(i, j, by_j, information, weights, residuals, i_from_j, diagonal, across, gradient)
-            matrix.add(done, across)
-            done += len(i)
+    for factors, residuals in zip(graph.unary, current.unary, strict=True):
+        by_pose = factors.jacobians(current.state.poses[factors.pose_index], residuals)
+        weighted = transposed(by_pose) @ factors.information
+        diagonal += _sum_by_index(n, factors.pose_index, weighted @ by_pose)
+        gradient += _sum_by_index(n, factors.pose_index, matvec(weighted, residuals))
+    for factors, evaluated in zip(graph.binary, current.binary, strict=True):
+        for first in range(0, len(factors.i), _BATCH):
+            batch = slice(first, first + _BATCH)
+            i, j, information = factors.i[batch], factors.j[batch], factors.information[batch]
+            residuals, weights = (values[batch] for values in evaluated)
+            i_from_j = _relative_poses(current.state.poses, i, j)
+            by_j, by_shared = factors.jacobians(i_from_j, current.state.shared, residuals)
+            off_diagonal = np.empty((len(i), 6, 6))
+            _add_binary(i, j, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient)
+            matrix.add(n_added, off_diagonal)
+            n_added += len(i)
             if by_shared is not None:
-                informed = weights[:, None] * times(information, by_shared)
-                _add_border(i, j, by_j, informed, i_from_j, border)
-                corner += float(np.sum(informed * by_shared))
-                shared_gradient += float(np.sum(informed * residuals))
-    return _System(diagonal, gradient, border, corner, shared_gradient)
+                weighted = weights[:, None] * matvec(information, by_shared)
+                _add_border(i, j, by_j, weighted, i_from_j, border)
+                corner += float(np.sum(weighted * by_shared))
+                shared_gradient += float(np.sum(weighted * residuals))
+    return _NormalEquations(diagonal, gradient, border, corner, shared_gradient)
 
 
 @njit(cache=True, nogil=True)
-def _add_pairs(first, second, by_j, information, weights, residuals, i_from_j, diagonal, across, gradient):
-    """Adds the normal equations of pairs to blocks and gradient of both their poses, and fills the blocks between.
+def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
+    """Adds the normal equations of binary factors to the diagonal blocks and the gradient of both poses.
 
-    A motion d of i is one of -Ad(j_from_i) d of j.
+    The Jacobian by the increment of pose i is that by pose j times -Ad(j_from_i).
+
+    Args:
+        off_diagonal: (m, 6, 6), filled with the blocks (i, j).
     """
     n = residuals.shape[1]
     half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
     for m in range(len(first)):
-        i, j, derivative = first[m], second[m], by_j[m]
+        i, j, jacobian = first[m], second[m], by_j[m]
         for a in range(6):
             slope[a] = 0.0
             for k in range(n):
                 half[a, k] = 0.0
                 for b in range(n):
-                    half[a, k] += weights[m] * derivative[b, a] * information[m, b, k]
+                    half[a, k] += weights[m] * jacobian[b, a] * information[m, b, k]
                 slope[a] += half[a, k] * residuals[m, k]
             for b in range(a + 1):
                 total = 0.0
                 for k in range(n):
-                    total += half[a, k] * derivative[k, b]
+                    total += half[a, k] * jacobian[k, b]
                 matrix[a, b] = matrix[b, a] = total
         geometry.put(to_i, geometry.adjoint(geometry.inverse(i_from_j[m])).T)
         for a in range(6):
             for b in range(6):
-                across[m, a, b] = 0.0
+                off_diagonal[m, a, b] = 0.0
                 for k in range(6):
-                    across[m, a, b] -= to_i[a, k] * matrix[k, b]
+                    off_diagonal[m, a, b] -= to_i[a, k] * matrix[k, b]
                 diagonal[j, a, b] += matrix[a, b]
                 gradient[i, a] -= to_i[a, b] * slope[b]
             gradient[j, a] += slope[a]
@@ -291,89 +316,109 @@ def _add_pairs(first, second, by_j, information, weights, residuals, i_from_j, d
 
 
 @njit(cache=True, nogil=True)
-def _add_border(first, second, by_j, informed, i_from_j, border):
-    """Adds what pairs hold together of their poses and what is shared."""
+def _add_border(first, second, by_j, weighted, i_from_j, border):
+    """Adds the second derivatives of binary factors by their poses and the shared parameter to the border (n, 6).
+
+    Args:
+        weighted: (m, d) Jacobian by the shared parameter times information and robust weight.
+    """
     for m in range(len(first)):
         slope = np.zeros(6)
-        for k in range(informed.shape[1]):
-            slope += informed[m, k] * by_j[m, k]
-        carry = geometry.adjoint(geometry.inverse(i_from_j[m]))
+        for k in range(weighted.shape[1]):
+            slope += weighted[m, k] * by_j[m, k]
+        j_from_i = geometry.adjoint(geometry.inverse(i_from_j[m]))
         for a in range(6):
             border[second[m], a] += slope[a]
             for b in range(6):
-                border[first[m], a] -= carry[b, a] * slope[b]
+                border[first[m], a] -= j_from_i[b, a] * slope[b]
 
 
-def motions(links: Sequence[Link], places: dict[int, int], huber: float | None = None) -> Pairs:
-    """What links say of the poses at these places, by number of their nodes."""
-    columns = Links.of(links)
+def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float | None = None) -> BinaryFactors:
+    """Returns binary factors of measured motions.
+
+    Args:
+        links: measured motions between nodes.
+        index_of: index of the pose of each node, by node number.
+        huber: residual [standard deviations] above which the loss is linear; None: least squares.
+    """
+    columns = Links.from_sequence(links)
     measured, information = columns.i_from_j, columns.information
-    i, j = (np.array([places[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
+    i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
 
-    def observe(i_from_j: Array, _: float) -> Array:
-        return errors(measured, i_from_j)
+    def residuals(i_from_j: Array, _: float) -> Array:
+        return pose_residuals(measured, i_from_j)
 
-    return Pairs(i, j, information, observe, lambda _, __, residuals: (log_derivatives(residuals), None), huber)
+    return BinaryFactors(
+        i, j, information, residuals, lambda _, __, residuals: (pose_residual_jacobians(residuals), None), huber
+    )
 
 
-def given(at: Sequence[int], poses: Array, covs: Array) -> Single:
-    """Poses (m, 4, 4) that are known with covariances (m, 6, 6) [rotation, translation], in their own axes."""
-    return Single(
-        np.asarray(at, np.int64), inverses(covs), lambda found: errors(poses, found),
-        lambda _, residuals: log_derivatives(residuals),
+def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> UnaryFactors:
+    """Returns unary factors of poses with known mean and covariance.
+
+    Args:
+        pose_index: (m,) indices of the poses.
+        poses: (m, 4, 4) means.
+        covs: (m, 6, 6) covariances [rotation, translation] (rad, m) in the poses' own axes.
+    """
+    return UnaryFactors(
+        np.asarray(pose_index, np.int64), symmetric_inverses(covs), lambda estimated: pose_residuals(poses, estimated),
+        lambda _, residuals: pose_residual_jacobians(residuals),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def errors(measured, found):
-    """log(measured^-1 found) of poses (m, 4, 4), (m, 6)."""
-    residuals = np.empty((len(found), 6))
-    for k in range(len(found)):
-        geometry.put(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), found[k])))
+def pose_residuals(measured, estimated):
+    """Returns log(measured^-1 estimated) (m, 6) of poses (m, 4, 4)."""
+    residuals = np.empty((len(estimated), 6))
+    for k in range(len(estimated)):
+        geometry.put(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), estimated[k])))
     return residuals
 
 
 @njit(cache=True, nogil=True)
-def log_derivatives(residuals):
-    """Derivatives (m, 6, 6) of such errors (m, 6) by motions of what is found."""
-    derivatives = np.empty((len(residuals), 6, 6))
+def pose_residual_jacobians(residuals):
+    """Returns the Jacobians (m, 6, 6) of `pose_residuals` (m, 6) by increments of the estimated poses."""
+    jacobians = np.empty((len(residuals), 6, 6))
     for k in range(len(residuals)):
-        geometry.put(derivatives[k], geometry.log_derivative(residuals[k]))
-    return derivatives
+        geometry.put(jacobians[k], geometry.log_derivative(residuals[k]))
+    return jacobians
 
 
 @njit(cache=True, nogil=True)
-def _moved(poses, steps):
+def _retract(poses, increments):
+    """Returns poses (n, 4, 4) moved by increments (n, 6) in their own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
-        geometry.put(moved[k], geometry.compose(poses[k], geometry.exp(steps[k])))
+        geometry.put(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
     return moved
 
 
 @njit(cache=True, nogil=True)
-def _between(poses, first, second):
-    """(m, 4, 4) poses of the second in the first of pairs."""
-    found = np.empty((len(first), 4, 4))
-    for k in range(len(first)):
-        geometry.put(found[k], geometry.compose(geometry.inverse(poses[first[k]]), poses[second[k]]))
-    return found
+def _relative_poses(poses, i, j):
+    """Returns i_from_j (m, 4, 4) of pairs of poses with indices i, j (m,)."""
+    relative = np.empty((len(i), 4, 4))
+    for k in range(len(i)):
+        geometry.put(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))
+    return relative
 
 
-def turned(matrices: Array) -> Array:
-    """Each of matrices (m, a, b) transposed, a view."""
+def transposed(matrices: Array) -> Array:
+    """Returns the transposes (m, b, a) of matrices (m, a, b), a view."""
     return matrices.transpose(0, 2, 1)
 
 
-def times(matrices: Array, vectors: Array) -> Array:
-    """Matrices (m, a, b) times vectors (m, b), one by one: (m, a)."""
+def matvec(matrices: Array, vectors: Array) -> Array:
+    """Returns the products (m, a) of matrices (m, a, b) and vectors (m, b)."""
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
-def _squares(residuals: Array, information: Array) -> Array:
-    return np.sum(residuals * times(information, residuals), axis=1)
+def _squared_norms(residuals: Array, information: Array) -> Array:
+    """Returns the squared Mahalanobis norms (m,) of residuals (m, d)."""
+    return np.sum(residuals * matvec(information, residuals), axis=1)
 
 
-def _summed(n: int, at: Indices, values: Array) -> Array:
-    """(n, ...) sums of the values (m, ...) that belong to each."""
-    picks = sparse.csr_array((np.ones(len(at)), (at, np.arange(len(at)))), shape=(n, len(at)))
-    return (picks @ values.reshape(len(at), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])
+def _sum_by_index(n: int, index: Indices, values: Array) -> Array:
+    """Returns the sums (n, ...) of the values (m, ...) with the same index."""
+    selection = sparse.csr_array((np.ones(len(index)), (index, np.arange(len(index)))), shape=(n, len(index)))
+    return (selection @ values.reshape(len(index), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])

@@ -1,8 +1,9 @@
-"""Kalman depth mapping along the path (part P18 of the method): one scalar filter per pixel of the current keyframe.
+"""Kalman depth filter along the path: one scalar filter per pixel of the current keyframe.
 
-State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step carries
-the state into the next keyframe, fuses the new stereo depth and the depth from the motion between the two, and hands
-over ("retires") every pixel of the old map that could not be carried: what a pixel knows leaves the filter once.
+State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step
+propagates the state to the next keyframe and fuses it with the new stereo depth and with the depth from the motion
+between the two keyframes. Pixels that are not propagated leave the filter and are fused into the map (`elevation`),
+each once.
 """
 
 from __future__ import annotations
@@ -22,85 +23,99 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Gate of the innovation, (z - h)^2 < GATE (P + R): 99.9 % of a chi-square with one degree of freedom.
+#: Gate of the innovation, (z - h)^2 < GATE (P + R): 99.9 % quantile of chi-square with one degree of freedom.
 GATE = 10.83
-#: Pixels whose disparities differ by more than this [px] are on different surfaces: nothing is interpolated between.
+#: Pixels whose disparities differ by more than this [px] are on different surfaces; no interpolation between them.
 JUMP_PX = 1.2
-#: Standard deviation of depth from motion beyond its own noise [px of stereo disparity].
-MOTION_FLOOR_PX = 0.03
+#: Standard deviation of depth from motion in addition to image noise [px of stereo disparity].
+MOTION_MIN_SIGMA_PX = 0.03
 
 
 class DepthMap(NamedTuple):
-    """Depth (H, W) float32 [m], NaN where unknown, and its variance (H, W) float32 [m^2], of one left camera."""
+    """Depth (H, W) float32 [m] in a left camera, NaN where unknown, and its variance (H, W) float32 [m^2]."""
 
     depth_m: Map
     variance_m2: Map
 
 
-class Carried(NamedTuple):
-    """The fused map of the new keyframe, and which of its pixels took information of the old map in."""
+class PropagatedDepth(NamedTuple):
+    """Result of `propagate`.
+
+    Args:
+        fused: depth map of the new keyframe.
+        inherited: (H, W) bool, pixels that contain information of the old map.
+    """
 
     fused: DepthMap
-    taken: Mask
+    inherited: Mask
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
-    """Depth and variance of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d."""
+    """Returns the depth map of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d."""
     focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
     depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
     variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2
     return DepthMap(depth.astype(np.float32), variance.astype(np.float32))
 
 
-def fuse(prior: DepthMap, seen: DepthMap) -> DepthMap:
-    """Scalar Kalman update of every pixel that passes the gate (z - h)^2 < GATE (P + R); others keep their prior.
+def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
+    """Fuses two depth maps of the same camera by scalar Kalman updates.
 
-    Where only one of the two knows, that one stands.
+    A pixel is updated if its innovation passes the gate (z - h)^2 < GATE (P + R); otherwise it keeps its prior. A pixel
+    that only one of the maps knows is taken from that map.
     """
     depth, variance = prior.depth_m.copy(), prior.variance_m2.copy()
-    _fuse(depth, variance, seen.depth_m, seen.variance_m2, GATE)
+    _fuse(depth, variance, measured.depth_m, measured.variance_m2, GATE)
     return DepthMap(depth, variance)
 
 
-def carry(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> Carried:
-    """Carries the old map into the new keyframe and fuses it with the new stereo depth.
+def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
+    """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth.
 
-    Each new pixel's stereo depth is the point of linearisation: where that point lay in the old image, the old map is
-    sampled bilinearly (backward, so without holes or rounding; not across jumps of depth) and its difference in depth
-    is brought over along the surface. A pixel without new stereo keeps what falls on it.
+    The new stereo depth of each pixel is the point of linearisation. The old map is sampled bilinearly where this point
+    projects in the old image (backward warping: no holes, no rounding; not across depth discontinuities), and the
+    difference in depth is transferred along the surface. Pixels without new stereo depth are linearised at the old
+    depth that projects to them.
 
     Args:
+        old: filtered depth of the old keyframe.
+        new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new one.
         step_cov: (6, 6) covariance of that relative pose [rotation, translation], in the new camera (rad, m).
+        rig: calibration.
     """
     args = (rig.focal_px, rig.focal_px * rig.baseline_m, JUMP_PX)
     old_from_new = geometry.inverse(new_from_old)
     guess = new.depth_m.copy()
-    _scatter(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, args[0])
-    prior = DepthMap(*_pull(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args))
+    _forward_project(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, args[0])
+    prior = DepthMap(
+        *_backward_warp(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args)
+    )
     depth, variance = new.depth_m.copy(), new.variance_m2.copy()
-    taken = _fuse(depth, variance, prior.depth_m, prior.variance_m2, GATE)
-    return Carried(DepthMap(depth, variance), taken)
+    inherited = _fuse(depth, variance, prior.depth_m, prior.variance_m2, GATE)
+    return PropagatedDepth(DepthMap(depth, variance), inherited)
 
 
 def motion_depth(
     gray: Map, old_gray: Map, current: DepthMap, old_from_new: Array, step_cov: Array, rig: StereoRig
 ) -> DepthMap:
-    """Depth from the flow between two keyframes (Negahdaripour & Madjidi 2003, eq. 1, in its exact two-view form).
+    """Computes depth from the flow between two keyframes (exact two-view form of Negahdaripour & Madjidi 2003, eq. 1).
 
-    The relative pose and the current depth predict the flow; what remains of it along the epipolar line is measured
-    with the same window as the disparity, and is linear in inverse depth. Errors of the relative pose enter R.
+    The relative pose and the current depth predict the flow. Its residual along the epipolar line is measured with the
+    same window as stereo disparity, and is linear in inverse depth. The covariance of the relative pose adds to the
+    variance of the depth.
 
-    Found on rendered strips (grey noise sd 2, true poses): error of motion depth 0.044 px on a reef and 0.063 px on a
-    fractal floor, in units of its own sigma 0.9 and 0.9, bias 0.001 px; with it the error of the filter falls from
-    0.045 to 0.035 px and from 0.040 to 0.029 px. A dense two-dimensional flow is not used: its bias of some 0.1 px is
-    common to the image and would stay in the map.
+    On rendered strips (noise of 2 grey levels, true poses), the error of motion depth was 0.044 px on a reef and 0.063
+    px on a fractal floor, 0.9 times its sigma on both, with a bias of 0.001 px. It reduced the error of the filter from
+    0.045 to 0.035 px and from 0.040 to 0.029 px. Dense two-dimensional flow is not used: its bias of about 0.1 px is
+    common to the image and would remain in the map.
 
     Args:
         gray, old_gray: (H, W) float32 left images.
-        current: depth of the new keyframe, the prediction.
+        current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old one.
-        step_cov: (6, 6) covariance of the relative pose, in the new camera (rad, m).
+        step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
+        rig: calibration.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
@@ -113,33 +128,33 @@ def motion_depth(
         rig.focal_px,
         focal_baseline,
     )
-    sigma = np.sqrt(flow.own_sigma_px**2 + pose_variance + np.float32(MOTION_FLOOR_PX**2))
+    sigma = np.sqrt(flow.measurement_sigma_px**2 + pose_variance + np.float32(MOTION_MIN_SIGMA_PX**2))
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
 
 
 @njit(cache=True, nogil=True)
-def _fuse(depth, variance, seen, seen_variance, gate):
-    """Updates depth and variance in place; returns which pixels took the other's information in."""
-    taken = np.zeros(depth.shape, np.bool_)
+def _fuse(depth, variance, measured, measured_variance, gate):
+    """Compiled kernel of `fuse`: updates `depth` and `variance` in place; returns which pixels were updated (H, W)."""
+    updated = np.zeros(depth.shape, np.bool_)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
-            z, r = seen[v, u], seen_variance[v, u]
+            z, r = measured[v, u], measured_variance[v, u]
             if not z > 0:
                 continue
             h, p = depth[v, u], variance[v, u]
             if not h > 0:
-                depth[v, u], variance[v, u], taken[v, u] = z, r, True
+                depth[v, u], variance[v, u], updated[v, u] = z, r, True
             elif (z - h) ** 2 < gate * (p + r):
                 gain = p / (p + r)
                 depth[v, u] = h + gain * (z - h)
                 variance[v, u] = p * r / (p + r)
-                taken[v, u] = True
-    return taken
+                updated[v, u] = True
+    return updated
 
 
 @njit(cache=True, nogil=True)
-def _scatter(old, rotation, translation, guess, focal):
-    """Fills pixels without stereo with the nearest old depth that falls on them."""
+def _forward_project(old, rotation, translation, guess, focal):
+    """Fills unknown pixels of `guess` (H, W) with the nearest old depth that projects to them."""
     height, width = old.shape
     cx, cy = (width - 1) / 2, (height - 1) / 2
     filled = np.zeros(old.shape, np.bool_)
@@ -147,7 +162,7 @@ def _scatter(old, rotation, translation, guess, focal):
         for u in range(width):
             if not old[v, u] > 0:
                 continue
-            x, y, z = _moved(u, v, old[v, u], rotation, translation, focal, cx, cy)
+            x, y, z = _transform_pixel(u, v, old[v, u], rotation, translation, focal, cx, cy)
             if z <= 0:
                 continue
             j, i = int(np.floor(focal * x / z + cx + 0.5)), int(np.floor(focal * y / z + cy + 0.5))
@@ -159,8 +174,8 @@ def _scatter(old, rotation, translation, guess, focal):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _moved(u, v, depth, rotation, translation, focal, cx, cy):
-    """The point of pixel (u, v) at a depth, in the other camera [m]."""
+def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
+    """Returns the point of pixel (u, v) at a depth, in the other camera [m]."""
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
@@ -171,8 +186,11 @@ def _moved(u, v, depth, rotation, translation, focal, cx, cy):
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Depth and variance at (x, y) if its four neighbours are one surface, else NaN. Inverse depth is interpolated:
-    it is linear on planes. The variance is interpolated as if neighbours erred alike: windows overlap."""
+    """Returns depth and variance at pixel (x, y); NaN if its four neighbours are not on one surface.
+
+    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly, because errors
+    of neighbouring pixels are fully correlated: their windows overlap.
+    """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
         return np.nan, np.nan
@@ -191,7 +209,10 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 
 @njit(cache=True, nogil=True, inline="always")
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
-    """Normal of the surface at a pixel, scaled so that normal . ray = 1 / depth; facing the ray where it is unknown."""
+    """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
+
+    Towards a depth discontinuity, inverse depth is taken as constant.
+    """
     height, width = depth.shape
     z = depth[v, u]
     slope_u, slope_v = 0.0, 0.0
@@ -208,19 +229,19 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 
 @njit(cache=True, nogil=True)
-def _pull(old, old_variance, guess, rotation, translation, step_cov, focal, focal_baseline, jump):
-    """Old depth and variance, brought to each pixel of the new map; NaN where the old map does not know it."""
+def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, focal, focal_baseline, jump):
+    """Returns depth and variance (H, W) of the old map at the pixels of the new map, linearised at `guess`."""
     height, width = old.shape
     cx, cy = (width - 1) / 2, (height - 1) / 2
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
-    uncertain = np.trace(step_cov) > 0
+    is_uncertain = np.trace(step_cov) > 0
     row = np.empty(6)
     for v in range(height):
         for u in range(width):
             z = guess[v, u]
             if not z > 0:
                 continue
-            x, y, w = _moved(u, v, z, rotation, translation, focal, cx, cy)
+            x, y, w = _transform_pixel(u, v, z, rotation, translation, focal, cx, cy)
             if w <= 0:
                 continue
             ox, oy = x / w, y / w
@@ -228,14 +249,14 @@ def _pull(old, old_variance, guess, rotation, translation, step_cov, focal, foca
             if np.isnan(h):
                 continue
             nx, ny, nz = _normal(guess, u, v, focal, cx, cy, focal_baseline, jump)
-            # the old ray seen from the new camera
+            # ray of the old camera in axes of the new camera
             rx = rotation[0, 0] * ox + rotation[1, 0] * oy + rotation[2, 0]
             ry = rotation[0, 1] * ox + rotation[1, 1] * oy + rotation[2, 1]
             rz = rotation[0, 2] * ox + rotation[1, 2] * oy + rotation[2, 2]
             ratio = min(max(z * (nx * rx + ny * ry + nz * rz), 0.5), 2.0)
             depth[v, u] = z + (h - w) * ratio
             variance[v, u] = p * ratio**2
-            if uncertain:
+            if is_uncertain:
                 px, py = (u - cx) / focal * z, (v - cy) / focal * z
                 row[0], row[1], row[2] = py * nz - z * ny, z * nx - px * nz, px * ny - py * nx
                 row[3], row[4], row[5] = nx, ny, nz
@@ -245,6 +266,7 @@ def _pull(old, old_variance, guess, rotation, translation, step_cov, focal, foca
 
 @njit(cache=True, nogil=True, inline="always")
 def _quadratic(row, cov):
+    """Returns row cov row' of a row (6,)."""
     total = 0.0
     for i in range(6):
         for j in range(6):
@@ -254,9 +276,9 @@ def _quadratic(row, cov):
 
 @njit(cache=True, nogil=True)
 def _pose_variance(disparity, rotation, translation, step_cov, focal, focal_baseline):
-    """Variance of disparity from motion [px^2] by the covariance of the relative pose alone: J cov J'.
+    """Returns the variance (H, W) of disparity from motion due to the relative pose: J cov J' [px^2].
 
-    A small motion of the old camera's image of a point, projected on the epipolar line, is taken for a change of depth.
+    The component along the epipolar line of a displacement of the image point is interpreted as a change of depth.
     """
     height, width = disparity.shape
     cx, cy = (width - 1) / 2, (height - 1) / 2
@@ -270,10 +292,10 @@ def _pose_variance(disparity, rotation, translation, step_cov, focal, focal_base
             if not d > 0:
                 continue
             z = focal_baseline / d
-            x, y, w = _moved(u, v, z, rotation, translation, focal, cx, cy)
+            x, y, w = _transform_pixel(u, v, z, rotation, translation, focal, cx, cy)
             ex = (translation[0] * w - translation[2] * x) / (w * w) * focal * z / focal_baseline
             ey = (translation[1] * w - translation[2] * y) / (w * w) * focal * z / focal_baseline
-            # flow by a displacement of the point in the new camera, projected on the epipolar line
+            # flow due to a displacement of the point in the new camera, projected on the epipolar line
             length = ex * ex + ey * ey
             gx, gy = ex / length * focal / w, ey / length * focal / w
             gz = -(gx * x + gy * y) / w

@@ -1,4 +1,4 @@
-"""The composite map (parts P18 to P20 of the method): what the filter retires, fused cell by cell."""
+"""Fusion of height patches into the elevation map, with its uncertainty and the photo mosaic."""
 
 from __future__ import annotations
 
@@ -9,33 +9,37 @@ from numpy.typing import NDArray
 
 from twin.core.records import ElevationMap, Image, MapGrid
 from twin.estimate.mapping.depth_filter import GATE, Mask
-from twin.estimate.mapping.surface import Patch
+from twin.estimate.mapping.surface import HeightPatch
 
 Map = NDArray[np.float32]
 
-#: The higher of two hypotheses stands if its variance is so many times smaller.
-_SURER = 10.0
-#: How often the one that stands is wrong.
-_DOUBT = 0.16
-#: Fewer cells that touch no others are no surface.
-LEAST_CELLS = 12
+#: The higher of two hypotheses is chosen if its variance is smaller by this factor.
+_VARIANCE_RATIO = 10.0
+#: Measured probability that the chosen hypothesis is wrong.
+_WRONG_CHOICE = 0.16
+#: Connected groups of fewer cells are removed.
+MIN_CELLS = 12
 
 
 class ElevationMapper:
-    """Fuses patches into the cells of a grid; memory is that of the grid, however long the survey.
+    """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
-    A cell keeps up to two hypotheses of its height (a steep cell is seen now at the foot, now at the edge): each patch
-    updates the one that fits best if it passes its gate (z - h)^2 < GATE (P + R), or opens the second, or replaces the
-    weaker if it knows more. The lower one is the result unless the higher is far better known: windows of matching
-    carry the edge of what is near over what lies behind it. Of the cells of the horseshoe reef with two hypotheses the
-    lower was right in 82 %, the better known in 67 %, this rule in 84 %.
+    A cell keeps up to two hypotheses of its height, because a steep cell is measured at its foot in one view and at its
+    edge in another. Each patch updates the hypothesis that fits best if it passes the gate (z - h)^2 < GATE (P + R);
+    otherwise it opens the second hypothesis, or replaces the one with the larger variance if its own is smaller. The
+    lower hypothesis is the result unless the higher one is much more certain, because matching windows extend near
+    surfaces over the floor behind them. Among cells with two hypotheses of the horseshoe reef, the lower one was right
+    in 82 %, the more certain one in 67 %, and this rule in 84 %.
 
-    Variance has two parts. That of depth is independent from map to map and shrinks with each fusion. That of the pose
-    and of smoothed slopes is shared by all cells of a leg, and largely by all legs: it is carried beside as the
-    weighted mean of what came in, so it never averages away. To their sum the result adds the lateral error times the
-    relief around the cell, and what may be on the wrong side of an edge: a share of the squared step, which for a step
-    of more than a cell is that of the lateral error in the cell. Without it the 1 % of cells at the reef's edges that
-    show the other side made sigma 1.9 times too small over all.
+    The variance has two parts. That of depth is independent between patches and decreases with each fusion. That of
+    pose and smoothed slopes is shared by all cells of a leg, and mostly by all legs; its weighted mean over the patches
+    is kept, so it never averages out. The result adds two terms: the lateral error times the relief around the cell,
+    and a fraction of the squared height step for cells that may be on the wrong side of an edge. The fraction is the
+    lateral error relative to the cell, for steps larger than a cell. Without this term, the 1 % of cells at the edges
+    of a reef that show the other side made sigma 1.9 times too small over the whole map.
+
+    Args:
+        grid: grid of the map.
     """
 
     def __init__(self, grid: MapGrid):
@@ -43,56 +47,69 @@ class ElevationMapper:
         self.grid = grid
         self._height = np.full((2, *shape), np.nan, np.float32)
         self._variance = np.full((2, *shape), np.inf, np.float32)
-        self._common = np.zeros((2, *shape), np.float32)
+        self._systematic = np.zeros((2, *shape), np.float32)
         self._colour = np.zeros((*shape, 4), np.float32)
         self._lateral_m: list[float] = [0.0, 0.0]  # sum, count
 
-    def retire(self, patch: Patch, successor: Patch | None = None, taken: Mask | None = None) -> None:
-        """Fuses the cells of a patch that its successor, the patch of the next keyframe, does not carry on.
+    def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
+        """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
-        A cell is carried on where the successor covers it with a pixel that took old information in (`taken`) and
-        whose height agrees: so what is known of a cell enters the map once, and none is lost between two patches.
+        A cell was propagated if the successor covers it with a pixel that inherited information and agrees in height.
+        So the information on a cell enters the map once, and none is lost between two patches.
+
+        Args:
+            patch: heights of a keyframe.
+            successor: heights of the next keyframe; None for the last one.
+            inherited: (H, W) bool, pixels of the next keyframe that contain information of this one
+                (`depth_filter.PropagatedDepth`).
         """
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
         height = patch.height_m
-        if successor is not None and taken is not None:
+        if successor is not None and inherited is not None:
             height = height.copy()
-            _strike_carried(*patch[:5], *successor[:6], taken, GATE, height)
-        _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._common)
+            _remove_propagated(*patch[:5], *successor[:6], inherited, GATE, height)
+        _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._systematic)
 
-    def add_colours(self, patch: Patch, rgb: Image, gain: Map) -> None:
-        """Adds the image to the mosaic: a weighted mean that prefers what lies near the middle of the image."""
-        _paint(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
+    def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
+        """Adds an image (H, W, 3) to the photo mosaic, a weighted mean with larger weights near the image centre.
+
+        Args:
+            patch: heights of the keyframe, with the pixel of each cell.
+            rgb: left image of the keyframe.
+            gain: (H, W, 3) factor that makes the illumination uniform.
+        """
+        _add_colours(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
 
     def result(self) -> ElevationMap:
-        """The likelier hypothesis of every cell, its standard deviation and the mosaic."""
+        """Returns the map: the chosen hypothesis of each cell, its standard deviation and the photo mosaic."""
         (low, high), gap = np.argsort(self._height, axis=0), self._height.max(axis=0) - self._height.min(axis=0)
-        of_low, of_high = (np.take_along_axis(self._variance, which[None], 0)[0] for which in (low, high))
-        chosen = np.where(np.isfinite(gap) & (of_high * _SURER < of_low), high, low)[None]
-        height, variance, common = (
-            np.take_along_axis(layers, chosen, 0)[0] for layers in (self._height, self._variance, self._common)
+        low_m2, high_m2 = (np.take_along_axis(self._variance, which[None], 0)[0] for which in (low, high))
+        chosen = np.where(np.isfinite(gap) & (high_m2 * _VARIANCE_RATIO < low_m2), high, low)[None]
+        height, variance, systematic = (
+            np.take_along_axis(layers, chosen, 0)[0] for layers in (self._height, self._variance, self._systematic)
         )
-        height[_islands(np.isfinite(height))] = np.nan
+        height[_small_groups(np.isfinite(height))] = np.nan
         step = _step(height)
         lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
-        share = lateral_m / (2 * self.grid.cell_m)
-        edge_m2 = (share * _relief(height)) ** 2 + share * np.where(step > self.grid.cell_m, step, 0) ** 2
-        doubt_m2 = _DOUBT * (1 - _DOUBT) * np.nan_to_num(gap) ** 2
-        sigma = np.where(np.isnan(height), np.nan, np.sqrt(variance + common + edge_m2 + doubt_m2)).astype(np.float32)
+        fraction = lateral_m / (2 * self.grid.cell_m)
+        edge_m2 = (fraction * _relief(height)) ** 2 + fraction * np.where(step > self.grid.cell_m, step, 0) ** 2
+        choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
+        sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
+        sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
         return ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
 
 
-def _islands(known: Mask) -> Mask:
-    """Groups of known cells too small to be a surface: mismatches at the rim of images."""
+def _small_groups(known: Mask) -> Mask:
+    """Returns the cells (rows, cols) in connected groups of fewer than `MIN_CELLS`: mismatches at image borders."""
     _, label, stats, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8), connectivity=8)
-    small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < LEAST_CELLS
+    small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < MIN_CELLS
     return known & small[np.asarray(label, np.int64)]
 
 
 def _relief(height: Map) -> Map:
-    """Highest minus lowest known height among the 3 x 3 cells around each [m]."""
+    """Returns the range of the known heights in the 3 x 3 cells around each cell (rows, cols) [m]."""
     block = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
     high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
@@ -100,60 +117,66 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """By how much the surface departs from a plane across each cell: its largest second difference [m]."""
+    """Returns the largest second difference of height across each cell (rows, cols) [m]."""
     step = np.zeros_like(height)
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
     for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):
-        bend = np.abs(around[..., i, j] + around[..., 2 - i, 2 - j] - 2 * inner)
-        np.fmax(step[1:-1, 1:-1], bend, out=step[1:-1, 1:-1])
+        second_difference = np.abs(around[..., i, j] + around[..., 2 - i, 2 - j] - 2 * inner)
+        np.fmax(step[1:-1, 1:-1], second_difference, out=step[1:-1, 1:-1])
     return step
 
 
 @njit(cache=True, nogil=True)
-def _strike_carried(
-    row, col, height, variance, common, new_row, new_col, new_height, new_variance, new_common, pixel, taken, gate, left
-):
-    """Sets to NaN what the successor carries on."""
+def _remove_propagated(
+    row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
+    inherited, gate, remaining,
+):  # fmt: skip
+    """Sets the cells of `remaining` (rows, cols) to NaN that were propagated to the successor."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
-            if not taken[int(pixel[c, e, 1] + 0.5), int(pixel[c, e, 0] + 0.5)]:
+            if not inherited[int(pixel[c, e, 1] + 0.5), int(pixel[c, e, 0] + 0.5)]:
                 continue
-            spread = variance[a, b] + new_variance[c, e] + common[a, b] + new_common[c, e]
-            if (height[a, b] - new_height[c, e]) ** 2 < gate * spread:
-                left[a, b] = np.nan
+            total = variance[a, b] + new_variance[c, e] + systematic[a, b] + new_systematic[c, e]
+            if (height[a, b] - new_height[c, e]) ** 2 < gate * total:
+                remaining[a, b] = np.nan
 
 
 @njit(cache=True, nogil=True)
-def _fuse_cells(row, col, height, variance, common, gate, heights, variances, commons):
+def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances, systematics):
+    """Fuses a patch (rows, cols) into the two hypotheses per cell, layers (2, grid rows, grid cols), in place."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]
             if np.isnan(z):
                 continue
-            r, q = variance[i, j], common[i, j]
+            r, q = variance[i, j], systematic[i, j]
             a, b = row + i, col + j
-            best, least = -1, gate
+            best, best_fit = -1, gate
             for n in range(2):
                 if np.isnan(heights[n, a, b]):
                     continue
-                fit = (z - heights[n, a, b]) ** 2 / (variances[n, a, b] + r + commons[n, a, b] + q)
-                if fit < least:
-                    best, least = n, fit
+                fit = (z - heights[n, a, b]) ** 2 / (variances[n, a, b] + r + systematics[n, a, b] + q)
+                if fit < best_fit:
+                    best, best_fit = n, fit
             if best < 0:
-                weaker = 0 if variances[0, a, b] >= variances[1, a, b] else 1
-                if r < variances[weaker, a, b]:
-                    heights[weaker, a, b], variances[weaker, a, b], commons[weaker, a, b] = z, r, q
+                worse = 0 if variances[0, a, b] >= variances[1, a, b] else 1
+                if r < variances[worse, a, b]:
+                    heights[worse, a, b], variances[worse, a, b], systematics[worse, a, b] = z, r, q
                 continue
             p = variances[best, a, b]
             gain = p / (p + r)
             heights[best, a, b] += gain * (z - heights[best, a, b])
-            commons[best, a, b] += gain * (q - commons[best, a, b])
+            systematics[best, a, b] += gain * (q - systematics[best, a, b])
             variances[best, a, b] = p * r / (p + r)
 
 
 @njit(cache=True, nogil=True)
-def _paint(row, col, height, pixel, rgb, gain, colour):
+def _add_colours(row, col, height, pixel, rgb, gain, colour):
+    """Adds the bilinear colour of each known cell, times its weight, to `colour` (grid rows, grid cols, 4), in place.
+
+    The fourth layer is the sum of the weights.
+    """
     rows, cols = rgb.shape[0] - 1, rgb.shape[1] - 1
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
@@ -162,10 +185,12 @@ def _paint(row, col, height, pixel, rgb, gain, colour):
             x, y = pixel[i, j, 0], pixel[i, j, 1]
             u, v = min(int(x), cols - 1), min(int(y), rows - 1)
             s, t = x - u, y - v
-            off = (2 * x / cols - 1) ** 2 + (2 * y / rows - 1) ** 2
-            weight = np.exp(-4 * off) + 1e-4
+            radius2 = (2 * x / cols - 1) ** 2 + (2 * y / rows - 1) ** 2
+            weight = np.exp(-4 * radius2) + 1e-4
             for k in range(3):
                 top = (1 - s) * rgb[v, u, k] * gain[v, u, k] + s * rgb[v, u + 1, k] * gain[v, u + 1, k]
-                low = (1 - s) * rgb[v + 1, u, k] * gain[v + 1, u, k] + s * rgb[v + 1, u + 1, k] * gain[v + 1, u + 1, k]
-                colour[row + i, col + j, k] += weight * ((1 - t) * top + t * low)
+                bottom = (1 - s) * rgb[v + 1, u, k] * gain[v + 1, u, k] + s * rgb[v + 1, u + 1, k] * gain[
+                    v + 1, u + 1, k
+                ]
+                colour[row + i, col + j, k] += weight * ((1 - t) * top + t * bottom)
             colour[row + i, col + j, 3] += weight

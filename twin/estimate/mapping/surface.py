@@ -1,4 +1,4 @@
-"""A depth map seen from above: its surface rasterised at the cell centres of a grid, with what it does not know."""
+"""Rasterisation of a depth map at the cell centres of a grid, with the variance of height."""
 
 from __future__ import annotations
 
@@ -14,46 +14,53 @@ from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-#: Least cosine between a triangle's normal and the ray to it: below, it is seen so much from the side that it may as
-#: well be a web between two surfaces.
-LEAST_COSINE = 0.05
-#: What no filter averages away, as a lateral error of the surface [px on the floor]: the matching window smooths relief
-#: and spills over edges in much the same way in every view. On a slope s it is an error of s times this in height.
-LATERAL_PX = 0.35
+#: Smallest cosine between a triangle's normal and the ray to it; below, it may connect two separate surfaces.
+MIN_COSINE = 0.05
+#: Lateral error of the surface that fusion does not reduce [px on the floor]: the matching window smooths relief and
+#: displaces edges in similar ways in all views. On a slope s it causes a height error of s times this.
+LATERAL_SIGMA_PX = 0.35
 
 
-class Patch(NamedTuple):
-    """One depth map seen from above: the cells of the grid from (row, col) on whose centres it covers.
+class HeightPatch(NamedTuple):
+    """Heights of one depth map in a window of the grid, whose first cell is (row, col).
 
     Args:
+        row, col: first cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
-        variance_m2: (rows, cols) by the depth's variance alone, independent from one retired map to the next.
-        common_m2: (rows, cols) by what views share: the pose's covariance and the smoothing of slopes.
-        pixel: (rows, cols, 2) where the cell lies in the image, (u, v).
-        lateral_m: the lateral error at the map's mean depth [m].
+        variance_m2: (rows, cols) variance due to depth, independent between the depth maps that leave the filter.
+        systematic_m2: (rows, cols) variance that views share, due to the pose and the smoothing of slopes.
+        pixel: (rows, cols, 2) position (u, v) of the cell in the image.
+        lateral_m: lateral error at the mean depth of the map [m].
     """
 
     row: int
     col: int
     height_m: Map
     variance_m2: Map
-    common_m2: Map
+    systematic_m2: Map
     pixel: Map
     lateral_m: float
 
 
 def rasterise(
     depth_map: DepthMap, world_from_camera: Array, pose_cov: Array, rig: StereoRig, grid: MapGrid
-) -> Patch | None:
-    """Heights of a depth map at the cell centres of a grid, linear within the triangles between neighbouring pixels.
+) -> HeightPatch | None:
+    """Computes the heights of a depth map at the cell centres of a grid, linear in triangles between pixels.
 
-    Each square of four pixels makes two triangles; none spans a jump of depth, is seen from below or almost along its
-    face, so no surface is invented between a reef's edge and the floor behind it. The variance of depth is projected
-    along the ray to the height of the surface, and so is the pose's covariance (with the slope's part of a horizontal
-    error).
+    Each square of four pixels makes two triangles. Triangles across a depth discontinuity, seen from below or at a
+    grazing angle are left out, so that no surface appears between the edge of a reef and the floor behind it. The
+    variance of depth is projected along the ray to the height of the surface. The covariance of the pose is projected
+    likewise, with the effect of a horizontal error on a slope.
 
     Args:
+        depth_map: depth in the left camera.
+        world_from_camera: (4, 4) pose of the left camera.
         pose_cov: (6, 6) covariance of the pose [rotation, translation], in the camera (rad, m).
+        rig: calibration.
+        grid: grid of the map.
+
+    Returns:
+        The patch, or None if the surface does not overlap the grid.
     """
     points, bounds = _grid_points(
         depth_map.depth_m, world_from_camera, rig.focal_px, grid.west_m, grid.north_m, grid.cell_m
@@ -62,10 +69,10 @@ def rasterise(
     if window is None:
         return None
     row, col, rows, cols = window
-    lateral = LATERAL_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
-    patch = Patch(row, col, *_blank(rows, cols), lateral)
+    lateral = LATERAL_SIGMA_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
+    patch = HeightPatch(row, col, *_empty_layers(rows, cols), lateral)
     rotation = np.kron(np.eye(2), world_from_camera[:3, :3])
-    view = _View(
+    view = _ViewGeometry(
         world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0],
         world_from_camera[:3, 2].copy(),
         rotation @ pose_cov @ rotation.T,
@@ -77,24 +84,34 @@ def rasterise(
     return patch
 
 
-class _View(NamedTuple):
-    """Eye relative to the grid's corner [m], optical axis, covariance in world axes, cell, focal length, jump [1/m]."""
+class _ViewGeometry(NamedTuple):
+    """View of a depth map onto the grid.
 
-    eye: Array
+    Args:
+        position: (3,) camera relative to the north-west corner of the grid [m].
+        axis: (3,) optical axis in the world.
+        cov: (6, 6) covariance of the pose in world axes.
+        cell_m: cell size.
+        focal_px: focal length.
+        max_jump: largest difference of inverse depth within a surface [1/m].
+    """
+
+    position: Array
     axis: Array
     cov: Array
     cell_m: float
     focal_px: float
-    jump: float
+    max_jump: float
 
 
-def _blank(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
+def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
+    """Returns height, two variances (rows, cols), all NaN, and pixel positions (rows, cols, 2)."""
     unknown = np.full((rows, cols), np.nan, np.float32)
     return unknown, unknown.copy(), unknown.copy(), np.zeros((rows, cols, 2), np.float32)
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """First row and column, number of rows and columns of the cells within bounds (cells); None if there are none."""
+    """Returns first row, first column, number of rows and of columns of the cells within bounds; None if none."""
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -105,7 +122,12 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
 @njit(cache=True, nogil=True)
 def _grid_points(depth, pose, focal, west, north, cell):
-    """Points of a depth map as (row, column, height), in cells from the centre of cell (0, 0) and metres; bounds."""
+    """Converts a depth map to grid coordinates.
+
+    Returns:
+        Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; their bounds (4,):
+        lowest row and column, highest row and column.
+    """
     height, width = depth.shape
     points = np.empty((height, width, 3))
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
@@ -124,43 +146,50 @@ def _grid_points(depth, pose, focal, west, north, cell):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _between(a, b, c, e):
-    """True if a whole number lies among four."""
+def _contains_integer(a, b, c, e):
+    """Returns whether an integer lies between the smallest and the largest of four numbers."""
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
 
 @njit(cache=True, nogil=True)
-def _triangles(points, depth, variance, view, row, col, height, spread, common, pixel):
-    out = (points, depth, variance, view, row, col, height, spread, common, pixel)
+def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
+    """Rasterises all triangles of a depth map into `height`, `height_variance`, `systematic` and `pixel`."""
+    out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
-            # most squares of pixels have no cell centre below them
-            if not _between(points[v, u, 0], points[v, u + 1, 0], points[v + 1, u, 0], points[v + 1, u + 1, 0]):
+            # most squares of pixels contain no cell centre
+            if not _contains_integer(
+                points[v, u, 0], points[v, u + 1, 0], points[v + 1, u, 0], points[v + 1, u + 1, 0]
+            ):
                 continue
-            if not _between(points[v, u, 1], points[v, u + 1, 1], points[v + 1, u, 1], points[v + 1, u + 1, 1]):
+            if not _contains_integer(
+                points[v, u, 1], points[v, u + 1, 1], points[v + 1, u, 1], points[v + 1, u + 1, 1]
+            ):
                 continue
             _triangle(v, u, v + 1, u, v, u + 1, *out)
             _triangle(v + 1, u + 1, v, u + 1, v + 1, u, *out)
 
 
 @njit(cache=True, nogil=True)
-def _triangle(va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, spread, common, pixel):
-    """Writes the cells under one triangle of pixels a, b, c; of two surfaces over one cell the higher is seen."""
+def _triangle(
+    va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
+):
+    """Writes the cells inside one triangle of pixels a, b, c; the highest surface over a cell wins."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
-    if not (j0 <= j1 and i0 <= i1):  # no cell centre below it: most triangles end here
+    if not (j0 <= j1 and i0 <= i1):  # contains no cell centre, as most triangles
         return
     za, zb, zc = depth[va, ua], depth[vb, ub], depth[vc, uc]
-    if not (za > 0 and zb > 0 and zc > 0) or 1 / min(za, zb, zc) - 1 / max(za, zb, zc) > view.jump:
+    if not (za > 0 and zb > 0 and zc > 0) or 1 / min(za, zb, zc) - 1 / max(za, zb, zc) > view.max_jump:
         return
-    cell, eye, axis = view.cell_m, view.eye, view.axis
+    cell, position, axis = view.cell_m, view.position, view.axis
     bx, by, bz = (b[1] - a[1]) * cell, (a[0] - b[0]) * cell, b[2] - a[2]
     cx, cy, cz = (c[1] - a[1]) * cell, (a[0] - c[0]) * cell, c[2] - a[2]
     nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-    rx, ry, rz = (a[1] + 0.5) * cell - eye[0], -(a[0] + 0.5) * cell - eye[1], a[2] - eye[2]
+    rx, ry, rz = (a[1] + 0.5) * cell - position[0], -(a[0] + 0.5) * cell - position[1], a[2] - position[2]
     facing = -(nx * rx + ny * ry + nz * rz)
-    if nz <= 0 or facing < LEAST_COSINE * np.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + rz * rz)):
+    if nz <= 0 or facing < MIN_COSINE * np.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + rz * rz)):
         return
     sx, sy = -nx / nz, -ny / nz  # slope of the surface
     for i in range(max(int(i0), row), min(int(i1), row + height.shape[0] - 1) + 1):
@@ -170,21 +199,28 @@ def _triangle(va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, h
             h = a[2] + s * bz + t * cz
             if s < -1e-9 or t < -1e-9 or s + t > 1 + 1e-9 or height[i - row, j - col] >= h:
                 continue
-            px, py, pz = rx + x, ry + y, h - eye[2]
+            px, py, pz = rx + x, ry + y, h - position[2]
             z = px * axis[0] + py * axis[1] + pz * axis[2]
-            lift = (pz - sx * px - sy * py) / z  # change of height per change of depth
+            height_per_depth = (pz - sx * px - sy * py) / z
             p, q = i - row, j - col
             height[p, q] = h
-            spread[p, q] = lift * lift * ((1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc])
-            common[p, q] = pose_part(px, py, pz, sx, sy, view.cov)
-            common[p, q] += (LATERAL_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
+            depth_variance = (1 - s - t) * variance[va, ua] + s * variance[vb, ub] + t * variance[vc, uc]
+            height_variance[p, q] = height_per_depth * height_per_depth * depth_variance
+            systematic[p, q] = pose_variance(px, py, pz, sx, sy, view.cov)
+            systematic[p, q] += (LATERAL_SIGMA_PX * z / view.focal_px) ** 2 * (sx * sx + sy * sy)
             pixel[p, q, 0] = ua + s * (ub - ua) + t * (uc - ua)
             pixel[p, q, 1] = va + s * (vb - va) + t * (vc - va)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def pose_part(px, py, pz, sx, sy, cov):
-    """Variance of height at a point (from the eye) of a surface by the pose's covariance, both in world axes."""
+def pose_variance(px, py, pz, sx, sy, cov):
+    """Returns the variance of a surface's height at a point due to the pose [m^2].
+
+    Args:
+        px, py, pz: point relative to the camera, in world axes [m].
+        sx, sy: slope of the surface.
+        cov: (6, 6) covariance of the pose [rotation, translation], in world axes.
+    """
     row = (-sx, -sy, 1.0)
     full = (py * row[2] - pz * row[1], pz * row[0] - px * row[2], px * row[1] - py * row[0], row[0], row[1], row[2])
     total = 0.0

@@ -1,1 +1,1 @@
-"""The online pose filter and the navigation sensors that aid it."""
+"""Online pose filter, and the navigation sensors that aid it and the global alignment."""

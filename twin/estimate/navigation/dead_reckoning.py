@@ -1,4 +1,4 @@
-"""From frame to frame: what a measured motion and the navigation sensors make of where the vehicle believes it is."""
+"""Dead reckoning from frame to frame: visual motion fused with DVL, pressure and AHRS readings."""
 
 from __future__ import annotations
 
@@ -10,56 +10,64 @@ from numba import njit
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings
-from twin.estimate.navigation.dvl import Beams, Way, logged
-from twin.estimate.navigation.pose_filter import Level, aided, predicted
+from twin.estimate.navigation.dvl import DvlModel, DvlState, fuse_dvl
+from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressure_ahrs, predict
 
 
-class Reckoning(NamedTuple):
-    """Poses (4, 4) and covariances (6, 6) that every frame moves on.
+class DeadReckoningState(NamedTuple):
+    """Poses (4, 4) and covariances (6, 6) after a frame; every frame returns a new state.
 
     Args:
         f2f: world_from_camera by frame-to-frame motion alone.
-        online, cov: world_from_camera as believed.
-        walked, walked_cov: motion since the last node.
+        online, cov: estimated world_from_camera and its covariance.
+        since_node, since_node_cov: estimated motion since the last node and its covariance.
     """
 
     f2f: Array
     online: Array
     cov: Array
-    walked: Array
-    walked_cov: Array
+    since_node: Array
+    since_node_cov: Array
 
 
-class Instruments(NamedTuple):
-    """What is believed of the sensors that speak at every frame, and what the velocity log said since the last node."""
+class FrameAiding(NamedTuple):
+    """Models of the sensors with a reading at every frame, and the state of the DVL integration.
 
-    level: Level
-    beams: Beams
-    way: Way
+    The arrays of `dvl_state` are modified in place.
+    """
+
+    pressure_ahrs: PressureAhrsModel
+    dvl: DvlModel
+    dvl_state: DvlState
 
 
-def said(readings: Readings) -> tuple[float, Array, Array]:
-    """Height [m], attitude (3,) [rad] and velocity (3,) [m/s] of readings; NaN where there is none."""
+def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
+    """Returns height [m], attitude (3,) [rad] and velocity (3,) [m/s] of readings; NaN where there is no reading."""
     height, angles, velocity = readings.pressure_z_m, readings.ahrs_rpy_rad, readings.dvl_mps
-    nothing = np.full(3, np.nan)
+    missing = np.full(3, np.nan)
     return (
         np.nan if height is None else height,
-        nothing if angles is None else angles,
-        nothing if velocity is None else velocity,
+        missing if angles is None else angles,
+        missing if velocity is None else velocity,
     )
 
 
 @njit(cache=True, nogil=True)
-def reckon(last, instruments, a_from_b, cov, height_m, rpy_rad, velocity_mps):
-    """The reckoning after one frame, and the motion (4, 4) that it rests on.
+def dead_reckon(last, aiding, a_from_b, cov, height_m, rpy_rad, velocity_mps):
+    """Computes the state after one frame.
 
     Args:
-        last: `Reckoning` of the frame before.
-        a_from_b, cov: motion by vision since then.
-        height_m, rpy_rad, velocity_mps: readings; NaN where a sensor says nothing.
+        last: `DeadReckoningState` of the frame before.
+        aiding: `FrameAiding`.
+        a_from_b, cov: (4, 4), (6, 6) visual motion since then.
+        height_m, rpy_rad, velocity_mps: readings of this frame; NaN where there is none.
+
+    Returns:
+        The new state, and the motion (4, 4) of this frame after fusion with the DVL.
     """
-    moved, moved_cov = logged(instruments.way, instruments.beams, a_from_b, cov, velocity_mps)
-    online, online_cov = predicted(last.online, last.cov, moved, moved_cov)
-    online, online_cov = aided(online, online_cov, instruments.level, height_m, rpy_rad)
-    walked, walked_cov = predicted(last.walked, last.walked_cov, moved, moved_cov)
-    return Reckoning(geometry.compose(last.f2f, a_from_b), online, online_cov, walked, walked_cov), moved
+    motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps)
+    online, online_cov = predict(last.online, last.cov, motion, motion_cov)
+    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad)
+    since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
+    f2f = geometry.compose(last.f2f, a_from_b)
+    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion

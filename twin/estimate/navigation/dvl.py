@@ -1,4 +1,4 @@
-"""The DVL as an aid: its velocity summed to a displacement, of a frame for the online position, of a node for GA."""
+"""Integration of DVL velocities to displacements: per frame for the online pose, per node for the global alignment."""
 
 from __future__ import annotations
 
@@ -11,157 +11,210 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, SensorNoise, StereoRig
-from twin.estimate.navigation.pose_filter import updated
+from twin.estimate.navigation.pose_filter import kalman_update
 
 
-class Beams(NamedTuple):
-    """What is believed of the log: its mount, time between readings, variance of a frame's way by white noise [m2],
-    and that of its scale error."""
+class DvlModel(NamedTuple):
+    """Error model of the DVL.
+
+    Args:
+        body_from_camera: (4, 4) mount of the left camera.
+        step_s: time between readings.
+        white_m2: variance of each component of a frame's displacement by white noise [m^2].
+        scale_variance: variance of the scale error.
+    """
 
     body_from_camera: Array
     step_s: float
     white_m2: float
-    scale2: float
+    scale_variance: float
 
 
-class Way(NamedTuple):
-    """What the log has said since the last node; all arrays are changed in place.
+class DvlState(NamedTuple):
+    """Integration of DVL velocities since the last node. All arrays are modified in place.
 
     Args:
-        velocity: (3,) the last reading [m/s]; NaN: none.
-        turn, turn_cov: (3, 3) of the body since the node, and its covariance.
-        metres, cov: (3,), (3, 3) displacement in the body at the node, and what white noise makes it err by.
-        path_m: (1,) length of the way.
-        whole: (1,) whether every reading was there.
+        velocity: (3,) last reading [m/s]; NaN: none.
+        node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance [rad^2].
+        displacement_m, cov: (3,), (3, 3) displacement in the body at the node, and its covariance by white noise [m^2].
+        path_m: (1,) path length since the node.
+        complete: (1,) whether no reading was missing.
     """
 
     velocity: Array
-    turn: Array
-    turn_cov: Array
-    metres: Array
+    node_from_body: Array
+    rotation_cov: Array
+    displacement_m: Array
     cov: Array
     path_m: Array
-    whole: NDArray[np.bool_]
+    complete: NDArray[np.bool_]
 
 
-class VelocityLog:
-    """Sums velocities by the trapezoidal rule, turned by the attitude since the last node.
+class DvlIntegrator:
+    """Integrates velocities by the trapezoidal rule, rotated by the attitude since the last node.
 
-    Each reading enters two neighbouring frames with half its noise: counted as independent, frames of variance
-    (sigma dt)^2 have the right sum.
+    Each reading contributes half its noise to two consecutive frames. Frames are treated as independent with the
+    variance (sigma dt)^2, which gives the correct variance of the sum.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
-        step_s = 1 / rig.frame_rate_hz
-        self.beams = Beams(rig.body_from_camera, step_s, (noise.dvl_mps * step_s) ** 2, noise.dvl_scale**2)
-        square = (3, 3)
-        self.way = Way(
-            np.full(3, np.nan), np.eye(3), np.zeros(square), np.zeros(3), np.zeros(square), np.zeros(1),
-            np.ones(1, np.bool_),
-        )  # fmt: skip
+        self._rig, self._noise = rig, noise
+        self.state = DvlState(
+            velocity=np.full(3, np.nan),
+            node_from_body=np.eye(3),
+            rotation_cov=np.zeros((3, 3)),
+            displacement_m=np.zeros(3),
+            cov=np.zeros((3, 3)),
+            path_m=np.zeros(1),
+            complete=np.ones(1, np.bool_),
+        )
         self._node = 0
 
-    def at_node(self, number: int) -> Displacement | None:
-        """The displacement from the last node to this one, where the next one starts; None where a reading lacks."""
-        node, self._node, way = self._node, number, self.way
-        walked = Displacement(node, way.metres.copy(), _walked_cov(way)) if way.whole[0] else None
-        _start(way)
-        return walked
+    def model(self, interval_s: float) -> DvlModel:
+        """Returns the error model for an interval between frames [s]."""
+        white_m2 = (self._noise.dvl_mps * interval_s) ** 2
+        return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
+
+    def displacement_at_node(self, number: int) -> Displacement | None:
+        """Returns the displacement from the last node to this one and restarts the integration here.
+
+        Args:
+            number: of this node.
+
+        Returns:
+            None if a reading was missing.
+        """
+        node, self._node, state = self._node, number, self.state
+        complete = state.complete[0]
+        displacement = Displacement(node, state.displacement_m.copy(), _displacement_cov(state)) if complete else None
+        _restart(state)
+        return displacement
 
 
 @njit(cache=True, nogil=True)
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Way (3,) of the body's origin in the earlier body for a motion of the camera, and its derivative (3, 6) by it."""
+    """Computes the displacement of the body's origin for a motion of the camera.
+
+    Args:
+        a_from_b: (4, 4) motion of the camera.
+        body_from_camera: (4, 4) mount.
+
+    Returns:
+        Displacement (3,) [m] in the axes of the earlier body, and its Jacobian (3, 6) by an increment of the motion.
+    """
     camera_from_body = geometry.inverse(body_from_camera)
-    turn = geometry.compose(body_from_camera, a_from_b)
+    body_a_from_b = geometry.compose(body_from_camera, a_from_b)
     lever, by_motion = geometry.skew(camera_from_body[:3, 3]), np.zeros((3, 6))
     for i in range(3):
         for k in range(3):
-            by_motion[i, 3 + k] = turn[i, k]
+            by_motion[i, 3 + k] = body_a_from_b[i, k]
             for m in range(3):
-                by_motion[i, k] -= turn[i, m] * lever[m, k]
-    return geometry.compose(turn, camera_from_body)[:3, 3].copy(), by_motion
+                by_motion[i, k] -= body_a_from_b[i, m] * lever[m, k]
+    return geometry.compose(body_a_from_b, camera_from_body)[:3, 3].copy(), by_motion
 
 
 @njit(cache=True, nogil=True)
-def logged(way, beams, a_from_b, cov, velocity):
-    """The camera's motion (4, 4) of a frame, with covariance (6, 6), and what the log says of it fused in.
+def fuse_dvl(state, model, a_from_b, cov, velocity):
+    """Fuses a frame's visual motion with the DVL and adds the frame to the integration.
 
     Args:
-        way: since the last node, which goes on.
-        a_from_b, cov: by vision; unchanged without two readings.
-        velocity: (3,) reading at the frame's end, in the body; NaN: none.
+        state: `DvlState`, updated.
+        model: `DvlModel`.
+        a_from_b, cov: (4, 4), (6, 6) visual motion of the camera.
+        velocity: (3,) reading at the end of the frame, in the body [m/s]; NaN: none.
+
+    Returns:
+        The motion (4, 4) and its covariance (6, 6); the visual ones unless there are readings at both ends.
     """
-    last = way.velocity.copy()
-    geometry.put(way.velocity, velocity)
+    last = state.velocity.copy()
+    geometry.put(state.velocity, velocity)
     if np.isnan(last[0]) or np.isnan(velocity[0]):
-        way.whole[0] = False
+        state.complete[0] = False
         return a_from_b, cov
-    turned, step = _of_body(a_from_b, beams.body_from_camera), np.empty(3)
+    rotation, step = _body_motion(a_from_b, model.body_from_camera), np.empty(3)
     for i in range(3):
-        now = turned[i, 0] * velocity[0] + turned[i, 1] * velocity[1] + turned[i, 2] * velocity[2]
-        step[i] = (last[i] + now) / 2 * beams.step_s
-    fused, fused_cov = fuse(a_from_b, cov, step, _step_cov(way, beams, step), beams.body_from_camera)
-    _sum(way, beams, step, fused, fused_cov)
+        now = rotation[i, 0] * velocity[0] + rotation[i, 1] * velocity[1] + rotation[i, 2] * velocity[2]
+        step[i] = (last[i] + now) / 2 * model.step_s
+    fused, fused_cov = fuse_displacement(a_from_b, cov, step, _step_cov(state, model, step), model.body_from_camera)
+    _accumulate(state, model, step, fused, fused_cov)
     return fused, fused_cov
 
 
 @njit(cache=True, nogil=True)
-def _of_body(a_from_b, body_from_camera):
-    """The motion (4, 4) of the body for one of the camera."""
+def _body_motion(a_from_b, body_from_camera):
+    """Returns the motion (4, 4) of the body for a motion of the camera."""
     return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
 
 
 @njit(cache=True, nogil=True)
 def _length(step):
+    """Returns the length of a vector (3,)."""
     return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
 @njit(cache=True, nogil=True)
-def _step_cov(way, beams, step):
-    """Covariance of a frame's displacement. The scale error adds up along the path L since the node: the frames'
-    shares s^2 ((L + l)^2 - L^2) have the sum s^2 L^2."""
+def _step_cov(state, model, step):
+    """Computes the covariance (3, 3) of a frame's displacement of length l.
+
+    The scale error s accumulates along the path L since the node: the frames' shares s^2 ((L + l)^2 - L^2) sum to the
+    variance s^2 L^2.
+    """
     length = max(_length(step), 1e-12)
-    grown, cov = (2 * way.path_m[0] + length) / length, np.empty((3, 3))
+    growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
     for i in range(3):
         for k in range(3):
-            cov[i, k] = beams.scale2 * grown * step[i] * step[k] + (beams.white_m2 if i == k else 0.0)
+            cov[i, k] = model.scale_variance * growth * step[i] * step[k] + (model.white_m2 if i == k else 0.0)
     return cov
 
 
 @njit(cache=True, nogil=True)
-def _sum(way, beams, step, a_from_b, cov):
-    """Adds a frame to the displacement since the node."""
-    way.path_m[0] += _length(step)
-    for i in range(3):
-        way.metres[i] += way.turn[i, 0] * step[0] + way.turn[i, 1] * step[1] + way.turn[i, 2] * step[2]
-        way.cov[i, i] += beams.white_m2
-    geometry.put(way.turn, geometry.product(way.turn, _of_body(a_from_b, beams.body_from_camera)[:3, :3]))
-    to_node = geometry.product(way.turn, beams.body_from_camera[:3, :3])
-    grown = geometry.product(geometry.product(to_node, cov[:3, :3]), to_node.T)
-    geometry.put(way.turn_cov, way.turn_cov + grown)
-
-
-@njit(cache=True, nogil=True)
-def _walked_cov(way):
-    lever = geometry.skew(way.metres)  # the attitude's error at the end bounds the one on the way
-    return way.cov + geometry.product(geometry.product(lever, way.turn_cov), lever.T)
-
-
-@njit(cache=True, nogil=True)
-def _start(way):
-    """Starts anew at a node; the last reading is kept."""
-    geometry.put(way.turn, np.eye(3))
-    way.turn_cov[:], way.metres[:], way.cov[:], way.path_m[:], way.whole[:] = 0.0, 0.0, 0.0, 0.0, True
-
-
-@njit(cache=True, nogil=True)
-def fuse(a_from_b, cov, step, step_cov, body_from_camera):
-    """Kalman update of a camera's motion by a measured displacement of the body's origin.
+def _accumulate(state, model, step, a_from_b, cov):
+    """Adds a frame to the integration since the node.
 
     Args:
-        a_from_b, cov: (4, 4), (6, 6).
-        step, step_cov: (3,), (3, 3) in the body before the motion [m].
+        step: (3,) displacement in the body before the frame [m].
+        a_from_b, cov: (4, 4), (6, 6) motion of the camera.
+    """
+    state.path_m[0] += _length(step)
+    node_from_body = state.node_from_body
+    for i in range(3):
+        state.displacement_m[i] += (
+            node_from_body[i, 0] * step[0] + node_from_body[i, 1] * step[1] + node_from_body[i, 2] * step[2]
+        )
+        state.cov[i, i] += model.white_m2
+    rotation = _body_motion(a_from_b, model.body_from_camera)[:3, :3]
+    geometry.put(node_from_body, geometry.product(node_from_body, rotation))
+    node_from_camera = geometry.product(node_from_body, model.body_from_camera[:3, :3])
+    added = geometry.product(geometry.product(node_from_camera, cov[:3, :3]), node_from_camera.T)
+    geometry.put(state.rotation_cov, state.rotation_cov + added)
+
+
+@njit(cache=True, nogil=True)
+def _displacement_cov(state):
+    """Returns the covariance (3, 3) of the displacement since the node by white noise and attitude error."""
+    lever = geometry.skew(state.displacement_m)  # conservative: the attitude error at the end applies to the whole path
+    return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
+
+
+@njit(cache=True, nogil=True)
+def _restart(state):
+    """Resets the integration at a node; the last reading is kept."""
+    geometry.put(state.node_from_body, np.eye(3))
+    state.rotation_cov[:], state.displacement_m[:], state.cov[:], state.path_m[:] = 0.0, 0.0, 0.0, 0.0
+    state.complete[:] = True
+
+
+@njit(cache=True, nogil=True)
+def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera):
+    """Kalman update of a camera motion by a measured displacement of the body's origin.
+
+    Args:
+        a_from_b, cov: (4, 4), (6, 6) motion of the camera.
+        step, step_cov: (3,), (3, 3) displacement in the body before the motion [m].
+        body_from_camera: (4, 4) mount.
+
+    Returns:
+        Updated motion and covariance.
     """
     expected, by_motion = body_displacement(a_from_b, body_from_camera)
-    return updated(a_from_b, cov, step - expected, by_motion, step_cov)
+    return kalman_update(a_from_b, cov, step - expected, by_motion, step_cov)

@@ -1,4 +1,7 @@
-"""The online position: frame-to-frame motion predicts, registration with the mosaic and navigation sensors correct."""
+"""Extended Kalman filter of the online pose.
+
+Frame-to-frame motion predicts; registration with the mosaic (F2M) and the navigation sensors correct.
+"""
 
 from __future__ import annotations
 
@@ -11,117 +14,152 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings, SensorNoise, StereoRig
 
-_GATE = 30.0  # chi2 beyond which a 6-DOF correction contradicts the prediction
+_GATE = 30.0  # chi2 of a 6-DOF correction above which it is rejected as an outlier
 
 
 class PoseFilter:
-    """Extended Kalman filter of one pose; the error is a motion [w, t] in the camera, applied on the right."""
+    """Extended Kalman filter of one pose.
+
+    Errors are motions [rotation, translation] (rad, m) in the camera, pose @ exp(error).
+    """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
         self.world_from_camera = world_from_camera
         self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
         self.rig, self.noise = rig, noise
-        self.level = Level(geometry.inverse(rig.body_from_camera), noise.pressure_m**2, _sigmas(noise))
+        camera_from_body = geometry.inverse(rig.body_from_camera)
+        self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
 
-    def correct_pose(self, measured: Array, cov: Array, since: Array) -> Array | None:
-        """Fuses a pose measured against something laid earlier.
+    def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
+        """Fuses a pose measured relative to an earlier one, such as a registration with the mosaic.
 
-        What had been laid errs by what the position had erred by until then, so the measurement tells of the motion
-        since only: the gain is S (S + R)^-1, and the covariance falls by the gain times S, which is less than by an
-        absolute position (Schmidt's consider filter, with the past position considered).
+        The mosaic contains the pose error at the time when it was recorded, so the measurement constrains only the
+        motion since then. With S the covariance of that motion, the gain is S (S + R)^-1 and the covariance decreases
+        by the gain times S, which is less than for an absolute pose (Schmidt's consider filter, where the earlier pose
+        is a consider parameter).
 
         Args:
-            measured: (4, 4).
-            cov: R, (6, 6) of the measurement.
-            since: (6, 6) of the motion since; taken for S as far as the position knows no less.
+            measured: (4, 4) measured world_from_camera.
+            cov: R, (6, 6) covariance of the measurement.
+            motion_cov: (6, 6) covariance of the motion since the reference was recorded. S is this matrix, limited to
+                the covariance of the pose.
 
         Returns:
-            (6, 6) by how much the covariance fell; None where the measurement contradicts the prediction beyond both
-            uncertainties and is refused.
+            (6, 6) decrease of the covariance; None if the measurement was rejected as an outlier.
         """
-        chi2, pose, learnt = _corrected(self.world_from_camera, self.cov, measured, cov, since)
+        chi2, pose, decrease = _correct(self.world_from_camera, self.cov, measured, cov, motion_cov)
         if chi2 > _GATE:
             return None
-        self.reset(pose, self.cov - learnt)
-        return learnt
+        self.reset(pose, self.cov - decrease)
+        return decrease
 
-    def fix(self, readings: Readings) -> None:
-        """Fuses what tells the position at keyframes: an acoustic fix, beacons in view."""
+    def fuse_position_fixes(self, readings: Readings) -> None:
+        """Fuses the readings that constrain the position at keyframes: an acoustic fix and beacons in view."""
         if readings.usbl_m is not None:
             rotation = self.world_from_camera[:3, :3]
             residual = readings.usbl_m - self.world_from_camera[:3, 3]
             self._update(residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
         for sighting in readings.beacons or ():
             beacon = np.array(self.noise.beacons_m[sighting.beacon])
-            predicted, jacobian = sight(self.world_from_camera, beacon, self.rig)
-            if np.isfinite(predicted).all():
-                self._update(np.array(sighting.pixel) - predicted, jacobian, np.eye(2) * self.noise.beacon_px**2)
+            expected, jacobian = project_beacon(self.world_from_camera, beacon, self.rig)
+            if np.isfinite(expected).all():
+                self._update(np.array(sighting.pixel) - expected, jacobian, np.eye(2) * self.noise.beacon_px**2)
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
-        """Takes a pose and covariance from elsewhere: a measured motion, a global alignment."""
-        self.world_from_camera, self.cov = geometry.rigid(world_from_camera), cov
+        """Replaces pose and covariance, for example by those of a global alignment."""
+        self.world_from_camera, self.cov = geometry.nearest_rigid(world_from_camera), cov
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
-        self.world_from_camera, self.cov = updated(self.world_from_camera, self.cov, residual, jacobian, cov)
+        self.world_from_camera, self.cov = kalman_update(self.world_from_camera, self.cov, residual, jacobian, cov)
 
 
-def sight(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Pixel (2,) where a beacon (3,) is to be seen, NaN behind the camera; its derivative (2, 6) by the motion."""
+def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Projects a beacon (3,) into the left image.
+
+    Returns:
+        Pixel (2,), NaN behind the camera, and its Jacobian (2, 6) by an increment of the pose.
+    """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
-    by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * rig.focal_px / depth
+    by_point = np.array([[1, 0, -x / depth], [0, 1, -y / depth]]) * rig.focals_px[:, None] / depth
     return rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
 
-class Level(NamedTuple):
-    """What is believed of the sensors of height and attitude: (4, 4) of the body, variance [m2], deviations (3,)."""
+class PressureAhrsModel(NamedTuple):
+    """Error model of the pressure sensor and the AHRS.
+
+    Args:
+        camera_from_body: (4, 4) inverse of the camera's mount.
+        pressure_m2: variance of the height [m^2].
+        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw.
+    """
 
     camera_from_body: Array
     pressure_m2: float
-    attitude_rad: Array
+    attitude_sigmas_rad: Array
 
 
 @njit(cache=True, nogil=True)
-def aided(world_from_camera, cov, level, height_m, rpy_rad):
-    """Pose and covariance after what the sensors said of height and attitude; NaN: nothing."""
+def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
+    """Fuses readings of height and attitude into a pose.
+
+    Args:
+        world_from_camera, cov: (4, 4), (6, 6).
+        model: `PressureAhrsModel`.
+        height_m, rpy_rad: readings, the attitude (3,); NaN: none.
+
+    Returns:
+        Updated pose and covariance.
+    """
     pose = world_from_camera
     if not np.isnan(height_m):
-        by_pose, off, spread = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
+        by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
         geometry.put(by_pose[0, 3:], pose[2, :3])
-        off[0], spread[0, 0] = height_m - pose[2, 3], level.pressure_m2
-        pose, cov = updated(pose, cov, off, by_pose, spread)
+        residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
+        pose, cov = kalman_update(pose, cov, residual, by_pose, height_cov)
     if not np.isnan(rpy_rad[0]):
-        measured, spread = _attitude(rpy_rad, level.camera_from_body[:3, :3], level.attitude_rad)
-        off = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
-        pose, cov = updated(pose, cov, off, np.eye(3, 6), spread)
+        measured, attitude_cov = _camera_attitude(rpy_rad, model.camera_from_body[:3, :3], model.attitude_sigmas_rad)
+        residual = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
+        pose, cov = kalman_update(pose, cov, residual, np.eye(3, 6), attitude_cov)
     return pose, cov
 
 
 @njit(cache=True, nogil=True)
-def predicted(world_from_camera, cov, a_from_b, motion_cov):
-    """Composes a relative motion with its covariance, eqs. (3) to (5)."""
-    return geometry.compose(world_from_camera, a_from_b), carried(cov, a_from_b) + motion_cov
+def predict(world_from_camera, cov, a_from_b, motion_cov):
+    """Returns the pose and its covariance after a motion with its covariance, eqs. (3) to (5)."""
+    return geometry.compose(world_from_camera, a_from_b), transport_covariance(cov, a_from_b) + motion_cov
 
 
 @njit(cache=True, nogil=True)
-def clipped(cov: Array, other: Array, least: float = 0.0, most: float = np.inf) -> Array:
-    """A covariance (n, n), cut to between `least` and `most` times another, in the axes that both have in common."""
-    root = np.linalg.cholesky(other)
-    inward = np.linalg.inv(root)
-    sizes, axes = np.linalg.eigh(inward @ cov @ inward.T)
+def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
+    """Limits a covariance (n, n) to between `lower` and `upper` times a reference covariance.
+
+    The limits apply to the generalised eigenvalues of the two matrices.
+    """
+    root = np.linalg.cholesky(reference)
+    inverse_root = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(inverse_root @ cov @ inverse_root.T)
     axes = root @ axes
-    return axes * np.minimum(np.maximum(sizes, least), most) @ axes.T
+    return axes * np.minimum(np.maximum(values, lower), upper) @ axes.T
 
 
 @njit(cache=True, nogil=True)
-def carried(cov: Array, a_from_b: Array) -> Array:
-    """The covariance (6, 6) of pose a, in the axes of b that it is carried to."""
+def transport_covariance(cov: Array, a_from_b: Array) -> Array:
+    """Returns the covariance (6, 6) of pose a expressed in the axes of b, which is rigidly attached."""
     return geometry.sandwich(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
 @njit(cache=True, nogil=True)
-def updated(world_from_camera, prior, residual, jacobian, cov):
-    """Pose and covariance after an observation (k,) with its derivative (k, 6) and covariance (k, k); Joseph's form."""
+def kalman_update(world_from_camera, prior, residual, jacobian, cov):
+    """Kalman update of a pose in Joseph's form.
+
+    Args:
+        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) of the observation; k is three at most.
+
+    Returns:
+        Pose (4, 4) and covariance (6, 6) after.
+    """
     gain = _gain(prior, jacobian, cov)
     keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
     for i in range(6):
@@ -136,9 +174,9 @@ def updated(world_from_camera, prior, residual, jacobian, cov):
 
 @njit(cache=True, nogil=True)
 def _gain(prior, jacobian, cov):
-    """P J' (J P J' + R)^-1 (6, k), by elimination: k is three at most."""
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination."""
     size = len(cov)
-    gain, spread = np.zeros((6, size)), cov.copy()
+    gain, innovation_cov = np.zeros((6, size)), cov.copy()
     for m in range(size):
         for i in range(6):
             for k in range(6):
@@ -146,44 +184,44 @@ def _gain(prior, jacobian, cov):
     for m in range(size):
         for n in range(size):
             for i in range(6):
-                spread[m, n] += jacobian[m, i] * gain[i, n]
+                innovation_cov[m, n] += jacobian[m, i] * gain[i, n]
     for m in range(size):
         for n in range(m + 1, size):
-            share = spread[m, n] / spread[m, m]
+            ratio = innovation_cov[m, n] / innovation_cov[m, m]
             for k in range(m, size):
-                spread[k, n] -= share * spread[k, m]
+                innovation_cov[k, n] -= ratio * innovation_cov[k, m]
             for i in range(6):
-                gain[i, n] -= share * gain[i, m]
+                gain[i, n] -= ratio * gain[i, m]
     for m in range(size - 1, -1, -1):
         for i in range(6):
-            gain[i, m] /= spread[m, m]
+            gain[i, m] /= innovation_cov[m, m]
             for n in range(m):
-                gain[i, n] -= spread[m, n] * gain[i, m]
+                gain[i, n] -= innovation_cov[m, n] * gain[i, m]
     return gain
 
 
 @njit(cache=True, nogil=True)
-def _corrected(world_from_camera, prior, measured, cov, since):
-    """How far a measured pose is off (chi2), the pose that it leads to, and by how much the covariance falls."""
-    moved = clipped(since, prior, 0.0, 1.0)
+def _correct(world_from_camera, prior, measured, cov, motion_cov):
+    """Computes the update of `PoseFilter.correct_pose`.
+
+    Returns:
+        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the covariance.
+    """
+    motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)
-    inverse = np.linalg.inv(moved + cov)
-    gain = moved @ inverse
-    return residual @ inverse @ residual, world_from_camera @ geometry.exp(gain @ residual), gain @ moved
+    inverse = np.linalg.inv(motion_cov + cov)
+    gain = motion_cov @ inverse
+    return residual @ inverse @ residual, world_from_camera @ geometry.exp(gain @ residual), gain @ motion_cov
 
 
-def attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
-    """Rotation of the camera in the world by an AHRS reading, with its covariance (3, 3) in the camera."""
-    return _attitude(rpy_rad, camera_from_body[:3, :3], _sigmas(noise))
-
-
-def _sigmas(noise: SensorNoise) -> Array:
-    """Deviations of roll, pitch and yaw (3,) [rad]."""
-    return np.array([noise.attitude_rad, noise.attitude_rad, noise.heading_rad])
+def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading and its covariance (3, 3) in the camera."""
+    return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 
 
 @njit(cache=True, nogil=True)
-def _attitude(rpy, camera_from_body, sigmas):
+def _camera_attitude(rpy, camera_from_body, sigmas):
+    """Compiled kernel of `camera_attitude`."""
     to_camera = np.ascontiguousarray(camera_from_body)
-    spread = to_camera * sigmas
-    return geometry.rotation_from_rpy(rpy[0], rpy[1], rpy[2]) @ to_camera.T, spread @ spread.T
+    root = to_camera * sigmas
+    return geometry.rotation_from_rpy(rpy[0], rpy[1], rpy[2]) @ to_camera.T, root @ root.T

@@ -1,4 +1,4 @@
-"""Dense stereo disparity with its uncertainty (part P12 of the method): a semi-global search, then refinement."""
+"""Dense stereo disparity with its uncertainty: semi-global matching, followed by sub-pixel refinement."""
 
 from __future__ import annotations
 
@@ -14,74 +14,88 @@ from twin.estimate.vision import epipolar
 Gray = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
-#: Block of the semi-global search [px]: 5 finds more than 3 in veiled water; after refinement edges are as sharp.
+#: Block of semi-global matching [px]: 5 matches more pixels than 3 in turbid water; refinement restores sharp edges.
 BLOCK_PX = 5
-#: Surfaces of fewer pixels are mismatches.
+#: Connected regions of fewer pixels are mismatches.
 SPECKLE_PX = 60
-#: Window of the contrast normalisation before the search [share of the image's width]: lamps and veil vary slowly. A
-#: small one (25 px) carries the grey of a near object to what lies beside it, differently in the two cameras.
-WINDOW = 1 / 7
-#: The two cameras' searches agree on a pixel to within this [px]; else one of them does not see it.
-AGREE_PX = 1.0
-#: What refinement cannot know (interpolation, relief inside the window): never claim less than this [px].
-FLOOR_PX = 0.03
-#: Widest search [share of the image's width].
-WIDEST = 0.4
-#: A disparity less certain than this is none [px], were the noise of pixels independent: beyond are mismatches.
-LIMIT_PX = 1.0
+#: Window of the contrast normalisation before matching, as a fraction of the image width. Illumination and backscatter
+#: vary slowly. A small window (25 px) is affected by the brightness of near objects next to a pixel, and differently in
+#: the two cameras.
+NORMALISATION_WINDOW = 1 / 7
+#: Largest difference between the left-to-right and the right-to-left disparity [px]; beyond, the pixel is occluded.
+CONSISTENCY_PX = 1.0
+#: Error that refinement does not model (interpolation, relief inside the window): a lower bound of sigma [px].
+MIN_SIGMA_PX = 0.03
+#: Largest disparity that is searched, as a fraction of the image width.
+MAX_DISPARITY_FRACTION = 0.4
+#: Largest standard deviation of a valid disparity, if the noise of pixels were independent [px]; beyond are mismatches.
+MAX_SIGMA_PX = 1.0
 
 
 class Disparity(NamedTuple):
-    """Disparity (H, W) float32 [px] and its standard deviation (H, W) float32 [px]; NaN where there is none."""
+    """Disparity (H, W) float32 [px] and its standard deviation (H, W) float32 [px]; NaN where unknown."""
 
     disparity_px: Map
     sigma_px: Map
 
-    def surer_than(self, sigma_px: float) -> Disparity:
-        """The same without what is less certain."""
-        sure = self.sigma_px < sigma_px
-        nothing = np.float32(np.nan)
-        return Disparity(np.where(sure, self.disparity_px, nothing), np.where(sure, self.sigma_px, nothing))
+    def with_sigma_below(self, sigma_px: float) -> Disparity:
+        """Returns the disparity with pixels of a larger standard deviation set to NaN."""
+        accepted = self.sigma_px < sigma_px
+        unknown = np.float32(np.nan)
+        return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
 
 
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
-    """Disparity of every left pixel that both cameras see.
+    """Computes the disparity of every pixel of the left image that is visible in both images.
 
-    Semi-global matching (Hirschmueller 2008, three-way) finds it to a pixel, on locally normalised contrast, once from
-    each eye: what the two do not agree on is half-occluded or a mismatch. Its sub-pixel part locks to whole pixels
-    (bias 0.02 px, spread 0.17 px on a rendered reef), so `epipolar.refine` replaces it (bias 0.002 px, spread 0.06 px).
-    Sigma is that of the refinement as a measurement of its own, so that it grows where texture fades into noise.
+    Semi-global matching (Hirschmueller 2008, three-way), on locally normalised contrast, finds the disparity to a
+    pixel, with a left-right consistency check against occlusions and mismatches. Its sub-pixel interpolation is biased
+    towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef), so `epipolar.refine` replaces it
+    (bias 0.002 px, standard deviation 0.06 px). Sigma is that of the refinement as an independent measurement, so it
+    increases where texture is weak compared with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
         max_disparity_px: largest disparity searched.
     """
-    coarse = search_both(_flattened(left), _flattened(right), max_disparity_px)
+    coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
-    sigma = np.hypot(fine.own_sigma_px, np.float32(FLOOR_PX))
-    return Disparity(fine.disparity_px, sigma).surer_than(LIMIT_PX * fine.shared**0.5)
+    sigma = np.hypot(fine.measurement_sigma_px, np.float32(MIN_SIGMA_PX))
+    return Disparity(fine.disparity_px, sigma).with_sigma_below(MAX_SIGMA_PX * fine.variance_inflation**0.5)
 
 
-class Reach:
-    """How far to search: up to the largest disparity of the last pair and a margin (P12), wide at first or if fixed."""
+class SearchRange:
+    """Range of the disparity search, adapted to the largest disparity of the last pair.
+
+    Args:
+        rig: calibration at the scale of the images.
+        fixed_px: fixed largest disparity; None to adapt it, starting from a wide range.
+
+    Attributes:
+        max_disparity_px: largest disparity to search.
+    """
 
     def __init__(self, rig: StereoRig, fixed_px: int | None = None):
         self._fixed = fixed_px is not None
-        self._widest = fixed_px or int(WIDEST * rig.width_px)
-        self.max_disparity_px = self._widest
+        self._widest_px = fixed_px or int(MAX_DISPARITY_FRACTION * rig.width_px)
+        self.max_disparity_px = self._widest_px
 
-    def see(self, disparity_px: Map) -> None:
-        """Adapts to the pair just matched; a pair without any disparity widens the search again."""
+    def update(self, disparity_px: Map) -> None:
+        """Adapts the range to the disparities (H, W) of the last pair; widens it again if there are too few."""
         known = disparity_px[np.isfinite(disparity_px)]
         if not self._fixed:
-            wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest
-            self.max_disparity_px = min(int(wanted), self._widest)
+            wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px
+            self.max_disparity_px = min(int(wanted), self._widest_px)
 
 
 def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Semi-global disparity (H, W) [px] of images of even contrast, NaN where none is: good to a fifth of a pixel.
+    """Computes the disparity (H, W) [px] by semi-global matching, to about 0.2 px; NaN where unknown.
 
-    Padded on the left, so that the margin is only as wide as each pixel's own disparity.
+    Images are padded on the left, so that the margin without disparity is not wider than a pixel's own disparity.
+
+    Args:
+        left, right: (H, W) uint8 rectified images with normalised contrast.
+        max_disparity_px: largest disparity searched.
     """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(
@@ -103,23 +117,26 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
     return disparity.astype(np.float32)
 
 
-def search_both(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """`search` of the left image, kept where that of the right one sees the same."""
-    found = search(left, right, max_disparity_px)
+def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
+    """Computes the disparity as `search` does, and keeps only pixels that pass the left-right consistency check."""
+    disparity = search(left, right, max_disparity_px)
     mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
-    v, u = np.nonzero(np.isfinite(found))
-    forth = found[v, u]
-    # seen from the right, the pixel lies at u - d: at width - 1 - (u - d) of the mirrored image
-    back = mirrored[v, np.minimum(left.shape[1] - 1 - u + np.rint(forth).astype(np.int64), left.shape[1] - 1)]
-    agreed = np.full_like(found, np.nan)
-    agreed[v, u] = np.where(np.abs(back - forth) <= AGREE_PX, forth, np.nan)
-    return agreed
+    v, u = np.nonzero(np.isfinite(disparity))
+    forward = disparity[v, u]
+    # the right image shows the pixel at column u - d, which is width - 1 - (u - d) in the mirrored image
+    backward = mirrored[v, np.minimum(left.shape[1] - 1 - u + np.rint(forward).astype(np.int64), left.shape[1] - 1)]
+    consistent = np.full_like(disparity, np.nan)
+    consistent[v, u] = np.where(np.abs(backward - forward) <= CONSISTENCY_PX, forward, np.nan)
+    return consistent
 
 
-def _flattened(image: Gray) -> Gray:
-    """Local contrast normalised, so that lamps and veil do not steer the search; less so where noise prevails."""
-    window = (2 * int(image.shape[1] * WINDOW / 2) + 1,) * 2
-    deviation = image.astype(np.float32)
-    deviation -= cv2.boxFilter(deviation, -1, window)
-    variance = cv2.boxFilter(deviation * deviation, -1, window)
-    return np.clip(128 + 30 * deviation / np.sqrt(variance + 200), 0, 255).astype(np.uint8)
+def _normalise_contrast(image: Gray) -> Gray:
+    """Normalises local mean and contrast of an image, so that illumination and backscatter do not affect matching.
+
+    Areas with little contrast are amplified less, because they are mostly noise.
+    """
+    window = (2 * int(image.shape[1] * NORMALISATION_WINDOW / 2) + 1,) * 2
+    centred = image.astype(np.float32)
+    centred -= cv2.boxFilter(centred, -1, window)
+    variance = cv2.boxFilter(centred * centred, -1, window)
+    return np.clip(128 + 30 * centred / np.sqrt(variance + 200), 0, 255).astype(np.uint8)

@@ -1,7 +1,7 @@
-"""Sub-pixel depth from two views: dense Lucas-Kanade along the epipolar lines, one kernel for stereo and for motion.
+"""Sub-pixel disparity from two views: dense Lucas-Kanade along the epipolar lines, for stereo and for motion.
 
-Depth is expressed as disparity of the stereo pair, d = f b / Z [px]: the exact two-view equations are linear in it, and
-the plane that a surface patch is at first order stays a plane, d = c + a u + b v.
+Depth is expressed as disparity of the stereo pair, d = f b / Z [px]. The two-view equations are linear in it, and a
+plane in space is a plane in disparity, d = c + a u + b v.
 """
 
 from __future__ import annotations
@@ -13,30 +13,33 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from twin.core.interpolation import bicubic_with_gradient
+
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Stands for "no disparity" inside the kernels; so far off that no neighbour counts it as support.
-NOTHING = np.float32(-1e4)
-#: Neighbours support a pixel while their disparities differ by less than this [px]: beyond it lies another surface.
+#: Marks unknown disparity inside the kernels; so far from any other that the pixel never supports its neighbours.
+UNKNOWN_PX = np.float32(-1e4)
+#: Neighbours support a pixel if their disparities differ by less than this [px]; beyond, they are on another surface.
 SUPPORT_PX = 1.2
-#: Prior of the correction and of the plane's slope [px, px/px]: decides only where there is no texture.
+#: Standard deviation of the prior of the correction and of the plane's slope [px, px/px]; effective without texture
+#: only.
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
-#: Taper of the window (standard deviation) in calm images and at most [px]; the median sigma that counts as calm [px].
-SPREAD_PX, MAX_SPREAD_PX, CALM_SIGMA_PX = 1.5, 2.5, 0.08
-#: Window in which brightness and contrast of the two images are made equal [px of images at half size].
+#: Taper of the window (standard deviation) at low noise and at most [px]; median sigma that counts as low noise [px].
+TAPER_PX, MAX_TAPER_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
+#: Window in which brightness and contrast of the two images are equalised [px of images at half size].
 BALANCE_PX = 13
-#: Windows that correlate less are mismatches.
-LEAST_CORRELATION = 0.4
-#: Variance of the difference of two images by rounding to grey levels alone.
-LEAST_NOISE = 1 / 6
-#: Per unit of noise variance: weights of the priors, and what noise adds to the square of a slope.
+#: Windows with a smaller correlation are mismatches.
+MIN_CORRELATION = 0.4
+#: Variance of the difference of two images due to rounding to grey levels alone.
+MIN_NOISE_VARIANCE = 1 / 6
+#: Per unit of noise variance: weights of the two priors, and the contribution of noise to a squared slope.
 _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 
 
 class TwoView(NamedTuple):
-    """Where a pixel of the reference image with disparity d lies in the other image: p = matrix [u, v, 1] + epipole d.
+    """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
 
     Args:
         matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
@@ -48,184 +51,179 @@ class TwoView(NamedTuple):
 
 
 class Refinement(NamedTuple):
-    """Refined disparity (H, W) [px], NaN where it failed, with its uncertainty and the images' noise [grey levels].
+    """Result of `refine`.
 
     Args:
-        sigma_px: (H, W) standard deviation if the start was good to `PRIOR_PX`.
-        gain: (H, W) share of an error of the start that the images corrected: 1 on texture, 0 where there is none.
-        shared: by how much the noise of a window varies more than if pixels were independent; `sigma_px` is without.
+        disparity_px: (H, W) refined disparity [px]; NaN where it failed.
+        sigma_px: (H, W) standard deviation if the error of the initial disparity is `PRIOR_PX` [px].
+        gain: (H, W) fraction of an error of the initial disparity that the images correct: 1 on texture, 0 without.
+        noise: standard deviation of the image noise in the difference of both images [grey levels].
+        variance_inflation: factor on the variance due to noise that neighbouring pixels share; not included in
+            `sigma_px`.
     """
 
     disparity_px: Map
     sigma_px: Map
     gain: Map
     noise: float
-    shared: float
+    variance_inflation: float
 
     @property
-    def own_sigma_px(self) -> Map:
-        """(H, W) standard deviation as a measurement of its own, whatever the start was; infinite without texture."""
-        return _own_sigma(self.sigma_px, self.gain) * np.float32(self.shared**0.5)
+    def measurement_sigma_px(self) -> Map:
+        """Standard deviation (H, W) as a measurement independent of the initial disparity; infinite without texture."""
+        return _measurement_sigma(self.sigma_px, self.gain) * np.float32(self.variance_inflation**0.5)
 
 
 STEREO = TwoView(np.eye(3), np.array([-1.0, 0.0, 0.0]))
 
 
 def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> TwoView:
-    """The two-view equations of a relative pose (4, 4) for cameras K = matrix (3, 3)."""
+    """Returns the two-view geometry of a relative pose.
+
+    Args:
+        other_from_reference: (4, 4) pose of the reference camera in the other one.
+        matrix: (3, 3) camera matrix K of both cameras [px].
+        baseline_m: baseline of the stereo pair, which defines disparity.
+    """
     focal_baseline = matrix[0, 0] * baseline_m
     rotation, translation = other_from_reference[:3, :3], other_from_reference[:3, 3]
     return TwoView(matrix @ rotation @ np.linalg.inv(matrix), matrix @ translation / focal_baseline)
 
 
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
-    """Moves each disparity to where the other image matches best, by least squares over a Gaussian window.
+    """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
-    With the other image O warped by the current disparities d, a pixel says  e = d_true - d = (I - O) / (dO/dd). A
-    plane through the d + e of a window, weighted with (dO/dd)^2 and the window's taper, gives the disparity at its
-    centre: unbiased on slopes, free of the pixel-locking of the integer search; neighbours on another surface do not
-    count. Brightness and contrast of O are first balanced locally: veil and lamps look different from another place.
-    The variance is the least-squares one for the noise found in the residuals nearby (dark and even parts of an image
-    have less), raised where a window's own residuals are larger. Where noise is strong, the last window grows. Slopes
-    that noise alone could make count as none. `own_sigma_px` is the error's within 15 % in clear water; where noise is
-    a fifth and a half of the contrast, errors (mismatches and all) are 1.3 and 1.7 times that.
+    With the other image O warped by the current disparities d, each pixel measures e = d_true - d = (I - O) / (dO/dd).
+    A plane is fitted to the d + e of a window, weighted by (dO/dd)^2 and the taper of the window; its value at the
+    centre is the refined disparity. It is unbiased on slopes and not biased towards whole pixels; neighbours on another
+    surface are excluded. Brightness and contrast of O are first equalised locally, because backscatter and illumination
+    change with the viewpoint.
+
+    The variance is that of least squares with the noise of nearby residuals (dark and uniform parts have less), or of
+    the window's own residuals if they are larger. With strong noise, the window of the last iteration is larger. Slopes
+    that noise alone can cause do not count as texture. `measurement_sigma_px` agrees with the error to 15 % in clear
+    water; where noise is a fifth and a half of the contrast, the error (mismatches included) is 1.3 and 1.7 times
+    sigma.
 
     Args:
         reference, other: (H, W) float32 grey images.
-        disparity_px: (H, W) float32, NaN where unknown.
-        view: where the other image sees a disparity.
+        disparity_px: (H, W) float32 initial disparity, NaN where unknown.
+        view: two-view geometry of the images.
+        iterations: number of iterations.
     """
-    fitted = np.where(np.isfinite(disparity_px), disparity_px, NOTHING).astype(np.float32)
-    sigma, gain, excess, noise_variance, shared, spread_px = fitted, fitted, fitted, 1.0, 1.0, SPREAD_PX
+    fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
+    sigma, gain, mean_square, noise_variance, inflation, taper_px = fitted, fitted, fitted, 1.0, 1.0, TAPER_PX
     for _ in range(iterations):
-        residual, slope, seen = _balanced_warp(reference, other, fitted, view)
-        fitted = np.where(seen, fitted, NOTHING)
-        noise_variance = _noise_variance(residual, seen)
-        noise = _local_noise(residual, seen, noise_variance)
-        fit = _fit_planes(fitted, residual, slope, noise, _taper(spread_px), np.float32(SUPPORT_PX), _PRIORS)
-        shared = _shared(np.asarray(residual - slope * (fit[0] - fitted), np.float32), seen, noise_variance)
-        fitted, weight, gain, excess = fit
-        sigma = np.sqrt(weight * np.maximum(excess, noise))
-        spread_px = _spread(_own_sigma(sigma, gain), fitted, spread_px)
-    known = (fitted > NOTHING) & (excess < 2 * (1 - LEAST_CORRELATION) * _contrast(reference))
+        residual, slope, visible = _balanced_warp(reference, other, fitted, view)
+        fitted = np.where(visible, fitted, UNKNOWN_PX)
+        noise_variance = _noise_variance(residual, visible)
+        noise = _local_noise(residual, visible, noise_variance)
+        fit = _fit_planes(fitted, residual, slope, noise, _taper(taper_px), np.float32(SUPPORT_PX), _PRIORS)
+        remaining = np.asarray(residual - slope * (fit[0] - fitted), np.float32)
+        inflation = _variance_inflation(remaining, visible, noise_variance)
+        fitted, unit_variance, gain, mean_square = fit
+        sigma = np.sqrt(unit_variance * np.maximum(mean_square, noise))
+        taper_px = _choose_taper(_measurement_sigma(sigma, gain), fitted, taper_px)
+    known = (fitted > UNKNOWN_PX) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
     return Refinement(
         np.where(known, fitted, np.nan).astype(np.float32),
         np.where(known, sigma, np.nan).astype(np.float32),
         np.where(known, gain, np.nan).astype(np.float32),
         float(noise_variance**0.5),
-        shared,
+        inflation,
     )
 
 
-def _own_sigma(sigma: Map, gain: Map) -> Map:
+def _measurement_sigma(sigma: Map, gain: Map) -> Map:
+    """Returns the standard deviation (H, W) without the contribution of the prior."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
-def _spread(sigma: Map, fitted: Map, spread_px: float) -> float:
-    """The window that the noise calls for: larger where the median uncertainty is above `CALM_SIGMA_PX`."""
-    typical = sigma[::4, ::4][fitted[::4, ::4] > NOTHING]
+def _choose_taper(sigma: Map, fitted: Map, taper_px: float) -> float:
+    """Returns the taper of the next window: larger if the median sigma is above `LOW_NOISE_SIGMA_PX`."""
+    typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
-        return spread_px
-    return float(np.clip(SPREAD_PX * np.sqrt(np.median(typical) / CALM_SIGMA_PX), SPREAD_PX, MAX_SPREAD_PX))
+        return taper_px
+    return float(np.clip(TAPER_PX * np.sqrt(np.median(typical) / LOW_NOISE_SIGMA_PX), TAPER_PX, MAX_TAPER_PX))
 
 
 def _contrast(image: Map) -> Map:
-    """Local variance of an image, over a window like that of the fit."""
+    """Returns the local variance (H, W) of an image, over a window similar to that of the fit."""
     mean = cv2.boxFilter(image, -1, (7, 7))
     return np.maximum(cv2.boxFilter(image * image, -1, (7, 7)) - mean * mean, 0)
 
 
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Mask]:
-    """Residual I - O, slope dO/dd and which pixels O reaches; local mean and deviation of the warped O are made I's."""
+    """Warps the other image O to the reference I and equalises its local mean and standard deviation.
+
+    Returns:
+        Residual I - O, slope dO/dd and which pixels are visible in O, each (H, W).
+    """
     warped, slope = np.zeros_like(reference), np.zeros_like(reference)
-    reached = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
-    seen = reached.astype(np.float32)
+    visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
+    weight = visible.astype(np.float32)
     gain, offset = (
         cv2.resize(layer, reference.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        for layer in _balance(reference[::2, ::2], warped[::2, ::2], seen[::2, ::2])
+        for layer in _balance(reference[::2, ::2], warped[::2, ::2], weight[::2, ::2])
     )
-    return np.asarray((reference - gain * warped - offset) * seen, np.float32), slope, reached
+    return np.asarray((reference - gain * warped - offset) * weight, np.float32), slope, visible
 
 
-def _balance(image: Map, other: Map, seen: Map) -> tuple[Map, Map]:
-    """Gain and offset that give `other` the local mean and deviation of `image`; at half size, they vary slowly."""
-    count = _mean(seen) + 1e-3
-    mean_i, mean_o = _mean(image * seen) / count, _mean(other * seen) / count
-    power_i, power_o = _mean(image * image * seen) / count, _mean(other * other * seen) / count
-    floor = 4.0  # grey levels squared: no texture, no balancing
+def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
+    """Returns the gain and offset (H, W) that give `other` the local mean and standard deviation of `image`."""
+    count = _mean(weight) + 1e-3
+    mean_i, mean_o = _mean(image * weight) / count, _mean(other * weight) / count
+    power_i, power_o = _mean(image * image * weight) / count, _mean(other * other * weight) / count
+    floor = 4.0  # grey levels squared: keeps the gain near 1 without texture
     gain = np.sqrt((np.maximum(power_i - mean_i**2, 0) + floor) / (np.maximum(power_o - mean_o**2, 0) + floor))
     return gain.astype(np.float32), (mean_i - gain * mean_o).astype(np.float32)
 
 
 def _mean(image: Map) -> Map:
+    """Returns the local mean (H, W) of an image over the balance window."""
     return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 
-def _taper(spread_px: float) -> Map:
-    half = int(np.ceil(2 * spread_px))
-    return np.exp(-0.5 * (np.arange(-half, half + 1) / spread_px) ** 2).astype(np.float32)
+def _taper(taper_px: float) -> Map:
+    """Returns the weights of a Gaussian window along one axis; `taper_px` is its standard deviation."""
+    half = int(np.ceil(2 * taper_px))
+    return np.exp(-0.5 * (np.arange(-half, half + 1) / taper_px) ** 2).astype(np.float32)
 
 
-def _noise_variance(residual: Map, seen: Mask) -> float:
-    """Variance of the residuals, robustly (normal consistent), never below that of rounding to grey levels."""
-    sample = np.abs(residual[::2, ::2][seen[::2, ::2]])
+def _noise_variance(residual: Map, visible: Mask) -> float:
+    """Returns a robust variance of the residuals (MAD), never below that of rounding to grey levels."""
+    sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
         return 1.0
-    return max(float(1.4826 * np.median(sample)) ** 2, LEAST_NOISE)
+    return max(float(1.4826 * np.median(sample)) ** 2, MIN_NOISE_VARIANCE)
 
 
-def _shared(left: Map, seen: Mask, variance: float) -> float:
-    """By how much neighbours that share their noise make that of a window vary more, by what the fit left of it.
+def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
+    """Returns the factor on the variance of a window due to noise that neighbouring pixels share.
 
-    The colours of a Bayer mosaic are interpolated: taken as independent, sigma was 1.6 times too small.
+    It is computed from the autocorrelation of the residuals that remain after the fit. Images behind a Bayer mosaic
+    have interpolated colours: with pixels taken as independent, sigma was 1.6 times too small.
     """
-    noise = np.where(seen, np.clip(left, -3 * variance**0.5, 3 * variance**0.5), 0)
+    noise = np.where(visible, np.clip(remaining, -3 * variance**0.5, 3 * variance**0.5), 0)
     power = float(np.mean(noise * noise)) + 1e-6
     along, across = (float(np.mean(a * b)) / power for a, b in ((noise[:, 1:], noise[:, :-1]), (noise[1:], noise[:-1])))
     return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
 
 
-def _local_noise(residual: Map, seen: Mask, most: float) -> Map:
-    """(H, W) variance of the residuals around each pixel, at most that of the image: dark and even parts have less."""
-    count = _mean(seen.astype(np.float32)) + 1e-3
-    return np.clip(_mean(residual * residual) / count, LEAST_NOISE, most).astype(np.float32)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _cubic(a, b, c, e, t):
-    """Catmull-Rom value and derivative at t between b and c."""
-    c1 = 0.5 * (c - a)
-    c2 = a - 2.5 * b + 2 * c - 0.5 * e
-    c3 = 0.5 * (e - a) + 1.5 * (b - c)
-    return b + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _sample(image, x, y):
-    """Bicubic value and gradient of an image at (x, y) inside it; beyond its border it goes on as at the border."""
-    height, width = image.shape
-    i, j = int(x), int(y)
-    s, t = np.float32(x - i), np.float32(y - j)
-    i0, i2, i3 = max(i - 1, 0), min(i + 1, width - 1), min(i + 2, width - 1)
-    j0, j2, j3 = max(j - 1, 0), min(j + 1, height - 1), min(j + 2, height - 1)
-    b, gb = _cubic(image[j, i0], image[j, i], image[j, i2], image[j, i3], s)
-    if t == 0:  # stereo: the same row
-        return b, gb, np.float32(0.5) * (image[j2, i] - image[j0, i])
-    a, ga = _cubic(image[j0, i0], image[j0, i], image[j0, i2], image[j0, i3], s)
-    c, gc = _cubic(image[j2, i0], image[j2, i], image[j2, i2], image[j2, i3], s)
-    e, ge = _cubic(image[j3, i0], image[j3, i], image[j3, i2], image[j3, i3], s)
-    value, gy = _cubic(a, b, c, e, t)
-    return value, _cubic(ga, gb, gc, ge, t)[0], gy
+def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
+    """Returns the variance (H, W) of the residuals around each pixel, at most that of the whole image."""
+    count = _mean(visible.astype(np.float32)) + 1e-3
+    return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
 def _warp(reference, other, disparity, matrix, epipole, warped, slope):
-    """Fills in the other image O warped to the reference and its slope dO/dd; returns which pixels it reaches.
+    """Writes the other image O, warped to the reference, and its slope dO/dd; returns which pixels are visible in O.
 
-    The gradient is the mean of both images': with one alone, its noise and the interpolation bias the answer.
+    The gradient is the mean of both images; the gradient of a single image is biased by its noise and by interpolation.
     """
     height, width = reference.shape
-    reached = np.zeros((height, width), np.bool_)
+    visible = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
             d = disparity[v, u]
@@ -239,20 +237,20 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
             x, y = px / pz, py / pz
             if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
                 continue
-            value, gx, gy = _sample(other, x, y)
+            value, gx, gy = bicubic_with_gradient(other, x, y)
             rx = 0.5 * (reference[v, min(u + 1, width - 1)] - reference[v, max(u - 1, 0)])
             ry = 0.5 * (reference[min(v + 1, height - 1), u] - reference[max(v - 1, 0), u])
             gx = 0.5 * (gx + matrix[0, 0] * rx + matrix[0, 1] * ry)
             gy = 0.5 * (gy + matrix[1, 0] * rx + matrix[1, 1] * ry)
             warped[v, u] = value
             slope[v, u] = (gx * (epipole[0] - x * epipole[2]) + gy * (epipole[1] - y * epipole[2])) / pz
-            reached[v, u] = True
-    return reached
+            visible[v, u] = True
+    return visible
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support):
-    """Adds a row of neighbours at offset (i, j) to the normal equations; plain slices, so that it vectorises."""
+    """Adds a row of neighbours at offset (i, j) to the normal equations; written to be vectorised."""
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
     for u in range(centre.size):
@@ -278,26 +276,31 @@ def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support)
 
 @njit(cache=True, nogil=True)
 def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
-    """Disparity of the plane fitted around each pixel, its variance at unit noise, gain, the mean square residual."""
+    """Fits a plane to the disparities around each pixel.
+
+    Returns:
+        Disparity at the centre, its variance at unit noise, gain (see `Refinement`) and mean squared residual, each
+        (H, W).
+    """
     height, width = disparity.shape
     half = taper.size // 2
-    fitted = np.full((height, width), NOTHING, np.float32)
-    weight = np.full((height, width), np.float32(np.inf))
+    fitted = np.full((height, width), UNKNOWN_PX, np.float32)
+    unit_variance = np.full((height, width), np.float32(np.inf))
     gain = np.ones((height, width), np.float32)
-    excess = np.zeros((height, width), np.float32)
+    mean_square = np.zeros((height, width), np.float32)
     sums = np.empty((12, width), np.float32)
     for v in range(height):
         sums[:] = 0
         for j in range(max(-half, -v), min(half, height - 1 - v) + 1):
             for i in range(-half, half + 1):
                 lo, hi = max(0, -i), min(width, width - i)
-                near = slice(lo + i, hi + i)
+                neighbours = slice(lo + i, hi + i)
                 _accumulate(
                     sums[:, lo:hi],
                     disparity[v, lo:hi],
-                    disparity[v + j, near],
-                    residual[v + j, near],
-                    slope[v + j, near],
+                    disparity[v + j, neighbours],
+                    residual[v + j, neighbours],
+                    slope[v + j, neighbours],
                     np.float32(i),
                     np.float32(j),
                     taper[j + half] * taper[i + half],
@@ -314,10 +317,10 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
             step = (c00 * sums[6, u] + c01 * sums[7, u] + c02 * sums[8, u]) / det
             if abs(step) < 1:
                 fitted[v, u] = disparity[v, u] + step
-                # the taper's own loss is sum w^2 / sum w
-                weight[v, u] = c00 / det * (sums[11, u] + p0) / a00
-                # what noise alone adds to the slopes, mean and three deviations, informs of nothing
-                by_noise = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))
-                gain[v, u] = max(sums[0, u] - by_noise, 0.03 * sums[0, u]) / a00
-                excess[v, u] = sums[9, u] / sums[10, u]
-    return fitted, weight, gain, excess
+                # tapering increases the variance by sum w^2 / sum w
+                unit_variance[v, u] = c00 / det * (sums[11, u] + p0) / a00
+                # squared slopes due to noise alone, mean plus three standard deviations, are not texture
+                noise_slopes = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))
+                gain[v, u] = max(sums[0, u] - noise_slopes, 0.03 * sums[0, u]) / a00
+                mean_square[v, u] = sums[9, u] / sums[10, u]
+    return fitted, unit_variance, gain, mean_square

@@ -1,4 +1,4 @@
-"""Frame-to-frame motion at video rate (P5, P6): flow of known points, eq. (1), composed along the path."""
+"""Frame-to-frame motion at video rate (F2F): tracking of the points of the last keyframe, composed along the path."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.estimate.vision import matching, observation_equations, two_view_motion
-from twin.estimate.vision.stereo import StereoPoints, normalised
+from twin.estimate.vision.observation_equations import PairMeasurements
+from twin.estimate.vision.stereo import StereoPoints
 
-MOST_POINTS = 150  # the best ones: keyframes correct what the frames between them drift
-_KEPT = 0.7  # of an anchor's points: where an image shows fewer, patches may have changed as well
-_UNKNOWN = 1.0  # variance of a disparity that a single image does not tell, normalised
+MAX_POINTS = 150  # the strongest; keyframes correct the drift of the frames between them
+_MIN_TRACKED = 0.7  # fraction of the reference points; below it, patches may have changed their appearance too
+_UNKNOWN_VARIANCE = 1.0  # of the disparity, which a single image does not measure, normalised
 
 
-class _Anchor(NamedTuple):
-    """What frames are held against: an image, and its points as `StereoPoints` has them."""
+class _Reference(NamedTuple):
+    """Image that frames are matched with, and its points (see `StereoPoints`)."""
 
     image: matching.Image
     pixels: matching.Points
@@ -26,86 +27,110 @@ class _Anchor(NamedTuple):
     cov: Array
 
     def xyz(self, baseline_m: float) -> Array:
-        """(n, 3) in its camera [m]."""
+        """Returns the points (n, 3) in the reference camera [m]."""
         x, y, disparity = self.measured.T
         return np.column_stack([x, y, np.ones_like(x)]) * (baseline_m / disparity[:, None])
 
 
 class FrameToFrame:
-    """Follows the points of the last keyframe; a frame's motion is the step between two positions against it.
+    """Frame-to-frame motion by tracking the points of the last keyframe.
 
-    Patches are looked for as the keyframe shows them, and the structure is estimated along (`motion.pair_motion`).
-    From one frame to the next, and with the depth taken as exact as eq. (2) has it, the motion over the 15 frames
-    between two keyframes of a survey was biased: by 1.25 mrad of pitch over fine texture, for what the matching of
-    each frame errs by adds up (now 0.1 +- 0.1), and by 4 mrad over coarse texture, whose depth is noisy (now 0.5 +-
-    0.7). It scatters by 0.35 mrad, not by 0.6.
+    Every frame is matched with the last keyframe, and structure is estimated together with motion
+    (`two_view_motion.pair_motion`); the motion between two frames is the difference of their poses in the keyframe.
+    Matching each frame with the previous one and taking depth as exact, as eq. (2) of Negahdaripour & Madjidi (2003)
+    does, biases the motion over the 15 frames between two keyframes, because matching errors add up: 1.25 mrad of pitch
+    over fine texture (now 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is noisy (now 0.5 +- 0.7). The
+    standard deviation of the rotation falls from 0.6 to 0.35 mrad.
 
-    A step that fails keeps the last velocity, says so, and reports a covariance that admits it.
+    If a step fails, the last motion is repeated, with a status and a large covariance.
+
+    Args:
+        rig: calibration at the scale of the images.
+        patch_px: side of the tracking window.
+
+    Attributes:
+        reference: image that frames are matched with; None before the first keyframe.
+        started: false until the first frame.
+        reference_from_current: (4, 4) pose of the last frame in the reference camera.
+        last_motion: (4, 4) motion of the last step.
     """
 
     def __init__(self, rig: StereoRig, patch_px: int):
         self.rig, self.patch_px = rig, patch_px
-        self.anchor: _Anchor | None = None
-        self.begun = False
-        self.anchor_from_now = np.eye(4)
+        self.reference: _Reference | None = None
+        self.started = False
+        self.reference_from_current = np.eye(4)
         self.last_motion = np.eye(4)
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Takes the image of a new keyframe and its points, best first."""
-        best = slice(MOST_POINTS)
-        self._hold(_Anchor(image, points.pixels[best], points.measured[best], points.cov[best]))
+        """Makes a new keyframe the reference, with its strongest points (they are sorted by strength)."""
+        strongest = slice(MAX_POINTS)
+        self._set_reference(
+            _Reference(image, points.pixels[strongest], points.measured[strongest], points.cov[strongest])
+        )
 
     def step(self, image: matching.Image) -> tuple[two_view_motion.Motion, str]:
-        """Motion from the last frame to this one, and "ok" or why it failed.
+        """Estimates the motion from the last frame to this one.
 
-        Its covariance is that of the position against the keyframe. Frames undo each other's errors: over several of
-        them the sum of their covariances is too careful.
+        Args:
+            image: (height, width) normalised frame.
+
+        Returns:
+            The motion, and "ok" or the reason for a failure. The covariance is that of the pose in the reference, so
+            the errors of successive motions cancel partly: the sum of their covariances is an upper bound.
         """
-        if not self.begun:
-            self.begun = True
+        if not self.started:
+            self.started = True
             return two_view_motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
-        before, expected = self.anchor_from_now, self.anchor_from_now @ self.last_motion
-        found = None if self.anchor is None else self._locate(image, self.anchor, expected)
-        if found is None:
-            self.anchor_from_now = expected
-            return coast(self.last_motion)
-        self.last_motion = geometry.inverse(before) @ found.a_from_b
-        return found._replace(a_from_b=self.last_motion), "ok"
+        previous, predicted = self.reference_from_current, self.reference_from_current @ self.last_motion
+        located = None if self.reference is None else self._locate(image, self.reference, predicted)
+        if located is None:
+            self.reference_from_current = predicted
+            return constant_velocity_motion(self.last_motion)
+        self.last_motion = geometry.inverse(previous) @ located.a_from_b
+        return located._replace(a_from_b=self.last_motion), "ok"
 
-    def _hold(self, anchor: _Anchor) -> None:
-        self.anchor, self.anchor_from_now = anchor, np.eye(4)
+    def _set_reference(self, reference: _Reference) -> None:
+        self.reference, self.reference_from_current = reference, np.eye(4)
 
-    def _locate(self, image: matching.Image, anchor: _Anchor, expected: Array) -> two_view_motion.Motion | None:
-        """Position of an image against the anchor, where it is expected at (4, 4); None where too few points agree.
+    def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> two_view_motion.Motion | None:
+        """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
-        An image that shows too few of the points becomes the anchor itself, with those that it shows.
+        If too few points are tracked, the image becomes the reference, with those points.
+
+        Returns:
+            The motion from the reference, or None if there are too few inliers.
         """
-        now_from_anchor = geometry.inverse(expected)
-        points = geometry.transform(now_from_anchor, anchor.xyz(self.rig.baseline_m))
+        current_from_reference = geometry.inverse(predicted)
+        points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
         guess = self.rig.project(points).astype(np.float32)
-        found, ok = matching.track(anchor.image, image, anchor.pixels, guess, self.patch_px)
-        pixels, measured, cov = found[ok], anchor.measured[ok], anchor.cov[ok]
-        seen, seen_cov = np.zeros_like(measured), np.zeros_like(cov)
-        seen[:, :2], seen_cov[:, :2, :2], seen_cov[:, 2, 2] = normalised(pixels, self.rig), cov[:, :2, :2], _UNKNOWN
-        shared = matching.correlation(pixels, self.patch_px)
-        moved = two_view_motion.pair_motion(
-            seen, measured, seen_cov, cov, self.rig.baseline_m, now_from_anchor, correlation=shared, told=2
+        tracked, ok = matching.track(reference.image, image, reference.pixels, guess, self.patch_px)
+        pixels, measured, cov = tracked[ok], reference.measured[ok], reference.cov[ok]
+        current, current_cov = np.zeros_like(measured), np.zeros_like(cov)
+        current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
+        current_cov[:, 2, 2] = _UNKNOWN_VARIANCE
+        settings = two_view_motion.PairMotionSettings(
+            variance_inflation=matching.variance_inflation(pixels, self.patch_px), n_measured=2
         )
-        if moved is None:
+        pair = PairMeasurements(current, measured, current_cov, cov)
+        motion = two_view_motion.pair_motion(pair, self.rig.baseline_m, current_from_reference, settings)
+        if motion is None:
             return None
-        carry = geometry.adjoint(moved.a_from_b)
-        self.anchor_from_now = geometry.rigid(geometry.inverse(moved.a_from_b))  # else errors double with every frame
-        located = moved._replace(a_from_b=self.anchor_from_now, cov=carry @ moved.cov @ carry.T)
-        if ok.mean() < _KEPT:
-            seen[:, 2] = observation_equations.transfer(measured, moved.a_from_b, self.rig.baseline_m)[0][:, 2]
-            self._hold(_Anchor(image, pixels, seen, cov))
+        adjoint = geometry.adjoint(motion.a_from_b)
+        # rounding errors would double with every frame
+        self.reference_from_current = geometry.nearest_rigid(geometry.inverse(motion.a_from_b))
+        located = motion._replace(a_from_b=self.reference_from_current, cov=adjoint @ motion.cov @ adjoint.T)
+        if ok.mean() < _MIN_TRACKED:
+            transferred, _, _ = observation_equations.transfer(measured, motion.a_from_b, self.rig.baseline_m)
+            current[:, 2] = transferred[:, 2]
+            self._set_reference(_Reference(image, pixels, current, cov))
         return located
 
 
-def coast(last_motion: Array) -> tuple[two_view_motion.Motion, str]:
-    """The last motion (4, 4) of a frame once more, with a covariance that admits it, and why."""
-    step = geometry.log(last_motion)
-    sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(step[3:]))])
+def constant_velocity_motion(last_motion: Array) -> tuple[two_view_motion.Motion, str]:
+    """Returns the last motion (4, 4) as a prediction, with a large covariance, and the status of a failed step."""
+    twist = geometry.log(last_motion)
+    sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
     return two_view_motion.Motion(
         last_motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf
     ), "too few points matched"

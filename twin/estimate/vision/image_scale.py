@@ -1,45 +1,52 @@
-"""The scale at which images are matched: pixels are binned where the floor's texture is coarser than their noise.
+"""Choice of the image scale: pixels are binned if the texture of the floor is coarser than the image noise.
 
-Found over a floor whose texture resolves 7.6 cm (a texel is 12 pixels wide, its contrast twice the noise): of the
-corners of the full image 0.35 to 0.6 are found by the other eye, the others are corners of noise, and flow from frame
-to frame is lost within 18 s. With pixels binned by 2 or 4 it is 0.88 to 0.96, and the survey flies. Over floors whose
-texture the full image resolves it is 0.95 to 0.99 at full size. A larger patch alone keeps the noise's corners.
+Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
+corners
+of the full image are matched in the right image: the others are noise, and F2F tracking fails within 18 s. With pixels
+binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full image resolves, it
+is 95 to 99 % without binning. Larger patches alone do not help, because they keep the corners that are noise.
 """
 
 from __future__ import annotations
 
 from twin.core.records import Image, StereoRig
+from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import disparity, matching, stereo
-from twin.scenario.model import EstimateConfig
 
 _BINNINGS = (1, 2, 4)
-_ENOUGH = 2 / 3  # of the corners are texture
+_MIN_MATCHED = 2 / 3  # fraction of the corners
 
 
-def binning(left: Image, right: Image, rig: StereoRig, settings: EstimateConfig) -> int:
-    """How many pixels to take as one along either side: the fewest with which most corners are seen by both cameras.
+def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
+    """Returns the smallest binning at which most corners are matched in both images, else the one that matches most.
 
     Args:
-        left, right: (height, width, 3) of the first keyframe.
+        left, right: (height, width, 3) images of the first keyframe.
+        rig: calibration of the full images.
+        settings: settings of the estimators.
+
+    Returns:
+        Number of pixels that are averaged along each side.
     """
-    best, most = 1, 0.0
-    for by in _BINNINGS:
-        if rig.width_px % by or rig.height_px % by:
+    best, best_fraction = 1, 0.0
+    for binning in _BINNINGS:
+        if rig.width_px % binning or rig.height_px % binning:
             break
-        share = _share_found(left, right, by, rig.binned(by), settings)
-        if share > _ENOUGH:
-            return by
-        if share > most:
-            best, most = by, share
+        fraction = _matched_fraction(left, right, binning, rig.binned(binning), settings)
+        if fraction > _MIN_MATCHED:
+            return binning
+        if fraction > best_fraction:
+            best, best_fraction = binning, fraction
     return best
 
 
-def _share_found(left_rgb: Image, right_rgb: Image, by: int, rig: StereoRig, settings: EstimateConfig) -> float:
-    """Share of the corners with a rough disparity that are found to a fraction of a pixel."""
-    left, right = matching.gray(left_rgb, by), matching.gray(right_rgb, by)
-    dense_px = disparity.search(
-        matching.normalise(left), matching.normalise(right), disparity.Reach(rig).max_disparity_px
-    )
+def _matched_fraction(
+    left_rgb: Image, right_rgb: Image, binning: int, rig: StereoRig, settings: EstimatorSettings
+) -> float:
+    """Returns the fraction of the corners with a coarse disparity that are matched to sub-pixel accuracy."""
+    left, right = matching.gray(left_rgb, binning), matching.gray(right_rgb, binning)
+    max_disparity_px = disparity.SearchRange(rig).max_disparity_px
+    dense_px = disparity.search(matching.normalise(left), matching.normalise(right), max_disparity_px)
     pixels, _ = stereo.corners_with_disparity(left, dense_px, settings.points, settings.patch_px)
-    points = stereo.points_of_pair(left, right, dense_px, rig, settings.points, settings.patch_px)
+    points = stereo.match_stereo_points(left, right, dense_px, rig, settings.points, settings.patch_px)
     return len(points.xyz) / max(len(pixels), 1)

@@ -1,4 +1,4 @@
-"""A keyframe of the survey: one stereo pair of the path (the paper's "key point")."""
+"""Keyframes of the survey."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from twin.estimate.vision.stereo import StereoPoints
 
 @dataclass
 class Keyframe:
-    """One stereo pair of the path.
+    """A stereo pair on the path (the paper's "key point"). Its fields are updated in place during the survey.
 
     Args:
-        number: counts the keyframes from 0.
+        number: index of the keyframe, from 0.
         row: index of its frame in the trajectories.
         track: number of its track, from 1.
-        world_from_camera: (4, 4) best pose so far.
-        points: matched points of the pair while it is the newest.
-        readings: of the navigation sensors.
-        walked: displacement since the node before by the DVL; None without.
-        walked_cov: (6, 6) what the motions up to here err by in sum, less what the mosaic told, in the world's axes.
+        world_from_camera: (4, 4) best pose estimate so far.
+        points: matched stereo points; only kept while this is the newest keyframe.
+        readings: readings of the navigation sensors.
+        dvl_displacement: displacement since the previous node, measured by the DVL; None without DVL, or if the link
+            to the previous node is the F2F motion, which already includes it.
+        accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the part that registrations
+            with the mosaic removed; in world axes. The difference between two keyframes is the covariance of the
+            motion between them.
+        depth_m: median depth of the matched points [m].
     """
 
     number: int
@@ -32,5 +36,6 @@ class Keyframe:
     world_from_camera: Array
     points: StereoPoints | None
     readings: Readings
-    walked: Displacement | None = None
-    walked_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    dvl_displacement: Displacement | None = None
+    accumulated_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    depth_m: float = np.nan

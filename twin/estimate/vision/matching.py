@@ -1,6 +1,6 @@
-"""Even images, points worth matching, and following them from frame to frame by Lucas-Kanade.
+"""Image normalisation, corner detection, and Lucas-Kanade tracking from frame to frame.
 
-Stereo and the links between keyframes need more than Lucas-Kanade gives: `patches.register`.
+Stereo and the links between keyframes need higher accuracy than Lucas-Kanade: see `patches.match_templates`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
 _BANDS = np.full((1, 3), 1 / 3, np.float32)
-_SMOOTH_PX = 0.5  # takes the finest detail, which sampling has folded, before it pulls matches towards whole pixels
-_FLAT_GRAY = 2.0  # deviations below this are sensor noise, not texture
-_ROUND_TRIP_PX = 0.5
+_SMOOTH_PX = 0.5  # removes aliased detail, which biases matches towards whole pixels
+_FLAT_GRAY = 2.0  # standard deviation of sensor noise [grey levels]; keeps uniform areas from being amplified
+_FORWARD_BACKWARD_PX = 0.5
 
 
 def gray(rgb: Image, binning: int = 1) -> Gray:
-    """Grey levels (height / binning, width / binning), hardly smoothed: what `patches` are registered on.
+    """Returns slightly smoothed grey levels (height / binning, width / binning), on which patches are matched.
 
-    Where pixels are taken together, noise rules, and the bands are taken together as well: their mean holds 1.14 times
-    as much texture for its noise as luma over the coarse floor of `paper_coarse`, and its final error falls by a fifth.
+    Binned images are limited by noise, so they use the mean of the colour bands: over the coarse floor of the scenario
+    `paper_coarse` its signal-to-noise ratio is 1.14 times that of luma, and the final position error is a fifth
+    smaller.
 
     Args:
         rgb: (height, width, 3).
-        binning: so many pixels become one along either side.
+        binning: number of pixels that are averaged along each side.
     """
     if binning == 1:
         levels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -44,30 +45,30 @@ def gray(rgb: Image, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Local mean and contrast of grey levels made even: the lamp pattern moves with the vehicle, none must track it.
+    """Normalises local mean and contrast of grey levels, so that the pattern of the lamps is not tracked.
 
     Returns:
-        (height, width) uint8, local mean 128, local deviation about 36 grey levels. They depend on what lies around, at
-        the border on less: nothing to be measured on to a hundredth of a pixel.
+        (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
+        surroundings, which are cut off at the border: not suited to measurements of a hundredth of a pixel.
     """
-    mean, square = _around(levels)
-    even = np.empty(levels.shape, np.uint8)
-    _even(levels.ravel(), mean.ravel(), square.ravel(), even.ravel())
-    return even
+    mean, square = _local_moments(levels)
+    normalised = np.empty(levels.shape, np.uint8)
+    _normalise(levels.ravel(), mean.ravel(), square.ravel(), normalised.ravel())
+    return normalised
 
 
 def contrast(levels: Gray) -> float:
-    """RMS contrast of what is matched: deviation of grey levels around a place over their mean, median over the image.
+    """Returns the local RMS contrast of an image: standard deviation / mean, median over the image.
 
-    Before it is made even by `normalise`. Noise counts as well: in the dark, and in thick water, little else is left.
+    The image must not be normalised. Noise contributes to contrast, and dominates it in dark or turbid images.
     """
-    mean, square = (level[::4, ::4] for level in _around(levels))
-    deviation = np.sqrt(np.maximum(square - mean**2, 0))
-    return float(np.median(deviation / np.maximum(mean, 1.0)))
+    mean, square = (moment[::4, ::4] for moment in _local_moments(levels))
+    sigma = np.sqrt(np.maximum(square - mean**2, 0))
+    return float(np.median(sigma / np.maximum(mean, 1.0)))
 
 
-def _around(levels: Gray) -> tuple[Gray, Gray]:
-    """Mean and mean square in the window around each pixel, an eighth of the image wide."""
+def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
+    """Returns mean and mean square in a window around each pixel that is an eighth of the image wide."""
     size = (levels.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
     square = cv2.sqrBoxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
@@ -75,7 +76,7 @@ def _around(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """The image (height, width, ...) with squares of `by` x `by` pixels averaged to one."""
+    """Returns the image (height, width, ...) with squares of `by` x `by` pixels averaged to one."""
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
@@ -83,67 +84,77 @@ def binned(image: Pixels, by: int) -> Pixels:
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _even(gray, mean, square, even):
-    """Fills `even` (n,) uint8 from grey levels, their local mean and local mean square."""
+def _normalise(gray, mean, square, normalised):
+    """Compiled kernel of `normalise`: writes `normalised` (n,) uint8 from grey levels and their local moments (n,)."""
     low, high, middle = np.float32(0), np.float32(255), np.float32(128.5)
     for k in range(gray.size):
-        deviation = np.sqrt(max(square[k] - mean[k] * mean[k], low)) + np.float32(_FLAT_GRAY)
-        level = (gray[k] - mean[k]) / deviation * np.float32(_GRAY_PER_SIGMA) + middle
-        even[k] = np.uint8(min(max(level, low), high))
+        sigma = np.sqrt(max(square[k] - mean[k] * mean[k], low)) + np.float32(_FLAT_GRAY)
+        level = (gray[k] - mean[k]) / sigma * np.float32(_GRAY_PER_SIGMA) + middle
+        normalised[k] = np.uint8(min(max(level, low), high))
 
 
 def corners(image: Image, count: int, patch_px: int) -> Points:
-    """Well-textured points, spread over the image, each with its whole patch inside, best first. -> (n, 2) float32 [px]
+    """Returns well-textured points, spread over the image, whose patches lie inside it.
 
-    Where texture is so coarse that there are not half as many corners as asked, points of a grid: between few corners
-    lies most of what the image tells. Over texels of 12 px motions over three keyframes err by 4.5 mrad, with corners
-    by 7.6.
+    Coarse texture has few corners, and most of its information lies between them. If there are fewer than half as many
+    corners as requested, the points form a grid: over texels of 12 px the rotation error over three keyframes is then
+    4.5 mrad instead of 7.6 mrad.
+
+    Args:
+        image: (height, width) normalised image.
+        count: largest number of points.
+        patch_px: side of the patches.
+
+    Returns:
+        (n, 2) float32 [px], strongest first.
     """
     height, width = image.shape
     margin, block = patch_px // 2 + 2, 7
     inside = np.zeros_like(image)
     inside[margin : height - margin, margin : width - margin] = 255
     spacing_px = 0.7 * np.sqrt(height * width / count)
-    found = cv2.goodFeaturesToTrack(image, count, 0.01, spacing_px, mask=inside, blockSize=block)
-    if found is None:
+    detected = cv2.goodFeaturesToTrack(image, count, 0.01, spacing_px, mask=inside, blockSize=block)
+    if detected is None:
         return np.zeros((0, 2), np.float32)
-    if len(found) < count / 2:
+    if len(detected) < count / 2:
         step = max(int(spacing_px), 1)
         u, v = np.meshgrid(np.arange(margin, width - margin, step), np.arange(margin, height - margin, step))
         strength = cv2.cornerMinEigenVal(image, block)[v, u].ravel()
         best = np.argsort(-strength, kind="stable")[:count]
         return np.column_stack([u.ravel(), v.ravel()])[best].astype(np.float32)
-    return np.asarray(found, np.float32).reshape(-1, 2)
+    return np.asarray(detected, np.float32).reshape(-1, 2)
 
 
 def track(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1
 ) -> tuple[Points, Mask]:
-    """Where patches of one image are in another, by Lucas-Kanade there and back.
+    """Tracks points from one image to another by Lucas-Kanade, with a forward-backward check.
 
     Args:
-        source, target: normalised images of one shape.
+        source, target: normalised images of the same shape.
         points: (n, 2) [px] in the source.
-        guess: (n, 2) [px], where they are expected in the target.
-        patch_px: window.
+        guess: (n, 2) expected positions in the target [px].
+        patch_px: side of the window.
         levels: pyramid levels above the full image.
 
     Returns:
-        (n, 2) [px] in the target, and which came back within half a pixel and lie inside.
+        (n, 2) positions in the target [px], and (n,) bool: tracked back to within half a pixel, window inside the
+        image.
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
     points = points.astype(np.float32)
-    found, there = _lucas_kanade(source, target, points, guess.astype(np.float32), patch_px, levels)
-    returned, back = _lucas_kanade(target, source, found, points, patch_px, 0)
-    round_trip_px = np.linalg.norm(returned - points, axis=1)
-    return found, there & back & (round_trip_px < _ROUND_TRIP_PX) & inside(found, source.shape, patch_px // 2)
+    tracked, forward_ok = _lucas_kanade(source, target, points, guess.astype(np.float32), patch_px, levels)
+    returned, backward_ok = _lucas_kanade(target, source, tracked, points, patch_px, 0)
+    consistent = np.linalg.norm(returned - points, axis=1) < _FORWARD_BACKWARD_PX
+    return tracked, forward_ok & backward_ok & consistent & inside(tracked, source.shape, patch_px // 2)
 
 
 def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
+    """Returns positions (n, 2) in the target, and which were tracked (n,)."""
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,
         points,
@@ -153,28 +164,29 @@ def _lucas_kanade(
         criteria=_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
-    return np.asarray(found, np.float32), np.asarray(status).ravel() > 0
+    return np.asarray(tracked, np.float32), np.asarray(status).ravel() > 0
 
 
 def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: float) -> Mask:
-    """Which points (n, 2) keep this distance from the image border."""
+    """Returns which points (n, 2) are at least `margin_px` from the image border."""
     x, y = points[:, 0], points[:, 1]
     return (x >= margin_px) & (y >= margin_px) & (x < shape[1] - margin_px) & (y < shape[0] - margin_px)
 
 
-def correlation(points: NDArray[np.floating], patch_px: int) -> float:
-    """By how much a covariance of independent points (n, 2) is too small: overlapping patches share their pixels.
+def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
+    """Returns the factor on a covariance that was computed for independent points (n, 2).
 
-    The variance of a mean grows by the mean sum of what each patch shares with all (itself included).
+    Overlapping patches share pixels, so their errors are correlated. The variance of a mean is inflated by the mean,
+    over the patches, of the summed overlap of a patch with all patches (design effect, Kish 1965).
     """
     if len(points) == 0:
         return 1.0
-    return _shared(np.ascontiguousarray(points, np.float64), float(patch_px)) / len(points)
+    return _summed_overlap(np.ascontiguousarray(points, np.float64), float(patch_px)) / len(points)
 
 
 @njit(cache=True, nogil=True)
-def _shared(points, patch):
-    """Sum over all pairs of square patches, each with itself too, of the share of a patch that both have."""
+def _summed_overlap(points, patch):
+    """Returns the sum of the overlap fractions over all ordered pairs of square patches, self-pairs included."""
     total = float(len(points))
     for i in range(len(points)):
         for j in range(i):

@@ -1,13 +1,15 @@
-"""The local 2.5-D mosaic and the registration of a frame with it (F2M, P7): six degrees of freedom over any relief.
+"""Local 2.5-D mosaic, and the registration of frames with it (F2M): six degrees of freedom over any relief.
 
-The mosaic is a raster in the world: brightness (locally normalised) and elevation per cell, and which keyframe laid
-it. A cell keeps what was seen there first: the oldest view has drifted least. A frame is registered by direct
-alignment: cells with texture are projected into it, and the pose is moved until their brightness agrees (Gauss-Newton
-with Huber weights).
+The mosaic is a raster in world coordinates: normalised brightness and elevation per cell, and the keyframe that each
+cell was taken from. Cells are never overwritten, because the oldest view has drifted least. A frame is registered by
+direct
+image alignment: textured cells are projected into the frame, and the pose is optimised until the brightness agrees
+(Gauss-Newton with Huber weights).
 
-What a registration errs by comes from heights and uneven light more than from the noise of pixels, and neighbouring
-cells share it: counted one by one they claimed 0.4 mrad where 1.4 to 6 were true, over a floor of coarse texture. So
-the covariance is that of clustered data (Liang & Zeger 1986), by what the blocks of the image disagree about.
+The residuals are dominated by errors of height and by uneven illumination rather than by pixel noise, and neighbouring
+cells share them. A covariance for independent cells claimed 0.4 mrad where the error was 1.4 to 6 mrad, over a floor of
+coarse texture. The covariance is therefore that of clustered data (Liang & Zeger 1986), with blocks of the image as
+clusters.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.interpolation import bilinear
 from twin.core.records import StereoRig
 from twin.estimate.vision import matching, two_view_motion
 from twin.estimate.vision.tiles import TiledRaster
@@ -28,50 +31,60 @@ from twin.estimate.vision.tiles import TiledRaster
 _MAX_CELLS = 4000
 _MIN_CELLS = 300
 _MIN_GRADIENT = 4.0  # grey levels per cell
-_MAX_RESIDUAL = 40.0  # grey levels; matched images of unit contrast (36) leave far less
+_MAX_RESIDUAL = 40.0  # grey levels; inliers are far below this, the standard deviation of an image is 36
 _ITERATIONS = 8
-_BLOCKS = (6, 8)  # of the image, rows and columns: each about a window of the normalisation wide
+_BLOCKS = (6, 8)  # rows and columns of blocks of the image, each about as wide as the normalisation window
 
 
 class Registration(NamedTuple):
-    """Where the mosaic shows a frame.
+    """Result of a registration with the mosaic.
 
     Args:
-        correction: of the predicted pose, predicted_from_true.
-        laid_by: number of the keyframe that laid the median cell: half of what was compared with is older.
+        correction: estimated pose of the frame relative to its predicted pose (predicted_from_true).
+        reference_keyframe: number of the keyframe that the median of the compared cells was taken from; half of the
+            cells are as old or older.
     """
 
     correction: two_view_motion.Motion
-    laid_by: int
+    reference_keyframe: int
 
 
 class Mosaic:
-    """Brightness, elevation and origin of the floor around the vehicle, in tiles: memory does not grow with the area.
+    """Raster of brightness, elevation and keyframe number, in tiles: memory does not grow with the area.
 
     Args:
-        cell_m: cell size, about a pixel's footprint; cell (0, 0) begins at the world's origin, rows run north.
-        folder: where tiles are spooled.
+        cell_m: cell size, about the ground sample distance; cell (0, 0) begins at the origin of the world, rows run
+            north.
+        folder: folder of the tiles on disk.
     """
 
     def __init__(self, cell_m: float, folder: Path):
         self.cell_m, self.cells = cell_m, TiledRaster(3, folder)
 
     def clear(self) -> None:
-        """Forgets everything: after a global alignment the mosaic is laid anew."""
+        """Removes all cells; used before the mosaic is rebuilt after a global alignment."""
         self.cells.clear()
 
     def add(
         self, number: int, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
     ) -> None:
-        """Lays a keyframe of this number with its depth (height, width), NaN where unknown, into the empty cells."""
+        """Adds a keyframe to the empty cells of the mosaic.
+
+        Args:
+            number: number of the keyframe.
+            image: (height, width) normalised left image.
+            depth_m: (height, width), NaN where unknown.
+            world_from_camera: (4, 4) pose of the keyframe.
+            rig: calibration at the scale of the image.
+        """
         known = depth_m[np.isfinite(depth_m)]
         if known.size == 0:
             return
-        farthest_m = 1.2 * float(np.quantile(known, 0.99))  # a mismatch may lie at any depth
+        farthest_m = 1.2 * float(np.quantile(known, 0.99))  # the maximum may be a mismatch
         reach_m = farthest_m * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
         row, col, side = self._window(world_from_camera[:3, 3], reach_m)
         cells = self.cells.read(row, col, side, side)
-        _lay(
+        _insert(
             image, depth_m, world_from_camera, geometry.inverse(world_from_camera), rig.focal_px, rig.cx_px, rig.cy_px,
             col * self.cell_m, row * self.cell_m, self.cell_m, number, cells[0], cells[1], cells[2],
         )  # fmt: skip
@@ -85,27 +98,32 @@ class Mosaic:
         footprint_m: float,
         rig: StereoRig,
     ) -> Registration | None:
-        """Pose correction of a frame, with its covariance; None where too little agrees.
+        """Registers a frame with the mosaic.
 
         Args:
-            image: normalised frame.
-            depth_m: (height, width) as its own pair measures it, NaN where unknown.
+            image: (height, width) normalised frame.
+            depth_m: (height, width) depth by the frame's own stereo pair, NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
-            footprint_m: half the extent of the floor to use, around the camera.
+            footprint_m: half the side of the square around the camera whose cells are used.
+            rig: calibration at the scale of the image.
+
+        Returns:
+            The pose correction with its covariance, or None if too few cells are textured or agree.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], footprint_m)
         if cells is None:
             return None
-        points, brightness, laid_by = cells
+        points, brightness, keyframe = cells
         frame = image.astype(np.float32)
         camera, current = (rig.focal_px, rig.cx_px, rig.cy_px), world_from_camera
         normal, scatter, sigma, n_used, used = np.eye(6), np.eye(6), 0.0, 0, np.zeros(0, np.bool_)
         for _ in range(_ITERATIONS):
-            *told, used = _compare(points, brightness, frame, depth_m, geometry.inverse(current), camera, _MAX_RESIDUAL)
+            camera_from_world = geometry.inverse(current)
+            *linearised, used = _linearise(points, brightness, frame, depth_m, camera_from_world, camera, _MAX_RESIDUAL)
             n_used = int(np.count_nonzero(used))
             if n_used < _MIN_CELLS:
                 return None
-            normal, right, scatter, sigma = _normal_equations(*told)
+            normal, right, scatter, sigma = _normal_equations(*linearised)
             step = np.asarray(np.linalg.solve(normal, right), np.float64)
             current = current @ geometry.exp(step)
             if np.abs(step).max() < 1e-6:
@@ -113,18 +131,18 @@ class Mosaic:
         inverse = np.linalg.inv(normal)
         cov = np.asarray(inverse @ scatter @ inverse.T, np.float64)
         correction = geometry.inverse(world_from_camera) @ current
-        median = np.partition(laid_by[used], n_used // 2)[n_used // 2]  # a keyframe's number, not between two
+        median = np.partition(keyframe[used], n_used // 2)[n_used // 2]  # always a number that occurs
         return Registration(two_view_motion.Motion(correction, cov, n_used, sigma), int(median))
 
     def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
-        """First row, first column and side of the square of cells around a place."""
+        """Returns first row, first column and side of the square of cells around a position."""
         half = int(np.ceil(half_m / self.cell_m))
         return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
     def _textured_cells(
         self, centre: Array, half_m: float
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
-        """World points (n, 3), brightness (n,) and keyframe (n,) of cells with a gradient, within a square."""
+        """Returns world points (n, 3), brightness (n,) and keyframe number (n,) of the textured cells in a square."""
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
         if side < 8:
@@ -142,7 +160,7 @@ class Mosaic:
 
 
 def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Brightness change per cell; zero where a neighbour is unknown."""
+    """Returns the magnitude of the brightness gradient [grey levels per cell]; zero where a neighbour is unknown."""
     strength = np.zeros_like(bright)
     across, along = bright[1:-1, 2:] - bright[1:-1, :-2], bright[2:, 1:-1] - bright[:-2, 1:-1]
     known = height[1:-1, 2:] + height[1:-1, :-2] + height[2:, 1:-1] + height[:-2, 1:-1] + height[1:-1, 1:-1]
@@ -151,10 +169,11 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 
 
 @njit(cache=True, nogil=True)
-def _lay(image, depth, pose, inverse, focal, cx, cy, west, south, cell, laid_by, brightness, height, number):
-    """Fills empty cells: the mean height of the pixels that fall in, the brightness where the cell's centre projects.
+def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
+    """Writes empty cells: the mean height of the pixels in the cell, and the brightness at the projected cell centre.
 
-    Taking a pixel's own brightness would shift the picture by the pixel's place in the cell: 5 mm of bias in position.
+    Taking the brightness of the pixels in the cell instead would bias the position by 5 mm, because they are not at the
+    cell's centre.
     """
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)
@@ -181,25 +200,29 @@ def _lay(image, depth, pose, inverse, focal, cx, cy, west, south, cell, laid_by,
             i, j = int(np.floor(v)), int(np.floor(u))
             if i < 0 or j < 0 or i >= image.shape[0] - 1 or j >= image.shape[1] - 1:
                 continue
-            height[row, col], number[row, col] = z, laid_by
-            brightness[row, col] = _between(image, i, j, v - i, u - j)
+            height[row, col], number[row, col] = z, keyframe
+            brightness[row, col] = bilinear(image, i, j, v - i, u - j)
 
 
 @njit(cache=True, nogil=True)
-def _compare(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """What each cell that the frame shows says of the motion.
+def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
+    """Linearises the brightness residuals of the cells that are visible in the frame.
 
     Args:
+        points: (n, 3) cells in the world [m], with brightness (n,).
+        frame, depth: (height, width) brightness and depth of the frame.
+        camera_from_world: (4, 4).
         camera: focal length, column and row of the principal point [px].
+        max_residual: largest brightness residual of an inlier.
 
     Returns:
-        Rows (m, 6) of the motion; the same told by the frame's own depth; residuals (m,); blocks of the image (m,); and
-        which cells these are (n,).
+        Jacobian (m, 6) of the projected brightness by the motion, with the depth of the mosaic; the same with the depth
+        of the frame; residuals (m,); block of the image (m,); and which cells are used (n,) bool.
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
-    rows, told, residuals, block = np.empty((n, 6)), np.empty((n, 6)), np.empty(n), np.empty(n, np.int64)
-    kept = np.zeros(n, np.bool_)
+    jacobian, frame_jacobian, residuals, block = np.empty((n, 6)), np.empty((n, 6)), np.empty(n), np.empty(n, np.int64)
+    used = np.zeros(n, np.bool_)
     rotation, translation = np.ascontiguousarray(camera_from_world[:3, :3]), camera_from_world[:3, 3].copy()
     for k in range(n):
         p = rotation @ points[k] + translation
@@ -211,53 +234,53 @@ def _compare(points, brightness, frame, depth, camera_from_world, camera, max_re
         if i < 1 or j < 1 or i >= frame.shape[0] - 2 or j >= frame.shape[1] - 2:
             continue
         a, b = v - i, u - j
-        residual = brightness[k] - _between(frame, i, j, a, b)
-        near = depth[int(v + 0.5), int(u + 0.5)]
-        if abs(residual) > max_residual or not near > 0:
+        residual = brightness[k] - bilinear(frame, i, j, a, b)
+        frame_depth = depth[int(v + 0.5), int(u + 0.5)]
+        if abs(residual) > max_residual or not frame_depth > 0:
             continue
-        grad_u = focal * (_between(frame, i, j + 1, a, b) - _between(frame, i, j - 1, a, b)) / 2
-        grad_v = focal * (_between(frame, i + 1, j, a, b) - _between(frame, i - 1, j, a, b)) / 2
-        rows[m, 0] = grad_u * x * y + grad_v * (1 + y * y)
-        rows[m, 1] = -grad_u * (1 + x * x) - grad_v * x * y
-        rows[m, 2] = grad_u * y - grad_v * x
-        rows[m, 3] = -grad_u / p[2]
-        rows[m, 4] = -grad_v / p[2]
-        rows[m, 5] = (grad_u * x + grad_v * y) / p[2]
+        grad_u = focal * (bilinear(frame, i, j + 1, a, b) - bilinear(frame, i, j - 1, a, b)) / 2
+        grad_v = focal * (bilinear(frame, i + 1, j, a, b) - bilinear(frame, i - 1, j, a, b)) / 2
+        jacobian[m, 0] = grad_u * x * y + grad_v * (1 + y * y)
+        jacobian[m, 1] = -grad_u * (1 + x * x) - grad_v * x * y
+        jacobian[m, 2] = grad_u * y - grad_v * x
+        jacobian[m, 3] = -grad_u / p[2]
+        jacobian[m, 4] = -grad_v / p[2]
+        jacobian[m, 5] = (grad_u * x + grad_v * y) / p[2]
         for c in range(3):
-            told[m, c], told[m, 3 + c] = rows[m, c], rows[m, 3 + c] * p[2] / near
-        residuals[m], kept[k] = residual, True
+            frame_jacobian[m, c], frame_jacobian[m, 3 + c] = jacobian[m, c], jacobian[m, 3 + c] * p[2] / frame_depth
+        residuals[m], used[k] = residual, True
         block[m] = i * high // frame.shape[0] * wide + j * wide // frame.shape[1]
         m += 1
-    return rows[:m], told[:m], residuals[:m], block[:m], kept
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _between(image, i, j, a, b):
-    """Bilinear value at a share (a, b) of the way from pixel (i, j) to the next row and column."""
-    top = image[i, j] * (1 - b) + image[i, j + 1] * b
-    bottom = image[i + 1, j] * (1 - b) + image[i + 1, j + 1] * b
-    return top * (1 - a) + bottom * a
+    return jacobian[:m], frame_jacobian[:m], residuals[:m], block[:m], used
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(rows, told, residuals, block):
-    """Normal matrix (6, 6), right side (6,), its scatter (6, 6) by the blocks of the image, robust deviation."""
+def _normal_equations(jacobian, frame_jacobian, residuals, block):
+    """Returns the weighted normal equations of the motion.
+
+    The Jacobian with the frame's depth serves as instrumental variables: its errors are independent of those of the
+    mosaic's depth, which would otherwise bias the solution.
+
+    Returns:
+        Normal matrix (6, 6), right-hand side (6,), its scatter (6, 6) over the blocks of the image, and the robust
+        standard deviation of the residuals.
+    """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
-    if len(rows) < 6:
+    if len(jacobian) < 6:
         return normal, right, scatter, 0.0
-    n_parts = _BLOCKS[0] * _BLOCKS[1]
-    parts, filled = np.zeros((n_parts, 6)), np.zeros(n_parts, np.bool_)
+    n_blocks = _BLOCKS[0] * _BLOCKS[1]
+    sums, filled = np.zeros((n_blocks, 6)), np.zeros(n_blocks, np.bool_)
     sigma = 1.4826 * np.median(np.abs(residuals)) + 1e-3
-    for k in range(len(rows)):
+    for k in range(len(jacobian)):
         size = abs(residuals[k]) / sigma
         weight = 1.0 if size < 1.5 else 1.5 / size
         filled[block[k]] = True
         for i in range(6):
-            parts[block[k], i] += weight * told[k, i] * residuals[k]
+            sums[block[k], i] += weight * frame_jacobian[k, i] * residuals[k]
             for j in range(6):
-                normal[i, j] += weight * told[k, i] * rows[k, j]
-    n_blocks = filled.sum()
-    for part in parts:
-        right += part
-        scatter += np.outer(part, part) * (n_blocks / max(n_blocks - 6, 1))
+                normal[i, j] += weight * frame_jacobian[k, i] * jacobian[k, j]
+    n_filled = filled.sum()
+    for block_sum in sums:
+        right += block_sum
+        scatter += np.outer(block_sum, block_sum) * (n_filled / max(n_filled - 6, 1))
     return normal, right, scatter, sigma

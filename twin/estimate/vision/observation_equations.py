@@ -1,7 +1,7 @@
-"""How a motion shows in one image and between two stereo pairs: linearised rows and their normal equations.
+"""Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity likewise: depth = baseline / disparity.
-Compiled: a keyframe's five links take 30 solutions of 500 points each.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity is divided by f too, so that
+depth = baseline / disparity. A keyframe with five links needs 30 solutions of 500 points each, hence compiled.
 """
 
 from __future__ import annotations
@@ -13,128 +13,161 @@ from numba import njit
 
 from twin.core.geometry import Array
 
-_NEAREST = 1e-4  # disparity of a point that the adjustment would push beyond infinity
+_MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 
 
-class Observations(NamedTuple):
-    """What n points measured by two pairs a and b say of the motion, linearised.
+class PairMeasurements(NamedTuple):
+    """The same n points measured by two stereo pairs a (earlier) and b (later).
 
     Args:
-        error: (n, 3) of what a measured, against the structure moved from b.
-        by_point: (n, 3, 3), by_motion: (n, 3, 6) derivatives of the prediction.
-        information: (n, 3, 3) inverse covariance of the error.
-        size: (n,) of the error in its own deviations, per degree of freedom.
+        a, b: (n, 3) normalised (x, y, disparity).
+        cov_a, cov_b: (n, 3, 3) covariances of `a` and `b`.
     """
 
-    error: Array
-    by_point: Array
-    by_motion: Array
+    a: Array
+    b: Array
+    cov_a: Array
+    cov_b: Array
+
+
+class LinearisedObservations(NamedTuple):
+    """Observation equations of n points in two stereo pairs, linearised at a motion and a structure.
+
+    Args:
+        residual: (n, 3) of the measurements in a, minus their prediction from the measurements in b.
+        jacobian_point: (n, 3, 3) derivative of the prediction by the point (x, y, disparity) in b.
+        jacobian_motion: (n, 3, 6) derivative of the prediction by the twist of the motion a_from_b.
+        information: (n, 3, 3) inverse covariance of the residual.
+        normalised_residual: (n,) root of the squared Mahalanobis distance of the residual per degree of freedom.
+    """
+
+    residual: Array
+    jacobian_point: Array
+    jacobian_motion: Array
     information: Array
-    size: Array
+    normalised_residual: Array
 
 
 @njit(cache=True, nogil=True)
-def image_motion(x, y, depth):
-    """Rows of eq. (1): image velocity per camera twist [w, t] (Negahdaripour & Madjidi 2003). (n,) -> (n, 2, 6)"""
-    rows = np.empty((len(x), 2, 6))
+def image_jacobian(x, y, depth):
+    """Returns the derivative of image coordinates by the camera's twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
+
+    Args:
+        x, y: (n,) normalised image coordinates.
+        depth: (n,) depth [m].
+
+    Returns:
+        (n, 2, 6) Jacobian.
+    """
+    jacobian = np.empty((len(x), 2, 6))
     for i in range(len(x)):
-        u, v, near = x[i], y[i], 1 / depth[i]
-        rows[i, 0] = u * v, -(1 + u * u), v, -near, 0.0, u * near
-        rows[i, 1] = 1 + v * v, -u * v, -u, 0.0, -near, v * near
-    return rows
+        u, v, inverse_depth = x[i], y[i], 1 / depth[i]
+        jacobian[i, 0] = u * v, -(1 + u * u), v, -inverse_depth, 0.0, u * inverse_depth
+        jacobian[i, 1] = 1 + v * v, -u * v, -u, 0.0, -inverse_depth, v * inverse_depth
+    return jacobian
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(rows, weight, value):
-    """Of weighted least squares: rows (n, k, 6), weight (n,), value (n, k). -> (6, 6), (6,)"""
+def normal_equations(jacobian, weight, residual):
+    """Returns the normal matrix (6, 6) and right-hand side (6,) of weighted least squares.
+
+    Args:
+        jacobian: (n, k, 6).
+        weight: (n,).
+        residual: (n, k).
+    """
     normal, right = np.zeros((6, 6)), np.zeros(6)
-    for i in range(len(rows)):
-        for k in range(rows.shape[1]):
+    for i in range(len(jacobian)):
+        for k in range(jacobian.shape[1]):
             for p in range(6):
-                scaled = weight[i] * rows[i, k, p]
-                right[p] += scaled * value[i, k]
+                scaled = weight[i] * jacobian[i, k, p]
+                right[p] += scaled * residual[i, k]
                 for q in range(6):
-                    normal[p, q] += scaled * rows[i, k, q]
+                    normal[p, q] += scaled * jacobian[i, k, q]
     return normal, right
 
 
-def linearise(
-    a: Array, b: Array, structure: Array, cov_a: Array, cov_b: Array, a_from_b: Array, baseline_m: float
-) -> Observations:
-    """Rows of points measured as `a` and `b` (n, 3) with these covariances (n, 3, 3), at a structure in b (n, 3)."""
-    return Observations(*linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline_m))
-
-
-def weighted_normal_equations(seen: Observations, weight: Array) -> tuple[Array, Array, Array]:
-    """The structure eliminated: normal matrix (6, 6), right side (6,), effect of an error that all share (6, 3)."""
-    return reduced(seen.error, seen.by_motion, seen.information, weight)
-
-
-def adjust_structure(seen: Observations, b: Array, cov_b: Array, twist: Array) -> Array:
-    """The structure (n, 3) in b once the motion has moved by `twist`."""
-    return _adjust_structure(seen.error, seen.by_point, seen.by_motion, seen.information, b, cov_b, twist)
-
-
 @njit(cache=True, nogil=True)
-def transfer(z_b, a_from_b, baseline):
-    """(x, y, disparity) in a of points measured in b; derivatives by the point (n, 3, 3) and the motion (n, 3, 6)."""
-    n = len(z_b)
-    z_a, by_point, by_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
-    rotation, lever = np.empty((3, 3)), np.empty(3)
+def transfer(points_b, a_from_b, baseline):
+    """Transfers points measured in pair b to pair a.
+
+    Args:
+        points_b: (n, 3) normalised (x, y, disparity) in b.
+        a_from_b: (4, 4) pose of b in a.
+        baseline: baseline of the rig [m].
+
+    Returns:
+        (n, 3) normalised (x, y, disparity) in a, and its derivatives by the point (n, 3, 3) and by the twist of
+        the motion (n, 3, 6).
+    """
+    n = len(points_b)
+    points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
+    rotation, translation = np.empty((3, 3)), np.empty(3)  # translation in baselines
     for r in range(3):
-        lever[r] = a_from_b[r, 3] / baseline
+        translation[r] = a_from_b[r, 3] / baseline
         for c in range(3):
             rotation[r, c] = a_from_b[r, c]
-    q, q_by = np.empty(3), np.empty((3, 9))  # the point in a, times disparity / baseline; by point and motion
+    q, q_jacobian = np.empty(3), np.empty((3, 9))  # point in a, times disparity / baseline; by point and motion
     for i in range(n):
-        x, y, d = z_b[i]
+        x, y, d = points_b[i]
         for r in range(3):
             r0, r1, r2 = rotation[r]
-            q[r] = r0 * x + r1 * y + r2 + d * lever[r]
-            q_by[r, 0], q_by[r, 1], q_by[r, 2] = r0, r1, lever[r]
-            q_by[r, 3], q_by[r, 4], q_by[r, 5] = r2 * y - r1, r0 - r2 * x, r1 * x - r0 * y
+            q[r] = r0 * x + r1 * y + r2 + d * translation[r]
+            q_jacobian[r, 0], q_jacobian[r, 1], q_jacobian[r, 2] = r0, r1, translation[r]
+            q_jacobian[r, 3], q_jacobian[r, 4], q_jacobian[r, 5] = r2 * y - r1, r0 - r2 * x, r1 * x - r0 * y
             for k in range(3):
-                q_by[r, 6 + k] = d * rotation[r, k] / baseline
+                q_jacobian[r, 6 + k] = d * rotation[r, k] / baseline
         for r in range(3):
-            z_a[i, r] = (d if r == 2 else q[r]) / q[2]
+            points_a[i, r] = (d if r == 2 else q[r]) / q[2]
             for k in range(9):
-                top = q_by[r, k] if r < 2 else (1.0 if k == 2 else 0.0)
-                slope = (top - z_a[i, r] * q_by[2, k]) / q[2]
+                numerator = q_jacobian[r, k] if r < 2 else (1.0 if k == 2 else 0.0)
+                derivative = (numerator - points_a[i, r] * q_jacobian[2, k]) / q[2]
                 if k < 3:
-                    by_point[i, r, k] = slope
+                    jacobian_point[i, r, k] = derivative
                 else:
-                    by_motion[i, r, k - 3] = slope
-    return z_a, by_point, by_motion
+                    jacobian_motion[i, r, k - 3] = derivative
+    return points_a, jacobian_point, jacobian_motion
 
 
 @njit(cache=True, nogil=True)
-def linearised(a, b, structure, cov_a, cov_b, a_from_b, baseline):
-    predicted, by_point, by_motion = transfer(structure, a_from_b, baseline)
+def linearise(measured, structure, a_from_b, baseline):
+    """Returns the `LinearisedObservations` of two stereo pairs.
+
+    Args:
+        measured: `PairMeasurements`.
+        structure: (n, 3) points in b at which to linearise, normalised (x, y, disparity).
+        a_from_b: (4, 4) motion at which to linearise.
+        baseline: baseline of the rig [m].
+    """
+    predicted, jacobian_point, jacobian_motion = transfer(structure, a_from_b, baseline)
+    a, b, cov_a, cov_b = measured.a, measured.b, measured.cov_a, measured.cov_b
     n = len(a)
-    error, information, size = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
-    cov, carried = np.empty((3, 3)), np.empty((3, 3))
+    residual, information, normalised_residual = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n)
+    cov, transferred_cov = np.empty((3, 3)), np.empty((3, 3))
     for i in range(n):
-        g = by_point[i]
+        g = jacobian_point[i]
         for r in range(3):
-            error[i, r] = a[i, r] - predicted[i, r]
+            residual[i, r] = a[i, r] - predicted[i, r]
             for k in range(3):
-                error[i, r] -= g[r, k] * (b[i, k] - structure[i, k])
-                carried[r, k] = g[r, 0] * cov_b[i, 0, k] + g[r, 1] * cov_b[i, 1, k] + g[r, 2] * cov_b[i, 2, k]
+                residual[i, r] -= g[r, k] * (b[i, k] - structure[i, k])
+                transferred_cov[r, k] = g[r, 0] * cov_b[i, 0, k] + g[r, 1] * cov_b[i, 1, k] + g[r, 2] * cov_b[i, 2, k]
             for c in range(r + 1):
-                off = carried[r, 0] * g[c, 0] + carried[r, 1] * g[c, 1] + carried[r, 2] * g[c, 2]
-                cov[r, c] = cov[c, r] = cov_a[i, r, c] + off
+                from_b = (
+                    transferred_cov[r, 0] * g[c, 0] + transferred_cov[r, 1] * g[c, 1] + transferred_cov[r, 2] * g[c, 2]
+                )
+                cov[r, c] = cov[c, r] = cov_a[i, r, c] + from_b
         _invert(cov, information[i])
-        square = 0.0
+        distance = 0.0
         for r in range(3):
             for c in range(3):
-                square += error[i, r] * information[i, r, c] * error[i, c]
-        size[i] = np.sqrt(square / 3)
-    return error, by_point, by_motion, information, size
+                distance += residual[i, r] * information[i, r, c] * residual[i, c]
+        normalised_residual[i] = np.sqrt(distance / 3)
+    return LinearisedObservations(residual, jacobian_point, jacobian_motion, information, normalised_residual)
 
 
 @njit(cache=True, nogil=True)
 def _invert(m, out):
-    """Inverse of a 3x3 matrix by its cofactors."""
+    """Writes the inverse of a (3, 3) matrix to `out`, by cofactors."""
     for r in range(3):
         for c in range(3):
             r1, r2, c1, c2 = (r + 1) % 3, (r + 2) % 3, (c + 1) % 3, (c + 2) % 3
@@ -144,45 +177,64 @@ def _invert(m, out):
 
 
 @njit(cache=True, nogil=True)
-def reduced(error, by_motion, information, weight):
-    normal, right, by_common = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))
+def motion_normal_equations(observations, weight):
+    """Returns the normal equations of the motion, with the structure eliminated.
+
+    Args:
+        observations: `LinearisedObservations`.
+        weight: (n,) robust weights; points of weight 0 are skipped.
+
+    Returns:
+        Normal matrix (6, 6), right-hand side (6,), and derivative of the right-hand side (6, 3) by a bias that all
+        points share.
+    """
+    residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
+    normal, right, bias_jacobian = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))
     projected = np.empty((6, 3))
-    for i in range(len(error)):
+    for i in range(len(residual)):
         if weight[i] == 0:
             continue
         for p in range(6):
             for c in range(3):
                 projected[p, c] = 0.0
                 for r in range(3):
-                    projected[p, c] += by_motion[i, r, p] * information[i, r, c]
+                    projected[p, c] += jacobian[i, r, p] * information[i, r, c]
                 projected[p, c] *= weight[i]
-                right[p] += projected[p, c] * error[i, c]
-                by_common[p, c] += projected[p, c]
+                right[p] += projected[p, c] * residual[i, c]
+                bias_jacobian[p, c] += projected[p, c]
             for q in range(p + 1):
                 for c in range(3):
-                    normal[p, q] += projected[p, c] * by_motion[i, c, q]
+                    normal[p, q] += projected[p, c] * jacobian[i, c, q]
     for p in range(6):
         for q in range(p):
             normal[q, p] = normal[p, q]
-    return normal, right, by_common
+    return normal, right, bias_jacobian
 
 
 @njit(cache=True, nogil=True)
-def _adjust_structure(error, by_point, by_motion, information, b, cov_b, twist):
+def adjust_structure(observations, measured, twist):
+    """Returns the adjusted points (n, 3) in b after an update of the motion by `twist` (6,).
+
+    Args:
+        observations: `LinearisedObservations`.
+        measured: `PairMeasurements` that they were linearised from.
+        twist: (6,) solution of the motion's normal equations.
+    """
+    b, cov_b = measured.b, measured.cov_b
     structure = b.copy()
-    left, pulled = np.empty(3), np.empty(3)
+    remaining, weighted = np.empty(3), np.empty(3)
     for i in range(len(b)):
         for r in range(3):
-            left[r] = error[i, r]
+            remaining[r] = observations.residual[i, r]
             for p in range(6):
-                left[r] -= by_motion[i, r, p] * twist[p]
+                remaining[r] -= observations.jacobian_motion[i, r, p] * twist[p]
         for r in range(3):
-            pulled[r] = 0.0
+            weighted[r] = 0.0
             for c in range(3):
-                pulled[r] += information[i, r, c] * left[c]
+                weighted[r] += observations.information[i, r, c] * remaining[c]
         for k in range(3):
             for m in range(3):
                 for r in range(3):
-                    structure[i, k] += cov_b[i, k, m] * by_point[i, r, m] * pulled[r]
-        structure[i, 2] = max(structure[i, 2], _NEAREST)
+                    structure[i, k] += cov_b[i, k, m] * observations.jacobian_point[i, r, m] * weighted[r]
+        structure[i, 2] = max(structure[i, 2], _MIN_DISPARITY)
     return structure

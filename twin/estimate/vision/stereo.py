@@ -1,4 +1,4 @@
-"""Stereo at a keyframe: well-textured points with their disparity, each with its own covariance."""
+"""Sparse stereo at a keyframe: well-textured points with their disparity and its covariance."""
 
 from __future__ import annotations
 
@@ -13,80 +13,84 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, patches
 
 _EPIPOLAR_PX = 1.0
-_SPARE_PX = 4  # interpolation needs two, the others are more than a match errs by
-_FLOOR_PX = 0.005  # what interpolation leaves: no match is better
+_BORDER_PX = 4  # two for interpolation, the rest exceeds the matching error
+_MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
 
 
 class StereoPoints(NamedTuple):
-    """Points of one stereo pair.
+    """Matched points of one stereo pair.
 
     Args:
         pixels: (n, 2) whole pixels in the left image.
-        slope: (n, 2) of the disparity around them, by column and row.
-        around_px: (n,) mean disparity around them [px], free of their own noise: it tells what another image shows.
+        disparity_slope: (n, 2) slope of the disparity around each point, by column and by row [px/px].
+        mean_disparity_px: (n,) mean disparity around each point [px]. It is free of the point's own noise and predicts
+            whether another image shows the point.
         measured: (n, 3) normalised (x, y, disparity).
-        cov: (n, 3, 3) of these.
+        cov: (n, 3, 3) covariance of `measured`.
         xyz: (n, 3) in the left camera [m].
     """
 
     pixels: NDArray[np.float32]
-    slope: Array
-    around_px: Array
+    disparity_slope: Array
+    mean_disparity_px: Array
     measured: Array
     cov: Array
     xyz: Array
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
+        """Returns the points where `keep` (n,) is true."""
         return StereoPoints(
-            self.pixels[keep], self.slope[keep], self.around_px[keep],
+            self.pixels[keep], self.disparity_slope[keep], self.mean_disparity_px[keep],
             self.measured[keep], self.cov[keep], self.xyz[keep],
         )  # fmt: skip
 
 
-def normalised(pixels: NDArray[np.floating], rig: StereoRig) -> Array:
-    """(x, y) = (pixel - principal point) / focal length. (n, 2) -> (n, 2)"""
-    return (pixels.astype(np.float64) - [rig.cx_px, rig.cy_px]) / rig.focal_px
-
-
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """(x, y, disparity) and its covariance from a patch's place in both images, given that both show it on one row.
+    """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
 
-    Each image errs by `cov`; the disparity is the difference of two columns, x is one of them: they err together. The
-    rows' difference must be zero, and observing that (a Kalman update) also tells the columns what they share with it.
+    Both positions have covariance `cov`. Disparity is the difference of two columns, one of which is x, so both are
+    correlated. The difference in row must be zero; this constraint is applied as a Kalman update, which also corrects
+    the columns where `cov` correlates them with the rows.
 
     Args:
-        left, right: (n, 2) [px].
-        cov: (n, 2, 2) of a place in one image [px^2].
+        left, right: (n, 2) positions [px].
+        cov: (n, 2, 2) covariance of a position in one image [px^2].
+        rig: calibration.
 
     Returns:
-        (n, 3) and (n, 3, 3), normalised.
+        (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
     """
-    xx, xy, yy = cov[:, 0, 0] + _FLOOR_PX**2, cov[:, 0, 1], cov[:, 1, 1] + _FLOOR_PX**2
+    xx, xy, yy = cov[:, 0, 0] + _MIN_SIGMA_PX**2, cov[:, 0, 1], cov[:, 1, 1] + _MIN_SIGMA_PX**2
     state = np.column_stack([left, left[:, 0] - right[:, 0]])
     joint = np.stack([np.stack([xx, xy, xx], 1), np.stack([xy, yy, xy], 1), np.stack([xx, xy, 2 * xx], 1)], axis=1)
-    with_rows = np.column_stack([xy, yy, 2 * xy])  # covariance with the rows' difference, whose variance is 2 yy
-    state = state - with_rows * ((left[:, 1] - right[:, 1]) / (2 * yy))[:, None]
-    joint = joint - with_rows[:, :, None] * with_rows[:, None, :] / (2 * yy)[:, None, None]
-    measured = np.column_stack([normalised(state[:, :2], rig), state[:, 2] / rig.focal_px])
+    cov_with_rows = np.column_stack([xy, yy, 2 * xy])  # covariance with the row difference, whose variance is 2 yy
+    state = state - cov_with_rows * ((left[:, 1] - right[:, 1]) / (2 * yy))[:, None]
+    joint = joint - cov_with_rows[:, :, None] * cov_with_rows[:, None, :] / (2 * yy)[:, None, None]
+    measured = np.column_stack([rig.normalised(state[:, :2]), state[:, 2] / rig.focal_px])
     return measured, joint / rig.focal_px**2
 
 
-def on_one_row(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Which matches (n, 2), (n, 2) [px] a rectified pair can show: rows alike, disparity positive."""
+def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Returns which matches (n, 2), (n, 2) [px] are possible in a rectified pair: equal rows, positive disparity."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
 def margin_px(patch_px: int) -> int:
-    """How far from the border a patch has to be expected to count."""
-    return patch_px // 2 + _SPARE_PX
+    """Returns the smallest accepted distance of a patch's expected centre from the image border [px]."""
+    return patch_px // 2 + _BORDER_PX
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
-    """Which patches (n, 2) are so far inside an image that no error of their places decides whether they are found.
+    """Returns which patches lie so far inside the image that matching errors cannot move them out.
 
-    Told of expected places that are free of the match's noise. Where the measured place decides, those are kept that
-    err inwards: over coarse texture, with errors of 0.1 to 0.2 px, disparities at the border came out 0.02 px smaller,
-    and links over two keyframes erred by 0.16 mrad on average.
+    The test must use expected positions that are independent of the matching noise. A test of the measured positions
+    selects matches with errors towards the inside: over coarse texture, with matching errors of 0.1 to 0.2 px, it
+    biased disparities at the border by -0.02 px and links over two keyframes by 0.16 mrad.
+
+    Args:
+        pixels: (n, 2) expected patch centres [px].
+        rig: calibration, for the image size.
+        patch_px: side of the patch.
     """
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
@@ -94,14 +98,14 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Whole pixels (n, 2) of well-textured points whose disparity (n,) [px] a dense map knows."""
+    """Returns well-textured whole pixels (n, 2) of the left image and their disparity (n,) [px] in a dense map."""
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
     return pixels[known], dense_px[rows, columns][known]
 
 
-def points_of_pair(
+def match_stereo_points(
     left: matching.Gray,
     right: matching.Gray,
     dense_px: NDArray[np.float32],
@@ -109,23 +113,32 @@ def points_of_pair(
     count: int,
     patch_px: int,
 ) -> StereoPoints:
-    """Corners of the left image with their disparity, started from a dense disparity map (NaN where unknown)."""
+    """Matches corners of the left image in the right image, to sub-pixel accuracy.
+
+    Args:
+        left, right: (height, width) grey levels (`matching.gray`).
+        dense_px: (height, width) disparity that matching starts from, NaN where unknown [px].
+        rig: calibration.
+        count: largest number of corners.
+        patch_px: side of the matched patches (odd).
+    """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
     slope = patches.disparity_slope(dense_px, pixels, patch_px)
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope
     guess = pixels - np.column_stack([disparity_px, np.zeros(len(pixels))])
-    match = patches.register(patches.cut([left], pixels, patch_px), patches.splines([right]), guess, warp)
-    around_px = _mean_around(dense_px, 3 * patch_px)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
-    shown = well_inside(pixels - np.column_stack([around_px, np.zeros(len(pixels))]), rig, patch_px)
-    ok = match.ok & on_one_row(pixels, match.points) & shown
+    templates = patches.extract_templates([left], pixels, patch_px)
+    match = patches.match_templates(templates, patches.spline_coefficients([right]), guess, warp)
+    mean_px = _local_mean(dense_px, 3 * patch_px)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
+    in_view = well_inside(pixels - np.column_stack([mean_px, np.zeros(len(pixels))]), rig, patch_px)
+    ok = match.ok & satisfies_epipolar(pixels, match.points) & in_view
     measured, cov = fuse(pixels[ok].astype(np.float64), match.points[ok], match.cov[ok], rig)
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
-    return StereoPoints(pixels[ok], slope[ok], around_px[ok].astype(np.float64), measured, cov, xyz)
+    return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz)
 
 
-def _mean_around(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
-    """Mean of what is known of a disparity map (H, W) in the square around each pixel."""
+def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
+    """Returns the mean of the known values of a disparity map (H, W) in the square around each pixel."""
     known = np.isfinite(dense_px)
     total, count = (
         cv2.boxFilter(part, cv2.CV_32F, (side_px, side_px), normalize=False)

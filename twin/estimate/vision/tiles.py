@@ -1,4 +1,4 @@
-"""A raster without bounds, cut into square tiles: the latest used in memory, the others on disk."""
+"""Unbounded raster in square tiles: the most recently used tiles in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -11,57 +11,59 @@ from numpy.typing import NDArray
 
 Layers = NDArray[np.float32]
 
-SIDE = 256
-_MOST_TILES = 64  # 50 MB of three layers: a footprint touches about 20
+TILE_SIDE = 256
+_MAX_TILES = 64  # 50 MB with three layers; an image covers about 20 tiles
 
 
 class TiledRaster:
-    """Layers of float32 cells at any row and column, also negative ones; unwritten cells are NaN.
+    """Layers of float32 cells at any row and column, including negative ones; unwritten cells are NaN.
 
     Args:
-        n_layers: values per cell.
-        folder: where tiles go that are not at hand; made when needed.
-        most_tiles: kept in memory.
+        n_layers: number of values per cell.
+        folder: folder of the tiles on disk; created when needed.
+        max_tiles: largest number of tiles in memory.
     """
 
-    def __init__(self, n_layers: int, folder: Path, most_tiles: int = _MOST_TILES):
-        self.n_layers, self.folder, self.most_tiles = n_layers, folder, most_tiles
+    def __init__(self, n_layers: int, folder: Path, max_tiles: int = _MAX_TILES):
+        self.n_layers, self.folder, self.max_tiles = n_layers, folder, max_tiles
         self._tiles: OrderedDict[tuple[int, int], Layers] = OrderedDict()
         self._spooled: set[tuple[int, int]] = set()
 
     def read(self, row: int, col: int, rows: int, cols: int) -> Layers:
-        """A copy (n_layers, rows, cols) of the window that begins at this cell."""
+        """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col)."""
         window = np.full((self.n_layers, max(rows, 0), max(cols, 0)), np.nan, np.float32)
-        for key, inside, outside in _pieces(row, col, rows, cols):
+        for key, in_tile, in_window in _overlapping_tiles(row, col, rows, cols):
             if key in self._tiles or key in self._spooled:
-                window[outside] = self._tile(key)[inside]
+                window[in_window] = self._tile(key)[in_tile]
         return window
 
     def write(self, row: int, col: int, window: Layers) -> None:
-        """Puts a window (n_layers, rows, cols) back. Raises OSError where the disk is full."""
-        for key, inside, outside in _pieces(row, col, *window.shape[1:]):
-            if key in self._tiles or key in self._spooled or not np.isnan(window[outside]).all():
-                self._tile(key)[inside] = window[outside]
+        """Writes a window (n_layers, rows, cols) whose first cell is (row, col). Raises OSError if the disk is full."""
+        for key, in_tile, in_window in _overlapping_tiles(row, col, *window.shape[1:]):
+            if key in self._tiles or key in self._spooled or not np.isnan(window[in_window]).all():
+                self._tile(key)[in_tile] = window[in_window]
 
     def clear(self) -> None:
-        """Forgets all cells."""
+        """Removes all cells and their files."""
         self._tiles.clear()
         for key in self._spooled:
             self._path(key).unlink(missing_ok=True)
         self._spooled.clear()
 
     def _tile(self, key: tuple[int, int]) -> Layers:
+        """Returns a tile for reading and writing; loads or creates it if needed."""
         if key not in self._tiles:
             if key in self._spooled:
                 self._tiles[key] = np.load(self._path(key))
             else:
-                self._tiles[key] = np.full((self.n_layers, SIDE, SIDE), np.nan, np.float32)
-            if len(self._tiles) > self.most_tiles:
+                self._tiles[key] = np.full((self.n_layers, TILE_SIDE, TILE_SIDE), np.nan, np.float32)
+            if len(self._tiles) > self.max_tiles:
                 self._spool(*self._tiles.popitem(last=False))
         self._tiles.move_to_end(key)
         return self._tiles[key]
 
     def _spool(self, key: tuple[int, int], tile: Layers) -> None:
+        """Writes a tile to disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
         np.save(self._path(key), tile)
         self._spooled.add(key)
@@ -70,13 +72,15 @@ class TiledRaster:
         return self.folder / f"tile_{key[0]}_{key[1]}.npy"
 
 
-def _pieces(
+def _overlapping_tiles(
     row: int, col: int, rows: int, cols: int
 ) -> Iterator[tuple[tuple[int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Per tile that a window touches: its key, the part of it inside the window, and that part of the window."""
-    for i in range(row // SIDE, -(-(row + rows) // SIDE)):
-        for j in range(col // SIDE, -(-(col + cols) // SIDE)):
-            top, left = max(row, i * SIDE), max(col, j * SIDE)
-            bottom, right = min(row + rows, (i + 1) * SIDE), min(col + cols, (j + 1) * SIDE)
-            inside = (slice(None), slice(top - i * SIDE, bottom - i * SIDE), slice(left - j * SIDE, right - j * SIDE))
-            yield (i, j), inside, (slice(None), slice(top - row, bottom - row), slice(left - col, right - col))
+    """Yields, per tile that overlaps a window: its key, and the overlap as slices of the tile and of the window."""
+    for i in range(row // TILE_SIDE, -(-(row + rows) // TILE_SIDE)):
+        for j in range(col // TILE_SIDE, -(-(col + cols) // TILE_SIDE)):
+            top, left = max(row, i * TILE_SIDE), max(col, j * TILE_SIDE)
+            bottom, right = min(row + rows, (i + 1) * TILE_SIDE), min(col + cols, (j + 1) * TILE_SIDE)
+            first_row, first_col = i * TILE_SIDE, j * TILE_SIDE
+            in_tile = (slice(top - first_row, bottom - first_row), slice(left - first_col, right - first_col))
+            in_window = (slice(top - row, bottom - row), slice(left - col, right - col))
+            yield (i, j), (slice(None), *in_tile), (slice(None), *in_window)

@@ -1,4 +1,4 @@
-"""The rows of a study on disk: each is written down as it comes, and all of them become one Parquet table."""
+"""Results of a study on disk: one JSON line per survey while it runs, and one Parquet table at the end."""
 
 from __future__ import annotations
 
@@ -16,36 +16,43 @@ import pyarrow.parquet as pq
 
 from twin.study.flight import Row
 
-_CHUNK = 1000  # rows turned into columns at a time: a hundred thousand as dictionaries would take gigabytes
+_CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionaries would take gigabytes
 
 
-class Ledger:
-    """rows.jsonl: a row a line, the last of a survey counts. A full disk keeps rows waiting, and never ends a study."""
+class ResultsLog:
+    """The file rows.jsonl: one row per line, where a later row of a survey replaces an earlier one.
+
+    If the disk is full, rows stay in memory and are written with the next one.
+    """
 
     def __init__(self, folder: Path):
         self.file = folder / "rows.jsonl"
-        self._waiting: list[str] = []
+        self._unwritten: list[str] = []
 
     def add(self, row: Row) -> None:
-        """Writes a row down, with those that could not be written before."""
-        self._waiting.append(json.dumps(row) + "\n")
+        """Writes a row, with the earlier ones that could not be written."""
+        self._unwritten.append(json.dumps(row) + "\n")
         with suppress(OSError):
             self.flush()
 
     def flush(self) -> None:
-        """Writes down what waits. Raises OSError where it cannot."""
-        if not self._waiting:
+        """Writes the rows that are still in memory.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        if not self._unwritten:
             return
         with self.file.open("a+b", buffering=0) as file:
             begin = file.seek(0, 2)
-            lines = _lead(file, begin) + "".join(self._waiting).encode()
+            lines = _line_end(file, begin) + "".join(self._unwritten).encode()
             if (file.write(lines) or 0) < len(lines):
-                file.truncate(begin)  # of a row all or nothing
+                file.truncate(begin)  # no partial rows
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
-        self._waiting.clear()
+        self._unwritten.clear()
 
     def rows(self) -> Iterator[Row]:
-        """Every row that was written whole, in the order of writing."""
+        """Yields all complete rows in the order of writing."""
         if not self.file.exists():
             return
         with self.file.open("rb") as file:
@@ -58,36 +65,39 @@ class Ledger:
                     yield row
 
     def done(self) -> set[tuple[int, int]]:
-        """Sample and seed of the surveys that need not be flown again."""
+        """Returns sample and seed of the surveys that have a result; those that failed are to be flown again."""
         status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
-        return {key for key, ended in status.items() if ended != "failed"}
+        return {key for key, last in status.items() if last != "failed"}
 
     def table(self, wanted: Container[tuple[int, int]] | None = None) -> pa.Table:
-        """The rows that count of the surveys wanted (None: all), by sample and seed, with the columns of all of them.
+        """Returns the last row of each survey as a table, sorted by sample and seed.
 
-        The same rows in any order of writing give the same table.
+        The table does not depend on the order in which the rows were written.
+
+        Args:
+            wanted: sample and seed of the surveys to include; None for all.
         """
-        latest = {(row["sample"], row["seed"]): number for number, row in enumerate(self.rows())}
-        counts = {number for key, number in latest.items() if wanted is None or key in wanted}
+        last = {(row["sample"], row["seed"]): number for number, row in enumerate(self.rows())}
+        included = {number for key, number in last.items() if wanted is None or key in wanted}
 
-        def counting() -> Iterator[Row]:
-            return (row for number, row in enumerate(self.rows()) if number in counts)
+        def included_rows() -> Iterator[Row]:
+            return (row for number, row in enumerate(self.rows()) if number in included)
 
         types: dict[str, pa.DataType] = {}
-        for row in counting():
+        for row in included_rows():
             for name, value in row.items():
-                types[name] = _wider(types.get(name, pa.null()), _type(value))
-        rows, chunks = counting(), []
+                types[name] = _common_type(types.get(name, pa.null()), _type(value))
+        rows, chunks = included_rows(), []
         while chunk := list(islice(rows, _CHUNK)):
             chunks.append(pa.table({name: _column([row.get(name) for row in chunk], types[name]) for name in types}))
         if not chunks:
             return pa.table({})
         whole = pa.concat_tables(chunks).sort_by([("sample", "ascending"), ("seed", "ascending")])
-        return whole.select(_ordered(whole.column_names)).combine_chunks()
+        return whole.select(_sorted_columns(whole.column_names)).combine_chunks()
 
 
-def _lead(file: IO[bytes], end: int) -> bytes:
-    """What to write first: a line that was cut off, as by a loss of power, is ended before the next."""
+def _line_end(file: IO[bytes], end: int) -> bytes:
+    """Returns a line break if the last line of the file is incomplete, e.g. after a power failure; else nothing."""
     if end == 0:
         return b""
     file.seek(end - 1)
@@ -95,27 +105,27 @@ def _lead(file: IO[bytes], end: int) -> bytes:
 
 
 def write_parquet(rows: pa.Table, file: Path) -> None:
-    """Writes the table, atomically."""
+    """Writes the table atomically."""
     part = file.with_name(f".{file.name}.part")
     pq.write_table(rows, part)
     part.replace(file)
 
 
-def _ordered(names: Iterable[str]) -> list[str]:
-    """Identity, what varies, figures, times: within each by name, as rows come in no order of their own."""
+def _sorted_columns(names: Iterable[str]) -> list[str]:
+    """Returns the names ordered by section: identity, varied keys, metrics, timing; alphabetical within each."""
     identity = ("sample", "seed", "status", "reason", "warning", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 
-    def place(name: str) -> tuple[int, int, str]:
+    def sort_key(name: str) -> tuple[int, int, str]:
         if name in identity:
             return 0, identity.index(name), name
         return sections.get(name.partition(".")[0], 2), 0, name
 
-    return sorted(names, key=place)
+    return sorted(names, key=sort_key)
 
 
 def _type(value: Any) -> pa.DataType:
-    """The column that holds a value; what is neither number nor text goes in as JSON."""
+    """Returns the column type of a value; anything but numbers and strings is stored as JSON text."""
     if value is None:
         return pa.null()
     for kind, column in ((bool, pa.bool_()), (int, pa.int64()), (float, pa.float64())):
@@ -124,8 +134,8 @@ def _type(value: Any) -> pa.DataType:
     return pa.string()
 
 
-def _wider(one: pa.DataType, other: pa.DataType) -> pa.DataType:
-    """The column that holds both."""
+def _common_type(one: pa.DataType, other: pa.DataType) -> pa.DataType:
+    """Returns a column type that can store the values of both types."""
     if one == other or pa.types.is_null(other):
         return one
     if pa.types.is_null(one):

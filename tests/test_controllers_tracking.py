@@ -1,12 +1,12 @@
-"""The pilot flies the plan on noisy estimates, holds its place, and asks of the thrusters what they can give."""
+"""Pose controller and thrust allocation: tracking errors in currents, saturation, unknown hull parameters."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from physics_world import bare_world
+from physics_world import bare_model
 
-from controllers.allocation import allocation
+from controllers.allocation import pseudo_inverse_allocation
 from controllers.lawnmower import plan
 from controllers.segments import Reference
 from controllers.survey_plan import SurveyRequest
@@ -14,32 +14,33 @@ from controllers.tracking import body_reference, commanded_velocity
 from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.core import geometry
 from twin.scenario.model import VehicleConfig
-from twin.simulate.autopilot import nominal_pilot, top_speed_mps
-from twin.simulate.hull import hull_of
+from twin.simulate.autopilot import nominal_controller, top_speed_mps
+from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
+from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.thrusters import steady_thrust_n
-from twin.simulate.vehicle import Vehicle
 
 RATE_HZ = 30.0
 LEVER_M = np.array([0.0, 0.075, -0.15])
-EFFECTS = angular_first(ROV.allocation)
+CONFIGURATION = angular_first(ROV.thrust_configuration)
 
 
 def thrust_of(command):
+    """Returns the steady thrust [N] at commands in [-1, 1]."""
     return steady_thrust_n(command, ROV.thrust_coefficients)
 
 
-SHARES = allocation(EFFECTS, thrust_of)
+ALLOCATION = pseudo_inverse_allocation(CONFIGURATION, thrust_of)
 
 
 def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors):
-    """Flies a small survey on the true state plus noise; errors of position (n, 3) [m] and attitude (n, 3) [deg]."""
+    """Flies a small survey with noisy state estimates; returns RMS position errors [m] and greatest tilts [deg]."""
     rng = np.random.default_rng(seed)
     p = plan(SurveyRequest((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ))
     start = body_reference(p.reference(1, 0.0), LEVER_M).position
     section = VehicleConfig(**factors)
-    rov = Vehicle(bare_world(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
-    pilot = nominal_pilot(1.2, RATE_HZ)
+    rov = MujocoVehicle(bare_model(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
+    controller = nominal_controller(1.2, RATE_HZ)
     rows = []
     for track in range(1, p.n_tracks + 1):
         duration = p.track_duration_s(track)
@@ -57,7 +58,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
             )
             estimate = pose @ geometry.exp(np.concatenate([rng.normal(0, 0.002, 3), rng.normal(0, 0.003, 3)]))
             twist = rov.twist_body + np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.02, 3)])
-            rov.step(pilot.command(estimate, twist, reference), 1 / RATE_HZ)
+            rov.step(controller.command(estimate, twist, reference), 1 / RATE_HZ)
     table = np.array(rows)
     cruising, holding, settled = (table[:, k].astype(bool) for k in (6, 7, 8))
     return SimpleNamespace(
@@ -74,7 +75,7 @@ def rms(values):
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 0.61])
-def test_in_still_water_legs_are_flown_and_stations_kept_within_a_centimetre(speed_mps):
+def test_in_still_water_legs_and_station_keeping_are_accurate_to_one_centimetre(speed_mps):
     flown = survey(speed_mps)
     assert flown.cross_m < 0.01
     assert flown.altitude_m < 0.01
@@ -85,7 +86,7 @@ def test_in_still_water_legs_are_flown_and_stations_kept_within_a_centimetre(spe
 
 @pytest.mark.parametrize("speed_mps", [0.3, 0.61])
 @pytest.mark.parametrize("current_mps", [(0.1, 0.0, 0.0), (-0.06, 0.08, 0.0), (0.0, 0.08, 0.06)])
-def test_a_current_of_ten_centimetres_a_second_moves_the_legs_by_less_than_two_centimetres(speed_mps, current_mps):
+def test_in_a_current_of_ten_centimetres_per_second_legs_are_accurate_to_two_centimetres(speed_mps, current_mps):
     flown = survey(speed_mps, current_mps)
     assert flown.cross_m < 0.02
     assert flown.altitude_m < 0.02
@@ -95,43 +96,43 @@ def test_a_current_of_ten_centimetres_a_second_moves_the_legs_by_less_than_two_c
 @pytest.mark.parametrize(
     "factors", [{"drag_factor": 0.3}, {"drag_factor": 2.0}, {"added_mass_factor": 0.3}, {"buoyancy_n": 6.0}]
 )
-def test_a_hull_unlike_the_believed_one_still_flies_its_legs(factors):
+def test_legs_are_accurate_with_a_wrong_hull_model(factors):
     flown = survey(0.3, (0.05, 0.05, 0.0), **factors)
     assert flown.cross_m < 0.02
     assert flown.altitude_m < 0.02
     assert flown.tilt_deg < 5
 
 
-def test_within_reach_the_thrusters_give_the_wrench_that_was_asked():
+def test_below_saturation_the_thrusters_produce_the_commanded_wrench():
     rng = np.random.default_rng(0)
     for wrench in rng.normal(size=(20, 6)) * [0.5, 0.5, 0.5, 10, 10, 10]:
-        commands, share = SHARES.commands(wrench)
-        assert share == 1
+        commands, scale = ALLOCATION.commands(wrench)
+        assert scale == 1
         # the table is linear between commands 0.001 apart: an error of F''/8 * 1e-6 < 1e-4 N a thruster
-        np.testing.assert_allclose(EFFECTS @ thrust_of(commands), wrench, atol=1e-3)
+        np.testing.assert_allclose(CONFIGURATION @ thrust_of(commands), wrench, atol=1e-3)
 
 
-def test_beyond_reach_the_wrench_keeps_its_direction_and_one_thruster_gives_its_all():
+def test_in_saturation_the_wrench_keeps_its_direction_and_one_thruster_is_at_full_thrust():
     wrench = np.array([1.0, -2.0, 3.0, 300.0, 20.0, -50.0])
-    commands, share = SHARES.commands(wrench)
-    assert 0 < share < 1
-    np.testing.assert_allclose(EFFECTS @ thrust_of(commands), share * wrench, atol=2e-3)
-    strongest = thrust_of(np.linspace(-1, 1, 100_001)).max()  # the fitted curve bends back before full command
+    commands, scale = ALLOCATION.commands(wrench)
+    assert 0 < scale < 1
+    np.testing.assert_allclose(CONFIGURATION @ thrust_of(commands), scale * wrench, atol=2e-3)
+    strongest = thrust_of(np.linspace(-1, 1, 100_001)).max()  # the fitted curve decreases near full command
     assert np.abs(thrust_of(commands)).max() == pytest.approx(strongest, abs=1e-3)
     assert np.abs(commands).max() <= 1
 
 
-def test_weights_spare_a_thruster_and_the_allocation_is_of_least_weighted_effort():
+def test_a_greater_weight_reduces_a_thrust_and_the_weighted_effort_is_minimal():
     weights = np.array([1.0, 1, 1, 1, 5, 1, 1, 1])
     wrench = np.array([1.0, -0.5, 0.7, 10.0, 3.0, -8.0])
-    thrusts = allocation(EFFECTS, thrust_of, weights).thrusts_from_wrench @ wrench
-    np.testing.assert_allclose(EFFECTS @ thrusts, wrench, atol=1e-12)
-    idle = np.linalg.svd(EFFECTS)[2][6:]  # thrusts that cancel each other: none of them may lower the effort
-    np.testing.assert_allclose(idle @ (weights * thrusts), 0, atol=1e-12)
-    assert abs(thrusts[4]) < abs(SHARES.thrusts_from_wrench @ wrench)[4]
+    thrusts = pseudo_inverse_allocation(CONFIGURATION, thrust_of, weights).thrusts_from_wrench @ wrench
+    np.testing.assert_allclose(CONFIGURATION @ thrusts, wrench, atol=1e-12)
+    null_space = np.linalg.svd(CONFIGURATION)[2][6:]  # thrusts without a wrench; none may reduce the effort
+    np.testing.assert_allclose(null_space @ (weights * thrusts), 0, atol=1e-12)
+    assert abs(thrusts[4]) < abs(ALLOCATION.thrusts_from_wrench @ wrench)[4]
 
 
-def test_body_and_camera_references_differ_by_the_lever_arm_turned_to_the_heading():
+def test_body_and_camera_references_differ_by_the_lever_arm_rotated_by_yaw():
     camera = Reference(np.array([1.0, 2.0, 3.0]), np.zeros(3), 0.7, np.zeros(3))
     body = body_reference(camera, LEVER_M)
     pose = geometry.pose(geometry.rotation_from_rpy(0, 0, 0.7), body.position)
@@ -139,37 +140,37 @@ def test_body_and_camera_references_differ_by_the_lever_arm_turned_to_the_headin
 
 
 @pytest.mark.parametrize("bearing_deg", [0.0, 30.0, 45.0, 90.0, 200.0])
-def test_at_top_speed_in_any_direction_drag_takes_all_that_one_thruster_gives(bearing_deg):
+def test_at_top_speed_in_any_direction_one_thruster_is_at_full_thrust(bearing_deg):
     bearing = np.deg2rad(bearing_deg)
     direction = np.array([np.cos(bearing), np.sin(bearing), 0.0])
-    hull = hull_of(VehicleConfig())
+    hull = trimmed_hull(VehicleConfig())
     velocity = top_speed_mps(VehicleConfig(), direction) * direction
     drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
-    thrusts = np.linalg.pinv(EFFECTS) @ [0, 0, 0, *drag]
+    thrusts = np.linalg.pinv(CONFIGURATION) @ [0, 0, 0, *drag]
     assert np.abs(thrusts).max() == pytest.approx(thrust_of(np.ones(1))[0])
 
 
-def test_a_commanded_velocity_follows_the_reference_and_closes_the_gap():
+def test_the_commanded_velocity_is_the_reference_velocity_plus_a_position_correction():
     reference = Reference(np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.0, 0.0]), 0.0, np.zeros(3))
     np.testing.assert_allclose(commanded_velocity(np.array([1.0, 1.5, 3.0]), reference, 1.2), [0.3, 0.6, 0.0])
 
 
-def test_while_thrusters_saturate_the_integral_does_not_wind_up():
-    pilot = nominal_pilot(1.2, RATE_HZ)
+def test_the_integral_does_not_wind_up_while_thrusters_saturate():
+    controller = nominal_controller(1.2, RATE_HZ)
     far = Reference(np.array([50.0, 0.0, 0.0]), np.zeros(3), 0.0, np.zeros(3))
     for _ in range(300):
-        pilot.command(np.eye(4), np.zeros(6), far)
-    commands = pilot.command(np.eye(4), np.zeros(6), far._replace(position=np.zeros(3)))
+        controller.command(np.eye(4), np.zeros(6), far)
+    commands = controller.command(np.eye(4), np.zeros(6), far._replace(position=np.zeros(3)))
     np.testing.assert_allclose(commands, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, np.pi / 2, -3.0])
-def test_the_pilot_holds_any_heading_against_a_current(yaw):
+def test_station_keeping_in_a_current_works_at_any_heading(yaw):
     reference = Reference(np.zeros(3), np.zeros(3), yaw, np.zeros(3))
     start = geometry.pose(geometry.rotation_from_rpy(0.1, 0.1, yaw + 0.4), np.array([0.2, 0.0, 0.0]))
-    rov = Vehicle(bare_world(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
-    pilot = nominal_pilot(1.2, RATE_HZ)
+    rov = MujocoVehicle(bare_model(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
+    controller = nominal_controller(1.2, RATE_HZ)
     for _ in range(20 * 30):
-        rov.step(pilot.command(rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
+        rov.step(controller.command(rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
     np.testing.assert_allclose(rov.world_from_body[:3, 3], 0, atol=0.005)
     np.testing.assert_allclose(rov.world_from_body[:3, :3], geometry.rotation_from_rpy(0, 0, yaw), atol=0.005)

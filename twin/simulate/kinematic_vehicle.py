@@ -1,4 +1,4 @@
-"""A carrier instead of a vehicle: the paper's own motion, level and at constant height, as if on rails."""
+"""Vehicle without dynamics: level, at constant height, it moves exactly at the commanded velocity."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from twin.errors import SurveyAborted
 Array = NDArray[np.float64]
 
 
-class Carrier:
-    """Moves at exactly the commanded velocity without turning or rising; without thrust, drag or current.
+class KinematicVehicle:
+    """Vehicle that moves horizontally at the commanded velocity, without rotation, thrust, drag or current.
 
-    The paper's simulated vehicle: t_Z and all rotation are zero (Negahdaripour & Madjidi 2003, section V-A).
+    This is the paper's simulated vehicle: t_Z and all rotation are zero (Negahdaripour & Madjidi 2003, section V-A).
 
     Args:
-        world_from_body: (4, 4) pose at the start, at rest.
+        world_from_body: (4, 4) initial pose, at rest.
     """
 
     def __init__(self, world_from_body: Array):
@@ -26,11 +26,11 @@ class Carrier:
 
     @property
     def twist_body(self) -> Array:
-        """True [angular, linear] velocity in the body (6,) [rad/s, m/s]."""
+        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s]."""
         return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Moves for a while with the horizontal part of a velocity in the world (3,) [m/s].
+        """Moves for a duration at the horizontal part of a velocity command (3,) in the world [m/s].
 
         Raises:
             SurveyAborted: the command is not finite.

@@ -1,0 +1,47 @@
+"""Command `twin fit-surrogate`: fits the surrogate's error model to rendered surveys."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.progress import track
+
+from twin.app import console
+from twin.study.study_file import load_study
+from twin.study.surveys import surveys
+from twin.surrogate import error_model_file
+from twin.surrogate_fit.rendered_surveys import fit_to_surveys, survey_statistics
+
+DEFAULT_STUDIES = ("fit_reef", "fit_sun", "fit_paper")
+
+
+def run(files: Sequence[str], out: Path, runs: Path) -> int:
+    """Flies the rendered surveys of the studies, fits the error model to them and writes it.
+
+    Args:
+        files: studies; the built-in ones if empty.
+        out: error model to write (TOML).
+        runs: folder of the rendered surveys; finished ones are reused.
+
+    Returns:
+        the exit status.
+
+    Raises:
+        TwinError: a study is invalid, or too few surveys are complete.
+    """
+    compared = error_model_file.load().model
+    rendered = [
+        (s.scenario, s.folder)
+        for file in files or DEFAULT_STUDIES
+        for s in surveys(load_study(file), runs / Path(file).stem)
+    ]
+    statistics = [
+        survey_statistics(scenario, folder, compared) for scenario, folder in track(rendered, "Rendered surveys")
+    ]
+    fitted = fit_to_surveys(statistics, compared)
+    error_model_file.save(fitted, out)
+    rows: list[tuple[str, ...]] = [(name, f"{value:.1%}") for name, value in fitted.misfit.items()]
+    console.print_table(f"Fit to {fitted.n_surveys} surveys", rows)
+    print(f"Error model: {out}")
+    return 0

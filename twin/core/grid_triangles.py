@@ -1,0 +1,35 @@
+"""Triangulation of a regular grid: two triangles per cell, split along the diagonal from south-west to north-east."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
+    """Returns the triangles of a grid, counter-clockwise as seen from above, cell by cell.
+
+    Args:
+        vertices: (rows, cols) vertex numbers; rows run from south to north, columns from west to east.
+
+    Returns:
+        (2 (rows - 1) (cols - 1), 3) vertex numbers, of the same integer type.
+    """
+    sw, se, ne, nw = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, 1:], vertices[1:, :-1]
+    return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
+
+
+def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Returns the triangles between the valid cells of a raster, counter-clockwise as seen from above.
+
+    Args:
+        valid: (rows, cols) bool; row 0 is the northernmost.
+
+    Returns:
+        (n, 3) numbers of the cells in row-major order.
+    """
+    cells = np.arange(valid.size).reshape(valid.shape)
+    triangles = grid_triangles(cells[::-1])
+    return triangles[valid.reshape(-1)[triangles].all(axis=1)]

@@ -1,0 +1,60 @@
+"""Interpolation kernels between the pixels of an image, compiled.
+
+All kernels take the position between the middle two samples as a fraction in [0, 1).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, inline="always")
+def bilinear(image, row, col, row_fraction, col_fraction):
+    """Returns the bilinear value between pixel (row, col) and the next row and column."""
+    top = image[row, col] * (1 - col_fraction) + image[row, col + 1] * col_fraction
+    bottom = image[row + 1, col] * (1 - col_fraction) + image[row + 1, col + 1] * col_fraction
+    return top * (1 - row_fraction) + bottom * row_fraction
+
+
+@njit(cache=True, nogil=True, inline="always")
+def catmull_rom(a, b, c, e, t):
+    """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
+
+    Cubic convolution with a = -1/2 (Keys 1981).
+    """
+    c1 = 0.5 * (c - a)
+    c2 = a - 2.5 * b + 2 * c - 0.5 * e
+    c3 = 0.5 * (e - a) + 1.5 * (b - c)
+    return b + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def bicubic_with_gradient(image, x, y):
+    """Returns the Catmull-Rom value of an image at (x, y) and its derivatives by x and y.
+
+    (x, y) lies inside the image; samples beyond the border repeat the border pixel. On an exact row, as in rectified
+    stereo, the derivative by y is the central difference.
+    """
+    height, width = image.shape
+    i, j = int(x), int(y)
+    s, t = np.float32(x - i), np.float32(y - j)
+    i0, i2, i3 = max(i - 1, 0), min(i + 1, width - 1), min(i + 2, width - 1)
+    j0, j2, j3 = max(j - 1, 0), min(j + 1, height - 1), min(j + 2, height - 1)
+    b, gb = catmull_rom(image[j, i0], image[j, i], image[j, i2], image[j, i3], s)
+    if t == 0:
+        return b, gb, np.float32(0.5) * (image[j2, i] - image[j0, i])
+    a, ga = catmull_rom(image[j0, i0], image[j0, i], image[j0, i2], image[j0, i3], s)
+    c, gc = catmull_rom(image[j2, i0], image[j2, i], image[j2, i2], image[j2, i3], s)
+    e, ge = catmull_rom(image[j3, i0], image[j3, i], image[j3, i2], image[j3, i3], s)
+    value, gy = catmull_rom(a, b, c, e, t)
+    return value, catmull_rom(ga, gb, gc, ge, t)[0], gy
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
+def bspline_weights(s):
+    """Returns the weights of four cubic B-spline coefficients at float32 fraction s between the middle two."""
+    one, sixth = np.float32(1), np.float32(1 / 6)
+    left, right = (one - s) * (one - s) * (one - s) * sixth, s * s * s * sixth
+    middle = np.float32(2 / 3) - s * s * (one - s * np.float32(0.5))
+    return left, middle, one - left - middle - right, right

@@ -1,0 +1,54 @@
+"""Settings of the estimators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from twin.errors import TwinError
+
+#: Smallest fraction of the matched points of a link that have to be inliers of its motion.
+MIN_INLIER_SHARE = 0.3
+#: Standard deviation of the interpolation bias that all points of a link share [px].
+COMMON_BIAS_PX = 0.005
+
+
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """Settings of motion estimation, the keyframe network and global alignment.
+
+    Args:
+        window_tracks: previous tracks in the window of a global alignment at the end of a track.
+        node_stride: every n-th keyframe is a node of the network.
+        min_overlap: smallest overlap of linked nodes, a fraction of the node's matched points.
+        max_links: largest number of links from a node to earlier nodes.
+        use_f2m: register keyframes with the mosaic (F2M).
+        use_ga: align the network globally (GA) at the end of each track and of the survey.
+        points: largest number of matched points of a keyframe.
+        patch_px: side of the matching window, the same for stereo and for motion [px]; odd.
+        keyframe_overlap: a frame becomes a keyframe where its overlap with the last keyframe falls below this fraction;
+            used only where the caller does not choose the keyframes.
+
+    Raises:
+        TwinError: a value is out of range.
+    """
+
+    window_tracks: int = 4
+    node_stride: int = 1
+    min_overlap: float = 0.45
+    max_links: int = 7
+    use_f2m: bool = True
+    use_ga: bool = True
+    points: int = 500
+    patch_px: int = 11
+    keyframe_overlap: float = 0.9
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("window_tracks", 0, 1000), ("node_stride", 1, 20), ("max_links", 1, 50), ("points", 30, 5000),
+            ("patch_px", 7, 61),
+        ):  # fmt: skip
+            if not low <= getattr(self, name) <= high:
+                raise TwinError(f"estimate.{name}", f"{getattr(self, name)!r} is out of range", f"{low} to {high}")
+        for name in ("min_overlap", "keyframe_overlap"):
+            if not 0 < getattr(self, name) < 1:
+                raise TwinError(f"estimate.{name}", f"{getattr(self, name)!r} is out of range", "between 0 and 1")

@@ -1,0 +1,28 @@
+"""The area that the keyframes of a survey show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.records import MapGrid, StereoRig, SurveyResult
+
+_CELL_PX = 3.0  # side of a map cell in pixels at the median depth: a height needs several disparities
+
+
+def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = None) -> MapGrid:
+    """Returns the grid that covers the images of all keyframes, each at the median depth of its matched points.
+
+    Args:
+        result: with at least one keyframe.
+        cell_m: side of a cell [m]; by default three pixels at the median depth of the survey.
+    """
+    depth_m = result.keyframe_depth_m
+    cell = cell_m or _CELL_PX * float(np.median(depth_m)) / rig.focal_px
+    corners = np.array([[0, 0], [rig.width_px, 0], [0, rig.height_px], [rig.width_px, rig.height_px]], np.float64)
+    rays = np.column_stack([rig.normalised(corners - 0.5), np.ones(4)])
+    poses = result.final.world_from_camera[result.keyframe_rows]
+    seen = np.concatenate([geometry.transform(p, rays * d)[:, :2] for p, d in zip(poses, depth_m, strict=True)])
+    west, south = np.floor(seen.min(axis=0) / cell) * cell
+    east, north = np.ceil(seen.max(axis=0) / cell) * cell
+    return MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))

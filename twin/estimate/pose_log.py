@@ -1,0 +1,37 @@
+"""Record of the estimated poses, frame by frame."""
+
+from __future__ import annotations
+
+from twin.core.geometry import Array
+from twin.core.growing_array import GrowingArray
+
+
+class PoseLog:
+    """Times and estimated poses of all frames; memory grows by 264 bytes a frame."""
+
+    def __init__(self) -> None:
+        self._times_s, self._f2f, self._online = GrowingArray(), GrowingArray(4, 4), GrowingArray(4, 4)
+
+    def __len__(self) -> int:
+        return len(self._times_s)
+
+    @property
+    def times_s(self) -> Array:
+        """(n,) times of the frames [s]."""
+        return self._times_s.array
+
+    @property
+    def f2f(self) -> Array:
+        """(n, 4, 4) world_from_camera by frame-to-frame motion alone."""
+        return self._f2f.array
+
+    @property
+    def online(self) -> Array:
+        """(n, 4, 4) world_from_camera as estimated online."""
+        return self._online.array
+
+    def append(self, times_s: float | Array, f2f: Array, online: Array) -> None:
+        """Appends one frame or several: times () or (n,) [s], poses (4, 4) or (n, 4, 4)."""
+        self._times_s.append(times_s)
+        self._f2f.append(f2f)
+        self._online.append(online)

@@ -1,0 +1,114 @@
+"""Measurement of a link: matches the points of a keyframe in an earlier stereo pair and estimates the motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import StereoRig
+from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
+from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
+from twin.estimate.vision.image_spool import ImageSpool
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.observation_equations import PairMeasurements
+
+_LEVELS = 2  # pyramid levels above the full image: predictions may be wrong by 8 px
+
+
+class PairMatcher:
+    """Matches a node with earlier nodes and estimates the motions between them.
+
+    Args:
+        rig: calibration at the scale of the spooled grey levels.
+        spool: images of the keyframes.
+        patch_px: side of the matched patches (odd).
+    """
+
+    def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
+        self.rig, self.spool, self.patch_px = rig, spool, patch_px
+        self._workers = ThreadPoolExecutor(2)
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._workers.shutdown()
+
+    def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[PairMeasurements | None]:
+        """Matches the node's points in both images of each other pair, two pairs at a time.
+
+        Returns:
+            Per other node, the points measured in its pair (a) and in the pair of `node` (b); None for all if the node
+            has no points.
+        """
+        points = node.points
+        if points is None:
+            return [None for _ in others]
+        left, _ = self.spool.gray(node.row)
+        templates = patches.extract_templates(patches.pyramid(left, _LEVELS), points.pixels, self.patch_px)
+        return list(self._workers.map(lambda other: self._match_pair(node, points, templates, other), others))
+
+    def _match_pair(
+        self,
+        node: Keyframe,
+        points: stereo.StereoPoints,
+        templates: Sequence[patches.PatchTemplates],
+        other: Keyframe,
+    ) -> PairMeasurements:
+        """Returns the points that are matched in both images of another pair.
+
+        Matching starts at the positions predicted from poses and depth, with each patch warped by the plane under it.
+        """
+        rig = self.rig
+        other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
+        expected, jacobian, _ = observation_equations.transfer(points.measured, other_from_node, rig.baseline_m)
+        warp = jacobian[:, :, :2] + jacobian[:, :, 2:] * points.disparity_slope[:, None, :]
+        left_warp, right_warp = warp[:, :2], warp[:, :2] - np.stack([warp[:, 2], np.zeros_like(warp[:, 2])], axis=1)
+        left_px, shift_px = self._project(expected)
+        left, right = self.spool.gray(other.row)
+        left_splines = patches.spline_coefficients(patches.pyramid(left, _LEVELS))
+        in_left = patches.match_templates(templates, left_splines, left_px, left_warp)
+        right_px, right_splines = in_left.points - shift_px, patches.spline_coefficients([right])
+        in_right = patches.match_templates(templates, right_splines, right_px, right_warp)
+        ok = in_left.ok & in_right.ok & stereo.satisfies_epipolar(in_left.points, in_right.points)
+        ok &= self._in_view(points, other_from_node)
+        source_cov = (in_left.cov[ok] + in_right.cov[ok]) / 2
+        cov = left_warp[ok] @ source_cov @ left_warp[ok].transpose(0, 2, 1)
+        measured, measured_cov = stereo.fuse(in_left.points[ok], in_right.points[ok], cov, rig)
+        return PairMeasurements(measured, points.measured[ok], measured_cov, points.cov[ok])
+
+    def _in_view(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
+        """Returns which points (n,) have their patch well inside both images of the other pair."""
+        smoothed = np.column_stack([points.measured[:, :2], points.mean_disparity_px / self.rig.focal_px])
+        expected, _, _ = observation_equations.transfer(smoothed, other_from_node, self.rig.baseline_m)
+        left_px, shift_px = self._project(expected)
+        in_left, in_right = (stereo.well_inside(px, self.rig, self.patch_px) for px in (left_px, left_px - shift_px))
+        return in_left & in_right
+
+    def _project(self, points: Array) -> tuple[Array, Array]:
+        """Returns the pixels (n, 2) of normalised points (n, 3) in the left image, and their (disparity, 0) (n, 2)."""
+        left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
+        return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
+
+    def motion(self, node: Keyframe, other: Keyframe, measured: PairMeasurements) -> two_view_motion.Motion | None:
+        """Estimates the pose of `node` in `other` from their matched points, jointly with the structure.
+
+        The estimate starts from the closed form of eq. (2), or from the predicted poses if that fails.
+
+        Returns:
+            The motion, or None if too few of the matched points are inliers.
+        """
+        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
+        closed_form = two_view_motion.exact_depth_motion(measured.a, measured.b, self.rig.baseline_m, predicted)
+        settings = two_view_motion.PairMotionSettings(
+            common_sigma=COMMON_BIAS_PX / self.rig.focal_px,
+            variance_inflation=matching.variance_inflation(measured.b[:, :2] * self.rig.focal_px, self.patch_px),
+        )
+        guess = predicted if closed_form is None else closed_form
+        motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)
+        if motion is None or motion.n_points < MIN_INLIER_SHARE * len(measured.b):
+            return None
+        return motion._replace(closed_form=closed_form)

@@ -1,0 +1,82 @@
+"""Interface between the estimation pipeline and the stereo camera.
+
+`pipeline.Navigator` uses this interface only, so that measurements can come from images (`stereo_vision.StereoVision`)
+or from an error model without images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from twin.core.geometry import Array
+from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, SurveyResult
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.mosaic import Registration
+from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.two_view_motion import Motion
+
+
+class Vision(Protocol):
+    """Visual measurements. Poses are (4, 4) world_from_camera of the left camera.
+
+    Attributes:
+        stereo_observations: image quality of every stereo pair so far.
+        runs_in_background: whether `measure_motions` takes long enough for a thread of its own.
+    """
+
+    runs_in_background: bool
+    stereo_observations: list[StereoObservation]
+
+    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
+        """F2F: returns the motion since the last frame, and "ok" or the reason why tracking failed."""
+        ...
+
+    def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
+        """Matches a stereo pair.
+
+        Args:
+            row: index of the frame in the trajectories.
+
+        Returns:
+            The matched points, or None where there are too few for a keyframe.
+        """
+        ...
+
+    def restart_tracking(self) -> None:
+        """Restarts F2F tracking from the keyframe that was observed last."""
+        ...
+
+    def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
+        """F2M: returns the correction of the keyframe's predicted pose, or None where the mosaic gives none."""
+        ...
+
+    def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
+        """Adds the last keyframe to the mosaic under its number."""
+        ...
+
+    def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
+        """Rebuilds the mosaic from these keyframes alone, the last ones of the path, at their present poses."""
+        ...
+
+    def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
+        """Returns the motion from each of the other nodes to this node; None where it cannot be measured.
+
+        May be called from another thread.
+        """
+        ...
+
+    def discard(self, numbers: range) -> None:
+        """Releases the memory of keyframes that no further motion will be measured from."""
+        ...
+
+    def build_map(
+        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
+    ) -> ElevationMap:
+        """Builds the elevation map along the final trajectory.
+
+        Args:
+            step_cov: (n_keyframes, 6, 6) covariance of each keyframe relative to the one before.
+            progress: called with the number of keyframes that are done.
+        """
+        ...

@@ -1,0 +1,60 @@
+"""Table of the positioning stages: error, improvement, inputs and disabled parts of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from twin.judge.stages import stage_errors
+
+
+class StageRow(NamedTuple):
+    """One positioning stage in the report.
+
+    Args:
+        stage: key of the stage.
+        inputs: measurements that it uses.
+        rmse_m: RMS position error of the keyframes [m].
+        gain: error of the preceding stage / error of this stage; None if there is none.
+        disabled: note on what the scenario disables in it; "" for nothing.
+    """
+
+    stage: str
+    inputs: str
+    rmse_m: float
+    gain: float | None
+    disabled: str
+
+
+def stage_rows(metrics: Mapping[str, Any], scenario: Mapping[str, Any]) -> list[StageRow]:
+    """Returns a row for each positioning stage of metrics.json that has an error."""
+    return [
+        StageRow(row.stage, _inputs(row.stage, scenario), row.rmse_m, row.gain, _disabled(row.stage, scenario))
+        for row in stage_errors(metrics)
+    ]
+
+
+def _inputs(stage: str, scenario: Mapping[str, Any]) -> str:
+    """Returns the measurements that a stage uses in this scenario."""
+    aiding = list(scenario.get("navigation", {}).get("aiding", []))
+    enabled = _enabled(scenario)
+    f2m, ga = ["F2M"] if enabled["F2M"] else [], ["previous GA"] if enabled["GA"] else []
+    return {
+        "f2f": "optical flow between frames",
+        "chain": "stereo pairs of consecutive keyframes",
+        "online": ", ".join(["chain", *f2m, *aiding, *ga]),
+        "final": ", ".join(["all links", *aiding]) if enabled["GA"] else "same as online",
+    }[stage]
+
+
+def _disabled(stage: str, scenario: Mapping[str, Any]) -> str:
+    """Returns a note on the parts of a stage that the scenario disables."""
+    parts = {"online": ("F2M", "GA"), "final": ("GA",)}.get(stage, ())
+    disabled = [part for part in parts if not _enabled(scenario)[part]]
+    return f"{' and '.join(disabled)} disabled" if disabled else ""
+
+
+def _enabled(scenario: Mapping[str, Any]) -> dict[str, bool]:
+    """Returns whether the scenario enables F2M and GA."""
+    estimate = scenario.get("estimate", {})
+    return {"F2M": estimate.get("use_f2m", True), "GA": estimate.get("use_ga", True)}

@@ -1,0 +1,43 @@
+"""Image of one object at one turbidity level, with its image quality and the contrast against range."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import Image
+from twin.imaging.water import Medium
+from twin.scenario.model import Scenario
+
+Array = NDArray[np.float64]
+
+#: Fraction of its clear-water contrast below which detail is invisible.
+MIN_VISIBLE_CONTRAST = 0.05
+
+
+class TurbidityLevel(NamedTuple):
+    """Results for one turbidity level.
+
+    Args:
+        scenario: scenario with this turbidity.
+        water: optical properties of the water.
+        image: (H, W, 3) image of the left camera.
+        quality: image quality, see `look.image_quality`.
+        ranges_m: (n,) ranges at which the contrast is given.
+        contrast: (n, 3) remaining fraction of the contrast of fine detail for R, G, B.
+    """
+
+    scenario: Scenario
+    water: Medium
+    image: Image
+    quality: dict[str, Any]
+    ranges_m: Array
+    contrast: Array
+
+    @property
+    def visibility_m(self) -> float | None:
+        """Range at which the green contrast falls below `MIN_VISIBLE_CONTRAST`; None if it does not."""
+        invisible = np.flatnonzero(self.contrast[:, 1] < MIN_VISIBLE_CONTRAST)
+        return float(self.ranges_m[invisible[0]]) if invisible.size else None

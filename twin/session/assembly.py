@@ -1,0 +1,59 @@
+"""Assembly of a survey: world, visual measurements and estimators, as the scenario specifies them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from twin.core.timing import StageTimer
+from twin.estimate.pipeline import Navigator
+from twin.estimate.stereo_vision import StereoVision
+from twin.estimate.vision_interface import Vision
+from twin.world.mission import Mission
+from twin.world.world import World
+
+
+def open_world(mission: Mission, stopwatch: StageTimer) -> World:
+    """Returns the simulated world of a mission, rendered or surrogate."""
+    # imported here: MuJoCo and OpenGL take 25 MB that a surrogate survey does not need
+    if mission.scenario.imaging.fidelity == "rendered":
+        from twin.world.rendered_world import RenderedWorld
+
+        return RenderedWorld(mission, stopwatch)
+    from twin.surrogate import error_model_file
+    from twin.surrogate.surrogate_world import SurrogateWorld
+
+    return SurrogateWorld(mission, stopwatch, error_model_file.load(mission.scenario.imaging.error_model))
+
+
+def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Navigator:
+    """Returns the estimators of a survey, with visual measurements from images or from the surrogate world.
+
+    Args:
+        folder: the run folder; images of keyframes are spooled below it.
+    """
+    if mission.scenario.imaging.fidelity == "rendered":
+        return navigator_with(mission, image_vision(mission, folder, stopwatch), stopwatch)
+    from twin.surrogate.surrogate_world import SurrogateWorld
+
+    assert isinstance(world, SurrogateWorld)
+    return navigator_with(mission, world.vision, stopwatch)
+
+
+def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:
+    """Returns visual measurements from images, given only what an estimator may know."""
+    cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
+    settings = mission.scenario.estimator_settings()
+    return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch)
+
+
+def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
+    """Returns the estimators, given only what they may know: believed calibration and noise, settings, planned start."""
+    scenario = mission.scenario
+    return Navigator(
+        mission.rig,
+        scenario.estimator_settings(),
+        start=mission.start,
+        readings_noise=scenario.believed_noise(),
+        vision=vision,
+        stopwatch=stopwatch,
+    )

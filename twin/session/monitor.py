@@ -1,0 +1,79 @@
+"""Monitor of a running survey: progress, log, live view, and the abort when vision stays lost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from twin.core.records import Estimate, Frame
+from twin.errors import SurveyAborted
+from twin.report.run_writer import RunFolder
+from twin.world.mission import Mission
+
+_MAX_BLIND_S = 2.0  # without vision for longer, the survey is aborted
+
+
+class SurveyProgress(NamedTuple):
+    """Progress of a survey.
+
+    Args:
+        simulated_s, wall_s: simulated and wall time [s].
+        share: completed fraction of the stage, 0 to 1.
+        sigma_m: standard deviation of the online position [m].
+        stage: "survey", "map" or "report".
+    """
+
+    simulated_s: float
+    wall_s: float
+    share: float
+    sigma_m: float
+    stage: str
+
+
+class SurveyMonitor:
+    """Observer of every frame of a survey.
+
+    Args:
+        progress: called with the progress after every frame.
+        live: show the survey in Rerun while it runs.
+    """
+
+    def __init__(
+        self, mission: Mission, folder: RunFolder, progress: Callable[[SurveyProgress], None], live: bool = False
+    ):
+        self.n_frames, self.rate_hz = mission.n_frames, mission.rig.frame_rate_hz
+        self.water = mission.scenario.water.label
+        self.folder, self.progress, self.start_s = folder, progress, time.perf_counter()
+        self.live = None
+        if live:
+            from twin.report.recording import LiveViewer
+
+            self.live = LiveViewer(mission.rig)
+        self.n_blind, self.status = 0, "ok"
+
+    def __call__(self, estimate: Estimate, frame: Frame) -> None:
+        """Reports one frame.
+
+        Raises:
+            SurveyAborted: vision has been lost for too long.
+        """
+        self.n_blind = 0 if estimate.status == "ok" else self.n_blind + 1
+        if estimate.status != self.status:
+            self.folder.log("vision", time_s=estimate.time_s, status=estimate.status)
+            self.status = estimate.status
+        if self.live is not None:
+            self.live.log_frame(frame, estimate)
+        share = (frame.index + 1) / self.n_frames
+        self.progress(SurveyProgress(estimate.time_s, self.wall_s, share, estimate.sigma_m, "survey"))
+        if self.n_blind > _MAX_BLIND_S * self.rate_hz:
+            raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
+
+    def report_stage(self, stage: str, share: float) -> None:
+        """Reports the completed fraction of a stage after the flight."""
+        self.progress(SurveyProgress(0.0, self.wall_s, share, 0.0, stage))
+
+    @property
+    def wall_s(self) -> float:
+        """Wall time since the start of the survey [s]."""
+        return time.perf_counter() - self.start_s

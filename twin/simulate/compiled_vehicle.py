@@ -1,0 +1,134 @@
+"""Compiled rigid-body simulation of the vehicle without MuJoCo, for surveys that are not rendered.
+
+It integrates as MuJoCo does for a free body without contacts: velocity first, then position with the new velocity, then
+rotation by the body rates. `mujoco_vehicle.MujocoVehicle` and this module agree to rounding.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.core import geometry
+from twin.errors import SurveyAborted
+from twin.scenario.model import VehicleConfig
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull
+from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
+from twin.simulate.thrusters import (
+    LaggedThrusters,
+    ThrusterState,
+    set_thruster_command,
+    step_thrusters,
+    thruster_wrench,
+)
+
+Array = NDArray[np.float64]
+
+
+class RigidBodyState(NamedTuple):
+    """State and parameters of a rigid body in water; the arrays of the state are modified in place.
+
+    Args:
+        pose: (4, 4) true pose, modified in place.
+        velocity: (6,) velocity of the free joint, half a timestep before the pose, modified in place.
+        acceleration: (6,) acceleration of the last step, modified in place.
+        kick: (1,) timesteps by which the next step advances the velocity: 0.5 in the first step, then 1.
+        thrusters: thrusters of the vehicle, modified in place.
+        hull: hull of the vehicle.
+        current: (3,) [m/s].
+        timestep_s: physics timestep.
+    """
+
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    kick: Array
+    thrusters: ThrusterState
+    hull: Hull
+    current: Array
+    timestep_s: float
+
+
+class CompiledVehicle:
+    """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
+
+    Args:
+        vehicle: trim and factors.
+        current_mps: (3,) steady current: east, north, up.
+        world_from_body: (4, 4) initial pose, at rest.
+        timestep_s: physics timestep.
+    """
+
+    def __init__(self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float):
+        thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s).state
+        self.state = RigidBodyState(
+            np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
+            trimmed_hull(vehicle), np.array(current_mps, float), timestep_s,
+        )  # fmt: skip
+        self._time_s = 0.0
+
+    @property
+    def world_from_body(self) -> Array:
+        """Returns the true pose (4, 4)."""
+        return self.state.pose.copy()
+
+    @property
+    def twist_body(self) -> Array:
+        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s] at the time of the pose."""
+        return body_twist(self.state)
+
+    def step(self, thruster_u: Array, duration_s: float) -> None:
+        """Simulates a whole number of physics steps under constant thruster commands (8,) in [-1, 1].
+
+        Raises:
+            SurveyAborted: the physics diverged.
+        """
+        advance(self.state, thruster_u, round(duration_s / self.state.timestep_s))
+        self.advance_clock(duration_s)
+
+    def advance_clock(self, duration_s: float) -> None:
+        """Advances the time after the state was advanced.
+
+        Raises:
+            SurveyAborted: the physics diverged.
+        """
+        self._time_s += duration_s
+        if has_diverged(self.state):
+            raise SurveyAborted(f"the physics diverged at {self._time_s:.3f} s")
+
+
+@njit(cache=True, nogil=True)
+def body_twist(body):
+    """Compiled kernel of `CompiledVehicle.twist_body`."""
+    velocity = body.velocity + 0.5 * body.timestep_s * body.acceleration
+    return twist_from_free_joint(body.pose[:3, :3], velocity)
+
+
+@njit(cache=True, nogil=True)
+def has_diverged(body):
+    """Returns whether the velocity is not finite or beyond SPEED_LIMIT_MPS or RATE_LIMIT_RADPS."""
+    speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
+    return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
+
+
+@njit(cache=True, nogil=True)
+def advance(body, command, n_steps):
+    """Advances the state in place by `n_steps` physics steps under thruster commands (8,)."""
+    thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
+    set_thruster_command(thrusters, command)
+    for _ in range(n_steps):
+        now = velocity + 0.5 * body.timestep_s * acceleration
+        wrench = thruster_wrench(thrusters)
+        geometry.put(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
+        velocity += body.kick[0] * body.timestep_s * acceleration
+        body.kick[0] = 1.0
+        rotation = geometry.so3_exp(body.timestep_s * velocity[3:])
+        next_pose = geometry.compose(pose, geometry.pose(rotation, np.zeros(3)))
+        for i in range(3):
+            next_pose[i, 3] += body.timestep_s * velocity[i]
+        geometry.put(pose, next_pose)
+        step_thrusters(thrusters)

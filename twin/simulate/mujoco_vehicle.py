@@ -1,0 +1,123 @@
+"""Vehicle simulated by MuJoCo, with an applied force that yields the acceleration of the hydrodynamic model."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenes.bluerov2 import BLUEROV2_HEAVY
+from scenes.gl import MjModel, mujoco
+from twin.core import geometry
+from twin.errors import SurveyAborted
+from twin.scenario.model import VehicleConfig
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull
+from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
+from twin.simulate.thrusters import LaggedThrusters
+
+Array = NDArray[np.float64]
+
+
+class MujocoVehicle:
+    """BlueROV2 Heavy under thrust, drag and current, stepped by MuJoCo with its own MjData.
+
+    MuJoCo's step (velocity first, then position with the new velocity) is interpreted as leapfrog integration: the
+    velocity of the joint refers to half a timestep before its pose. Energy is then conserved to second order in the
+    timestep.
+
+    Args:
+        model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
+        vehicle: trim and factors.
+        current_mps: (3,) steady current: east, north, up.
+        world_from_body: (4, 4) initial pose, at rest.
+    """
+
+    def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
+        self._model, self._data = model, mujoco.MjData(model)
+        self._hull, self._current = trimmed_hull(vehicle), np.array(current_mps, dtype=float)
+        self._body = self._model.body("vehicle").id
+        joint = int(self._model.body_jntadr[self._body])
+        first_q, first_v = int(self._model.jnt_qposadr[joint]), int(self._model.jnt_dofadr[joint])
+        self._velocity = self._data.qvel[first_v : first_v + 6]  # a view into MjData
+        self._dofs = slice(first_v, first_v + 6)
+        self._acceleration = np.zeros(6)
+        self._kick = 0.5  # the first step advances the velocity by half a timestep, see above
+        self._thrusters = LaggedThrusters(BLUEROV2_HEAVY, self._model.opt.timestep)
+        self._history: deque[tuple[float, Array, Array]] = deque(maxlen=3)
+        self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
+        self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
+        mujoco.mj_step1(self._model, self._data)
+
+    @property
+    def time_s(self) -> float:
+        """Returns the simulated time."""
+        return float(self._data.time)
+
+    @property
+    def world_from_body(self) -> Array:
+        """Returns the true pose (4, 4)."""
+        return geometry.pose(self._rotation, self._data.xpos[self._body])
+
+    @property
+    def twist_body(self) -> Array:
+        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s] at the time of the pose."""
+        return twist_from_free_joint(self._rotation, self._velocity_now())
+
+    @property
+    def _rotation(self) -> Array:
+        """Returns the rotation world_from_body (3, 3)."""
+        return self._data.xmat[self._body].reshape(3, 3)
+
+    def _velocity_now(self) -> Array:
+        """Returns the velocity of the free joint (6,) at the time of the pose."""
+        return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
+
+    def step(self, thruster_u: Array, duration_s: float) -> None:
+        """Simulates a whole number of physics steps under constant thruster commands (8,) in [-1, 1].
+
+        Raises:
+            SurveyAborted: the physics diverged.
+            ValueError: the duration is not a whole number of timesteps.
+        """
+        n_steps = round(duration_s / self._model.opt.timestep)
+        if n_steps < 1 or abs(n_steps * self._model.opt.timestep - duration_s) > 1e-6 * duration_s:
+            raise ValueError(f"{duration_s} s is not a whole number of timesteps of {self._model.opt.timestep} s")
+        self._thrusters.command(thruster_u)
+        for _ in range(n_steps):
+            self._advance(self._thrusters.wrench())
+            self._thrusters.step()
+        self._history.append(self._snapshot())
+
+    def _advance(self, wrench: Array) -> None:
+        """Simulates one physics step under a wrench (6,) of the thrusters in the body."""
+        model, data = self._model, self._data
+        velocity = self._velocity_now()
+        target = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
+        self._check_divergence(target, velocity)
+        acceleration, force = np.zeros(model.nv), np.zeros(model.nv)
+        acceleration[self._dofs] = self._kick * target
+        mujoco.mj_mulM(model, data, force, acceleration)
+        # Adding the bias force cancels MuJoCo's own gravity and gyroscopic terms: `target` contains both.
+        data.qfrc_applied[self._dofs] = (force + data.qfrc_bias - data.qfrc_passive)[self._dofs]
+        mujoco.mj_step2(model, data)
+        mujoco.mj_step1(model, data)
+        self._acceleration, self._kick = target, 1.0
+
+    def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
+        """Raises SurveyAborted, with the last states, if the acceleration or velocity is not finite or too large."""
+        speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
+        if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
+            return
+        states = "; ".join(_describe(*state) for state in [*self._history, self._snapshot()])
+        raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
+
+    def _snapshot(self) -> tuple[float, Array, Array]:
+        """Returns time, position (3,) and velocity of the free joint (6,)."""
+        return self.time_s, self._data.xpos[self._body].copy(), self._velocity.copy()
+
+
+def _describe(time_s: float, position_m: Array, velocity: Array) -> str:
+    """Formats a state for an error message."""
+    linear, angular = np.round(velocity, 4).reshape(2, 3).tolist()
+    return f"{time_s:.3f} s: at {np.round(position_m, 4).tolist()} m, {linear} m/s, {angular} rad/s"

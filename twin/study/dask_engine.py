@@ -1,0 +1,139 @@
+"""Engine on the workers of a Dask cluster that is already running, or of a Dask cluster started as SLURM jobs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any
+
+import dask.config
+from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
+
+from twin.errors import TwinError
+from twin.study.engine import Outcome, Result, Task
+from twin.study.worker import Reply, TaskLimits, WorkerPool, describe_exception
+
+_CONNECT_TIMEOUT_S = 20
+_QUEUED_PER_THREAD = 8  # keeps every worker busy, and the memory of a queue of 100,000 tasks bounded
+_MIN_QUEUED = 64
+_REFRESH_S = 2.0
+_MAX_LOST_WORKERS = 3  # during one task
+
+
+@contextmanager
+def connect_scheduler(address: str) -> Iterator[DaskEngine]:
+    """Yields an engine on the workers of a running Dask scheduler.
+
+    Raises:
+        TwinError: the scheduler does not answer.
+    """
+    try:
+        client = Client(address, timeout=_CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        allowed = "the address of a running scheduler, e.g. tcp://host:8786"
+        raise TwinError("--scheduler", f"{address} does not answer: {error}", allowed) from None
+    with client:
+        yield DaskEngine(client)
+
+
+@contextmanager
+def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
+    """Yields an engine on a new Dask cluster of this number of SLURM jobs.
+
+    Raises:
+        TwinError: dask-jobqueue is not installed.
+    """
+    with dask.config.set({"distributed.scheduler.allowed-failures": _MAX_LOST_WORKERS}):
+        with _slurm_cluster(jobs) as cluster, Client(cluster) as client:
+            yield DaskEngine(client)
+
+
+def _slurm_cluster(jobs: int) -> Any:
+    """Returns a cluster of one-core jobs; queue, account, time and memory come from the configuration of Dask."""
+    try:
+        from dask_jobqueue.slurm import SLURMCluster
+    except ImportError:
+        needed = "pip install 'seabed-twin[cluster]'"
+        raise TwinError("--scheduler", "slurm needs dask-jobqueue, which is not installed", needed) from None
+    given = dask.config.get("jobqueue.slurm")
+    cluster = SLURMCluster(cores=given.get("cores") or 1, processes=1, memory=given.get("memory") or "4GB")
+    cluster.scale(jobs=jobs)
+    return cluster
+
+
+class DaskEngine:
+    """Engine on the workers of a Dask cluster; each Dask worker has a pool with one process per thread."""
+
+    def __init__(self, client: Client):
+        self.client = client
+        client.register_plugin(_WorkerPoolPlugin())
+
+    def run_many(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
+    ) -> Iterator[Outcome[Task, Result]]:
+        """Runs `function` on every task; see `Engine.run_many`. If a Dask worker is lost, another one gets its tasks.
+
+        Raises:
+            TwinError: the connection to the scheduler was lost.
+        """
+        waiting, running, queue_size = iter(tasks), {}, _QueueSize(self.client)
+        arriving = as_completed(with_results=True, raise_errors=False)
+
+        def submit(count: int) -> None:
+            for task in islice(waiting, count):
+                future = self.client.submit(_run_task, function, task, limits, pure=False)
+                running[future.key] = task
+                arriving.add(future)
+
+        submit(queue_size())
+        for future, result in arriving:
+            yield _outcome(running.pop(future.key), future, result)
+            future.release()
+            submit(max(0, queue_size() - len(running)))
+
+
+class _WorkerPoolPlugin(WorkerPlugin):
+    """Worker pool of one Dask worker."""
+
+    name = "twin-worker-pool"
+
+    def setup(self, worker: Any = None) -> None:
+        self.pool = WorkerPool()
+
+    def teardown(self, worker: Any = None) -> None:
+        self.pool.close()
+
+
+def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
+    """Runs a task in the worker pool of this Dask worker; see `WorkerPool.run`."""
+    plugin: Any = get_worker().plugins[_WorkerPoolPlugin.name]
+    return plugin.pool.run(function, task, limits)
+
+
+class _QueueSize:
+    """Number of tasks to submit to a cluster whose size may change; cached, because a query takes a round trip."""
+
+    def __init__(self, client: Client):
+        self.client, self.tasks, self.updated_s = client, 0, -math.inf
+
+    def __call__(self) -> int:
+        if time.monotonic() - self.updated_s > _REFRESH_S:
+            threads: Any = self.client.nthreads()
+            self.tasks = max(_MIN_QUEUED, _QUEUED_PER_THREAD * sum(threads.values()))
+            self.updated_s = time.monotonic()
+        return self.tasks
+
+
+def _outcome(task: Any, future: Future, result: Any) -> Outcome:
+    if future.status == "finished":
+        reply, attempts = result
+        return Outcome(task, reply.value, reply.reason, attempts)
+    if future.status != "error":
+        raise TwinError("--scheduler", "the connection was lost", "a running scheduler; continue with --resume")
+    error: Any = result[1] if isinstance(result, tuple) else future.exception()
+    if isinstance(error, KilledWorker):
+        return Outcome(task, None, "the Dask workers that ran it were lost", error.allowed_failures + 1)
+    return Outcome(task, None, describe_exception(error), 1)

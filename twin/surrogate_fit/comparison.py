@@ -1,0 +1,198 @@
+"""Comparison of measurements from images with those of the surrogate and with the truth, for the fit.
+
+During a rendered survey every measurement is made from the images and also sampled by the surrogate at the same true
+poses. The statistics are the ratios of the reported covariances of both, and the errors relative to the truth. Both
+measure the same geometry, so the ratios depend on the error model alone.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import ElevationMap, Frame, MapGrid, SurveyResult
+from twin.estimate.stereo_vision import StereoVision
+from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.mosaic import Registration
+from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.two_view_motion import Motion
+from twin.surrogate.error_model import ErrorModel, SigmaLaw
+from twin.surrogate.vision import SurrogateVision
+
+_MIN_CELLS = 300
+_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # a level cell has a smaller slope, a steep cell a larger one
+_NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
+#: Values of the link models in which one error source acts alone.
+BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
+
+
+class ComparisonVision:
+    """`Vision` by images that collects statistics of the comparison with a surrogate.
+
+    Args:
+        images: vision whose measurements are returned.
+        surrogate: vision to compare with.
+        true_pose: returns the present true pose (4, 4) of the left camera.
+
+    Attributes:
+        statistics: samples by name. Names that end in `sigma_ratio` are standard deviations reported from images over
+            those reported by the surrogate; `nees` are squared errors normalised by the covariance, per degree of
+            freedom.
+    """
+
+    def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
+        self.images, self.surrogate, self._true_pose = images, surrogate, true_pose
+        self.stereo_observations = images.stereo_observations
+        self.runs_in_background = images.runs_in_background
+        self.statistics: dict[str, list[float]] = defaultdict(list)
+        self.statistics["lamp_share"] = [surrogate.lamp_share]
+        self._poses: dict[int, Array] = {}
+        self._last_node = -1
+        self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the path's last link
+        self._last_pose: Array | None = None
+        self._frames: list[tuple[Array, Array]] = []  # error and covariance of each frame since the last keyframe
+
+    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
+        (measured, status), (sampled, _) = self.images.track_frame(frame), self.surrogate.track_frame(frame)
+        last, self._last_pose = self._last_pose, self._true_pose()
+        if last is not None and status == "ok" and measured.n_points:
+            true = geometry.inverse(last) @ self._last_pose
+            self.statistics["f2f_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
+            errors = [geometry.log(geometry.inverse(true) @ motion.a_from_b) for motion in (measured, sampled)]
+            self.statistics["f2f_nees"].append(_chi2(errors[0], measured.cov) / 6)
+            self.statistics["f2f_nees_surrogate"].append(_chi2(errors[1], sampled.cov) / 6)
+            self._frames.append((errors[0], measured.cov))
+        return measured, status
+
+    def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
+        points, sampled = self.images.observe_stereo(frame, row), self.surrogate.observe_stereo(frame, row)
+        if len(self._frames) > 1:
+            error, cov = (np.sum(x, axis=0) for x in zip(*self._frames, strict=True))
+            self.statistics["f2f_interval_nees"].append(_chi2(error, cov) / 6)
+            self.statistics["f2f_interval_frames"].append(float(len(self._frames)))
+        self._frames = []
+        if points is not None and sampled is not None:
+            self.statistics["point_fraction"].append(len(points.xyz) / self.images.settings.points)
+            traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
+            sigma_ratio = np.sqrt(traces[0] / traces[1] * self.surrogate.raster_fraction)
+            self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
+            self.statistics["bound_px"].append(self.surrogate.bound_px)
+        return points
+
+    def restart_tracking(self) -> None:
+        self.images.restart_tracking()
+        self.surrogate.restart_tracking()
+
+    def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
+        measured = self.images.register_with_mosaic(world_from_camera)
+        sampled = self.surrogate.register_with_mosaic(world_from_camera)
+        if measured is not None and sampled is not None:
+            ours, theirs = measured.correction, sampled.correction
+            self.statistics["mosaic_sigma_ratio"].append(_sigma_ratio(ours.cov, theirs.cov))
+            difference = geometry.log(geometry.inverse(theirs.a_from_b) @ ours.a_from_b)
+            self.statistics["mosaic_difference_nees"].append(_chi2(difference, theirs.cov) / 6)
+        return measured
+
+    def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
+        self._poses[number] = self._true_pose()
+        self.images.add_to_mosaic(number, world_from_camera)
+        self.surrogate.add_to_mosaic(number, world_from_camera)
+
+    def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
+        self.images.rebuild_mosaic(keyframes)
+        self.surrogate.rebuild_mosaic(keyframes)
+
+    def discard(self, numbers: range) -> None:
+        self.images.discard(numbers)
+        self.surrogate.discard(numbers)
+
+    def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
+        """Returns the links from images; compares them with links sampled with all errors and with one error alone."""
+        measured = {"images": self.images.measure_motions(node, others)}
+        models = {"all": self.surrogate.model, **single_error_models(self.surrogate.model)}
+        measured |= {name: self.surrogate.sample_links(node, others, model) for name, model in models.items()}
+        pose = self._poses.get(node.number)
+        node_pose = self._true_pose() if pose is None else pose
+        for k, other in enumerate(others):
+            links = {name: motions[k] for name, motions in measured.items()}
+            true = geometry.inverse(self._poses[other.number]) @ node_pose
+            self._compare_link(other.number, node.number, links, true)
+        self._last_node = node.number
+        return measured["images"]
+
+    def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
+        """Adds the statistics of a link from i to j with true motion (4, 4), by the name of its source.
+
+        Errors are normalised by the covariance that the surrogate reports. For two consecutive links along the path,
+        the normalised product of their errors is added as well: it is negative if the second cancels the first.
+        """
+        measured, sampled = links["images"], links["all"]
+        if measured is None or sampled is None:
+            return
+        self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
+        self.statistics["link_point_ratio"].append(measured.n_points / sampled.n_points)
+        self.statistics["link_distance"].append(self.surrogate.distance_in_depths(true))
+        errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
+        for name, error in errors.items():
+            self.statistics[f"link_nees_{name}"].append(_chi2(error, sampled.cov) / 6)
+        if i == self._last_node:
+            (end, previous), self._last_link = self._last_link, (j, errors)
+            sigma, adjoint = np.sqrt(np.diag(sampled.cov)), geometry.adjoint(geometry.inverse(true))
+            for name, last in previous.items() if end == i else ():
+                product = float(adjoint @ last / sigma @ (errors[name] / sigma)) / 6
+                self.statistics[f"consecutive_product_{name}"].append(product)
+
+    def build_map(
+        self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
+    ) -> ElevationMap:
+        """Returns the map from images; compares it with maps sampled along the same path with one error alone."""
+        elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
+        models = {
+            "pose": model._replace(depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0),
+            "depth": model._replace(lateral_sigma_px=0.0),
+            "lateral": model._replace(depth_sigma_px=_NEGLIGIBLE),
+        }
+        seen = self.surrogate.scene.map_model.seen
+        self.statistics["map_completeness"].append(float(np.isfinite(elevation.height_m[seen]).mean()))
+        for name, single_error in models.items():
+            self.surrogate.model = single_error
+            self._compare_map(name, self.surrogate.build_map(result, grid, step_cov, lambda _: None))
+        self.surrogate.model = model
+        self._compare_map("images", elevation)
+        return elevation
+
+    def _compare_map(self, source: str, elevation: ElevationMap) -> None:
+        """Adds robust variance of the height errors and median reported variance, of level and steep cells [m^2]."""
+        map_model = self.surrogate.scene.map_model
+        error = elevation.height_m - map_model.height_m
+        level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE
+        for name, cells in (("level", level), ("steep", steep)):
+            known = cells & map_model.seen & np.isfinite(error)
+            if known.sum() > _MIN_CELLS:
+                residual = error[known] - np.median(error[known])
+                self.statistics[f"map_error_{name}_{source}"].append(float((1.4826 * np.median(np.abs(residual))) ** 2))
+                self.statistics[f"map_sigma_{name}_{source}"].append(float(np.median(elevation.sigma_m[known]) ** 2))
+
+
+def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
+    """Returns link models in which one error source acts alone: the matching of patches, or relief."""
+    return {
+        "patches": model._replace(
+            match_error_ratio=1.0, lamp_error_growth=0.0, match_bias_fraction=BIAS_FRACTION, relief_gain=0.0
+        ),
+        "relief": model._replace(match_error_ratio=0.0, relief_gain=RELIEF_GAIN, common_bias_px=0.0),
+    }
+
+
+def _chi2(error: Array, cov: Array) -> float:
+    """Returns the squared Mahalanobis norm of an error."""
+    return float(error @ np.linalg.solve(cov, error))
+
+
+def _sigma_ratio(cov: Array, other: Array) -> float:
+    """Returns the ratio of the standard deviations of two covariances, as the geometric mean over all directions."""
+    return float(np.exp((np.linalg.slogdet(cov)[1] - np.linalg.slogdet(other)[1]) / (2 * len(cov))))
