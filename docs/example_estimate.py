@@ -13,14 +13,16 @@ DEPTH_M, SPEED_MPS, N_FRAMES = 2.0, 0.2, 60
 PIXEL_M = DEPTH_M / RIG.focal_px
 
 rng = np.random.default_rng(1)
-noise = sum(cv2.resize(rng.normal(size=(96 * s, 96 * s)), (1536, 1536), interpolation=cv2.INTER_CUBIC) for s in (1, 2, 4, 8))
+octaves = [rng.normal(size=(96 * scale, 96 * scale)) for scale in (1, 2, 4, 8)]
+noise = sum(cv2.resize(octave, (1536, 1536), interpolation=cv2.INTER_CUBIC) for octave in octaves)
 floor = np.clip(128 + 25 * noise, 0, 255).astype(np.float32)
 
 
 def image(x_m: float) -> np.ndarray:
     """Returns the RGB image (H, W, 3) of a camera at x, 0, looking at the floor along its optical axis."""
     centre = 500 + x_m / PIXEL_M, 768.0
-    gray = cv2.getRectSubPix(floor, (RIG.width_px, RIG.height_px), centre) + rng.normal(0, 2, (RIG.height_px, RIG.width_px))
+    gray = cv2.getRectSubPix(floor, (RIG.width_px, RIG.height_px), centre)
+    gray = gray + rng.normal(0, 2, gray.shape)
     return np.repeat(np.clip(gray, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
 
 

@@ -1,8 +1,5 @@
 """Tests of dense disparity: bias, calibration of sigma, robustness to illumination and occlusion."""
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ from twin.estimate.vision import disparity, epipolar
 
 RIG = small_rig()
 INSIDE = np.s_[10:-10, 60:-10]
-DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 
 
 def on_slanted_plane(noise):
@@ -118,12 +114,12 @@ def test_the_gain_is_the_fraction_of_an_initial_error_that_refinement_corrects(c
         assert corrected == pytest.approx(gain, abs=0.1)
 
 
-def test_on_the_motorcycle_pair_disparity_is_dense_and_sigma_predicts_mismatches():
+def test_on_the_motorcycle_pair_disparity_is_dense_and_sigma_predicts_mismatches(outside_data):
     """Middlebury 2014 (Scharstein et al.); density over all pixels with ground truth, including half-occluded ones."""
-    if not (DATA / "motorcycle_left.png").is_file():
-        pytest.skip("no ../shared/data (or TWIN_DATA): the Middlebury pair is not included")
-    left, right = (cv2.imread(str(DATA / f"motorcycle_{side}.png"), cv2.IMREAD_GRAYSCALE) for side in ("left", "right"))
-    truth = np.load(DATA / "motorcycle_disp.npz")["arr_0"]
+    left, right = (
+        cv2.imread(str(outside_data(f"motorcycle_{side}.png")), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")
+    )
+    truth = np.load(outside_data("motorcycle_disp.npz"))["arr_0"]
     result = disparity.dense_disparity(left, right, 64)
     error = np.abs(result.disparity_px - truth)
     known = np.isfinite(error)

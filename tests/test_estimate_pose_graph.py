@@ -1,8 +1,5 @@
 """Pose graph optimisation against gtsam on public and generated graphs, and its parts against closed forms."""
 
-import os
-from pathlib import Path
-
 import gtsam
 import numpy as np
 import pytest
@@ -14,13 +11,11 @@ from twin.core.links import Link
 from twin.estimate.adjustment import block_cholesky, chordal, pose_graph
 from twin.exchange import posegraph
 
-DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 
-
-def public_graph(name):
-    if not (DATA / name).is_file():
-        pytest.skip(f"{name} is not shipped with the project: not found in ../shared/data or $TWIN_DATA")
-    return posegraph.read(DATA / name).links
+@pytest.fixture
+def public_graph(outside_data):
+    """Returns a function that reads the links of a public pose graph."""
+    return lambda name: posegraph.read(outside_data(name)).links
 
 
 def with_quaternion_information(link):
@@ -110,12 +105,12 @@ def graph_of(poses, links, huber=None, sigma=1e-3):
     return pose_graph.FactorGraph(len(poses), [anchor], [motions])
 
 
-def test_the_small_grid_reaches_the_optimum_of_gtsam():
+def test_the_small_grid_reaches_the_optimum_of_gtsam(public_graph):
     links = public_graph("smallGrid3D.g2o")
     assert chordal.solve_pose_graph(links).cost == pytest.approx(517.93, rel=1e-4)
 
 
-def test_the_sphere_reaches_the_optimum_of_gtsam_and_the_truth():
+def test_the_sphere_reaches_the_optimum_of_gtsam_and_the_truth(public_graph):
     links = public_graph("sphere2500.txt")
     graph = gtsam_graph(links)
     solved = chordal.solve_pose_graph(links)
@@ -124,7 +119,7 @@ def test_the_sphere_reaches_the_optimum_of_gtsam_and_the_truth():
     assert truth_error_m(solved.poses) <= 0.21
 
 
-def test_the_sphere_with_quaternion_information_has_the_published_cost():
+def test_the_sphere_with_quaternion_information_has_the_published_cost(public_graph):
     solved = chordal.solve_pose_graph([with_quaternion_information(link) for link in public_graph("sphere2500.txt")])
     assert solved.cost == pytest.approx(675.70, rel=1e-3)  # 676.26 is reached, 0.08 % more
     assert truth_error_m(solved.poses) <= 0.21

@@ -97,7 +97,8 @@ def away(first):
 
 
 def chosen_of(earlier, node, most):
-    return [k.number for k, _ in link_selection.choose_links(node, earlier, poses_of(earlier), RIG, 0.45, most, PATCH_PX)]
+    links = link_selection.choose_links(node, earlier, poses_of(earlier), RIG, 0.45, most, PATCH_PX)
+    return [k.number for k, _ in links]
 
 
 def poses_of(nodes):
@@ -109,9 +110,8 @@ def error_of(true, estimated):
 
 
 def test_normalised_images_are_invariant_to_a_uniform_gain():
-    image = colour(
-        scene.digitise(scene.render_view(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))[0], np.random.default_rng(0), 0)
-    )
+    view, _ = scene.render_view(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))
+    image = colour(scene.digitise(view, np.random.default_rng(0), 0))
     half = (image * 0.5).astype(np.uint8)
     difference = matching.normalise(matching.gray(image)).astype(float) - matching.normalise(matching.gray(half))
     assert np.median(np.abs(difference)) < 3  # of 36 grey levels of contrast; the rest is rounding of the darker image
@@ -469,7 +469,8 @@ def test_frame_to_frame_motion_bridges_a_failed_link():
     assert [(link.i, link.n_points) for link in bridge] == [(2, 0)]
     np.testing.assert_allclose(bridge[0].i_from_j, geometry.inverse(poses[2]) @ poses[3], atol=1e-9)
     np.testing.assert_allclose(result.final.world_from_camera, poses, atol=1e-6)
-    assert [node.dvl_displacement is None for node in navigator.network.nodes] == [True, False, False, True, False, False]
+    missing = [node.dvl_displacement is None for node in navigator.network.nodes]
+    assert missing == [True, False, False, True, False, False]
 
 
 def test_only_the_newest_keyframe_keeps_its_points():
@@ -520,7 +521,7 @@ def test_nodes_older_than_the_window_are_fixed(stride):
 
 
 def test_rotations_stay_orthogonal_after_many_alignments():
-    """Poses at the start are in the window of every loop: without orthogonalisation 34 alignments scale them by 1.003."""
+    """Poses at the start are in every window: without orthogonalisation 34 alignments scale them by 1.003."""
     poses = [scene.down_camera(0.0, 0.1 * (k % 3), 2.4, (0.01 * k, 0.02, 0.1 * (k % 3))) for k in range(120)]
     navigator = navigated(Script(poses, rng=np.random.default_rng(1)), [1 + k // 3 for k in range(120)])
     for key in navigator.network.keyframes:

@@ -1,4 +1,4 @@
-"""Claims on whole (small) surveys: closed loop, wall between truth and estimate, determinism, partial runs."""
+"""Whole (small) surveys: closed loop, separation of truth and estimate, aids, partial runs."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ from twin.core import records
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted
 from twin.scenario import file as scenario_file
+from twin.session.assembly import image_vision, navigator_with
 from twin.world import rendered_world
 from twin.world.mission import prepare
 
@@ -27,7 +28,7 @@ TRAJECTORIES = ("truth", "f2f", "online", "final")
 
 
 def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> survey.RunResult:
-    """A small survey; drawing its report takes longer than flying it and is left out where nobody looks."""
+    """Flies a small survey; its report, which takes longer than the flight, is written where asked for only."""
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         if not report:
@@ -35,12 +36,17 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
         return survey.run(scenario, out, progress)
 
 
+def image_navigator(mission, folder):
+    stopwatch = Stopwatch()
+    return navigator_with(mission, image_vision(mission, folder, stopwatch), stopwatch)
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     return fly(tmp_path_factory.mktemp("flown"), report=True)
 
 
-def test_a_survey_steers_by_sight_maps_and_ends_complete(flown):
+def test_a_survey_by_vision_ends_complete_with_an_accurate_path_and_map(flown):
     m = flown.metrics
     assert flown.status == m["status"] == "complete"
     assert m["trajectory"]["final"]["ate_rmse_m"] < 0.01
@@ -49,7 +55,7 @@ def test_a_survey_steers_by_sight_maps_and_ends_complete(flown):
     assert m["map"]["completeness"] > 0.9
 
 
-def test_the_run_folder_holds_all_that_the_design_promises(flown):
+def test_the_run_folder_contains_every_documented_file(flown):
     names = (
         "scenario.resolved.toml env.json metrics.json report.html run.rrd log.jsonl posegraph.g2o mesh.glb mosaic.tif"
     )
@@ -98,12 +104,12 @@ class Recorder:
         self.navigator.align_track(track)
 
 
-def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path):
+def test_estimates_from_recorded_frames_do_not_depend_on_the_truth(tmp_path):
     """Frames are recorded in one world and replayed with every truth (floor, poses, map) replaced by another."""
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]"])
-    mission, watch = prepare(scenario), Stopwatch()
-    recorder = Recorder(survey.make_navigator(mission, survey.image_vision(mission, tmp_path / "first", watch), watch))
-    with rendered_world.RenderedWorld(mission, watch) as world:
+    mission, stopwatch = prepare(scenario), Stopwatch()
+    recorder = Recorder(image_navigator(mission, tmp_path / "first"))
+    with rendered_world.RenderedWorld(mission, stopwatch) as world:
         survey.fly(mission, world, recorder, lambda *_: None)
     first = recorder.navigator.finish()
 
@@ -112,7 +118,7 @@ def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path
     )
     other = prepare(elsewhere)
     assert not np.array_equal(other.terrain.height_m, mission.terrain.height_m)
-    navigator = survey.make_navigator(other, survey.image_vision(other, tmp_path / "second", watch), watch)
+    navigator = image_navigator(other, tmp_path / "second")
     for frame, track in recorder.frames:
         navigator.align_track(track) if frame is None else navigator.update(frame, track)
     second = navigator.finish()
@@ -120,8 +126,9 @@ def test_estimates_of_recorded_frames_do_not_change_when_the_truth_does(tmp_path
         assert getattr(first, name).world_from_camera.tobytes() == getattr(second, name).world_from_camera.tobytes()
 
 
-def test_frames_carry_nothing_but_images_time_and_readings():
-    assert set(records.Frame.__dataclass_fields__) == {"index", "time_s", "left", "right", "readings"}
+def test_frames_contain_only_images_time_readings_and_the_choice_of_keyframes():
+    fields = {"index", "time_s", "left", "right", "readings", "keyframe"}
+    assert set(records.Frame.__dataclass_fields__) == fields
     assert set(records.Readings.__dataclass_fields__) == {
         "pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", "beacons",
     }  # fmt: skip
@@ -139,14 +146,14 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
         "beacons=[{position_m=[0.0, 0.0, 0.8]}]",
     ]
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
-    images = survey.image_vision(mission, tmp_path, Stopwatch())
-    navigator, estimates = survey.make_navigator(mission, images, Stopwatch()), []
+    navigator, estimates = image_navigator(mission, tmp_path), []
     with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
-        survey.fly(mission, world, navigator, lambda _, estimate, __: estimates.append(estimate))
+        survey.fly(mission, world, navigator, lambda estimate, _: estimates.append(estimate))
         true = world.truth().trajectory
     result = navigator.finish()
-    assert [node.dvl_displacement is not None for node in navigator.nodes] == [False] + [True] * (len(navigator.nodes) - 1)
-    assert sum(len(node.readings.beacons) for node in navigator.nodes) > 3
+    nodes = navigator.network.nodes
+    assert [node.dvl_displacement is not None for node in nodes] == [False] + [True] * (len(nodes) - 1)
+    assert sum(len(node.readings.beacons) for node in nodes) > 3
     sigma_m = [estimates[row].sigma_m for row in result.keyframe_rows]
     assert max(sigma_m) < np.sqrt(3) * 1.01e-4  # no worse than the fix just taken
     for path in (result.online, result.final):
@@ -176,7 +183,7 @@ def stop_at(share, error):
         (SurveyAborted("the physics diverged at 3.000 s"), "the physics diverged at 3.000 s", False),
     ],
 )
-def test_what_stops_a_survey_is_told_and_what_was_found_is_kept(tmp_path, error, reason, report):
+def test_an_interrupted_survey_reports_its_reason_and_keeps_partial_results(tmp_path, error, reason, report):
     result = fly(tmp_path / "run", "plan.area_m=[0.6, 0.5]", progress=stop_at(0.5, error), report=report)
     assert (result.status, result.metrics["reason"]) == ("aborted", reason)
     path = records.Trajectory.load(result.folder / "trajectory_final.tum")
@@ -204,7 +211,7 @@ def test_a_nan_in_the_physics_aborts_with_the_reason(tmp_path, monkeypatch):
     assert "physics diverged at 4" in result.metrics["reason"]
 
 
-def test_lost_vision_ends_the_survey_with_its_reason(tmp_path):
+def test_lost_vision_aborts_the_survey_with_a_reason(tmp_path):
     result = fly(tmp_path / "run", "water.jerlov=9C", "water.turbidity=20")
     assert result.status == "aborted"
     assert result.metrics["reason"].startswith("vision lost at ")
@@ -221,21 +228,21 @@ def test_lost_vision_ends_the_survey_with_its_reason(tmp_path):
         ("plan.speed_mps=2.0", "plan.speed_mps: 2: too fast for the thrusters (allowed: up to 0.7"),
         ("plan.altitude_m=0.7", "plan.altitude_m: 0.7: the cameras come within "),
         ('require."map.le91_m"=0.1', "map.le91_m: no such metric, did you mean"),
-        ("terrain.texture_file=x.png", "terrain.texture_file: is not read by a generated floor (reef)"),
+        ("terrain.texture_file=x.png", "terrain.texture_file: has no effect on a generated floor"),
     ],
 )
-def test_a_survey_that_cannot_be_flown_is_refused_before_anything_is_written(tmp_path, override, message):
+def test_an_impossible_survey_is_rejected_before_anything_is_written(tmp_path, override, message):
     with pytest.raises(ScenarioError) as refused:
         fly(tmp_path / "run", override)
     assert message in str(refused.value)
     assert not (tmp_path / "run").exists()
 
 
-def test_an_alignment_that_fails_is_told_and_the_rest_is_kept(tmp_path, monkeypatch):
+def test_a_failed_alignment_is_reported_and_partial_results_are_kept(tmp_path, monkeypatch):
     def fail(*_):
         raise np.linalg.LinAlgError("not every pose is held")
 
-    monkeypatch.setattr("twin.estimate.pipeline.align", fail)
+    monkeypatch.setattr("twin.estimate.network.align", fail)
     result = fly(tmp_path / "run", "plan.area_m=[0.6, 0.5]")
     assert (result.status, result.metrics["reason"]) == (
         "aborted",
@@ -244,13 +251,13 @@ def test_an_alignment_that_fails_is_told_and_the_rest_is_kept(tmp_path, monkeypa
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05
 
 
-def test_a_full_disk_behind_the_survey_is_told_and_the_rest_is_kept(tmp_path, monkeypatch):
-    """Links are measured while the survey goes on: their fault comes to light when they are taken over."""
+def test_a_full_disk_in_the_background_is_reported_and_partial_results_are_kept(tmp_path, monkeypatch):
+    """Links are measured in the background: an error is raised when they are collected."""
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("twin.estimate.network.share_noise", full)
+    monkeypatch.setattr("twin.estimate.link_selection.share_noise", full)
     result = fly(tmp_path / "run", "plan.area_m=[0.3, 0.5]", "estimate.use_ga=false")
     assert (result.status, result.metrics["reason"]) == ("aborted", "[Errno 28] No space left on device")
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05

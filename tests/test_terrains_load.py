@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ import terrains
 from terrains import Terrain
 from twin.errors import TwinError
 
-DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 #: row 0 = north; the north-east corner is the highest, the south-west corner the lowest
 HEIGHTS = np.array([[2.0, 3.0, 4.0], [1.5, 2.0, 3.0], [1.0, 1.0, 2.0]], np.float32)
 
@@ -123,10 +121,8 @@ def test_an_invalid_texture_file_is_rejected(tmp_path: Path, name: str, problem:
     assert caught.value.field == "terrain.texture_file"
 
 
-def test_the_horseshoe_reef_has_its_measured_relief() -> None:
-    if not (DATA / "horseshoe_reef_dem.tif").is_file():
-        pytest.skip("no ../shared/data (or TWIN_DATA): the reef data are not distributed")
-    terrain = load(DATA / "horseshoe_reef_dem.tif", DATA / "gravel.png", 0.0025)
+def test_the_horseshoe_reef_has_its_measured_relief(outside_data) -> None:
+    terrain = load(outside_data("horseshoe_reef_dem.tif"), outside_data("gravel.png"), 0.0025)
     assert terrain.height_m.shape == (800, 800) and terrain.spacing_m == pytest.approx(0.01)
     assert terrain.highest_m == pytest.approx(-2.584359 + 3.9536424, abs=1e-5)  # minimum and maximum by gdalinfo
     assert terrain.texture.shape == (3196, 3196, 3)

@@ -115,10 +115,10 @@ def test_the_lawnmower_may_fly_as_fast_as_the_bow_allows_and_a_carrier_faster():
 
 
 @pytest.mark.parametrize("file", SCENES, ids=lambda file: file.stem)
-def test_every_scene_says_what_it_is_and_can_be_planned(file):
+def test_every_scene_has_a_description_and_can_be_planned(file, outside_data):
     assert file.read_text().startswith("# ")
     scenario = load_scenario(file.stem, ["terrain.texture_px_m=0.2"])  # the plan needs no fine texture
-    if scenario.terrain.height_file and not Path(scenario.terrain.height_file).exists():
-        pytest.skip(f"{scenario.terrain.height_file} is missing: set TWIN_DATA to the folder of the shared data")
+    if scenario.terrain.height_file:
+        outside_data(Path(scenario.terrain.height_file).name)
     assert scenario.name == file.stem
     assert prepare(scenario).n_frames > 1000

@@ -310,7 +310,7 @@ class SurveyResult:
 
     @property
     def step_cov(self) -> Array:
-        """(n_keyframes, 6, 6) covariance of each keyframe relative to the one before, zero where no link connects them."""
+        """(n_keyframes, 6, 6) covariance of each keyframe relative to the one before; zero without a link."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))
         chain = self.links.j == self.links.i + 1
         cov[self.links.j[chain]] = self.links.own_cov[chain]
@@ -319,7 +319,7 @@ class SurveyResult:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """Cells of the maps of a survey: row 0 is the northernmost; (west_m, north_m) is the outer corner of cell (0, 0)."""
+    """Cells of the maps of a survey; row 0 is the northernmost, (west_m, north_m) the outer corner of cell (0, 0)."""
 
     west_m: float
     north_m: float

@@ -11,8 +11,8 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link
 from twin.core.records import StereoRig
-from twin.estimate.vision.two_view_motion import Motion
 from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.two_view_motion import Motion
 
 _SAME_SWATH = 2  # the paper's two previous keyframes on the same swath
 _NEAREST_M = 1e-3  # of a point before a camera

@@ -140,7 +140,9 @@ class KeyframeNetwork:
         links = self._measure(node, [(last, overlap)])
         return links[0] if links else None
 
-    def connect(self, node: Keyframe, chain: Link | None, bridge: Link | None, displacement: Displacement | None) -> None:
+    def connect(
+        self, node: Keyframe, chain: Link | None, bridge: Link | None, displacement: Displacement | None
+    ) -> None:
         """Adds a node and links it to earlier ones; the links are measured in the background.
 
         Args:
@@ -154,9 +156,7 @@ class KeyframeNetwork:
             oldest, n = min(_START_NODES, first), len(self.nodes)
             window = self.nodes[:oldest] + self.nodes[first:]
             poses = np.concatenate([self._node_poses[:oldest], self._node_poses[first:n]])
-            chosen = link_selection.choose_links(
-                node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px
-            )
+            chosen = link_selection.choose_links(node, window, poses, self.rig, s.min_overlap, s.max_links, s.patch_px)
         others = [(k, overlap) for k, overlap in chosen if k is not self.nodes[-1]]
         # a copy, because the points of the node are released before its links are measured
         self._queue.submit(partial(self._links_of, replace(node), others, chain, bridge))

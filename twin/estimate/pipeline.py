@@ -1,4 +1,4 @@
-"""The method in the order of the paper: F2F at every frame; stereo, F2M and network at keyframes; GA at a track's end."""
+"""The method in the paper's order: F2F at every frame; stereo, F2M, network at keyframes; GA at the end of a track."""
 
 from __future__ import annotations
 
@@ -115,7 +115,8 @@ class Navigator:
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
         self.log.append(frame.time_s, f2f, online)
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
-        return Estimate(frame.time_s, online, f2f, geometry.log(moved) / interval_s, sigma_m, status)
+        velocity = geometry.log(moved) * (1 / interval_s)
+        return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
 
     def align_track(self, track: int) -> None:
         """Global alignment over the window of tracks that ends with this track; moves the online pose along."""

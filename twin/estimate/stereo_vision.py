@@ -15,12 +15,12 @@ from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObserva
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
-from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision import disparity, image_scale, matching, stereo
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
+from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -174,7 +174,7 @@ class StereoVision:
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
-    """Returns half the side of the mosaic window for registration [m]: 1.2 times the view at the 90th percentile of depth.
+    """Returns half the side of the mosaic window [m]: 0.6 times the view at the 90th percentile of depth.
 
     The largest depth is no measure: one mismatch of 0.5 px of disparity would demand 20 GB of mosaic.
     """

@@ -47,7 +47,7 @@ def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> Stere
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators, given only what they may know: believed calibration and noise, settings, planned start."""
+    """Returns the estimators, given what they may know: believed calibration and noise, settings, planned start."""
     scenario = mission.scenario
     return Navigator(
         mission.rig,

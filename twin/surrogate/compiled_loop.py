@@ -25,7 +25,8 @@ def compiled_loop(
     Every frame passes the same steps with the same random numbers as in `survey.fly`.
     """
     rate_hz = world.mission.rig.frame_rate_hz
-    gauges, n_steps = world.sensors.per_frame_sensors(), round(1 / rate_hz / vehicle.state.timestep_s)
+    interval_s = 1 / rate_hz
+    sensors, n_steps = world.sensors.per_frame_sensors(), round(interval_s / vehicle.state.timestep_s)
 
     def fast_forward(course: Course, first: int) -> int:
         errors, ahead = vision.frame_errors, course.keyframe[first:]
@@ -35,14 +36,15 @@ def compiled_loop(
         n, reference = end - first, tuple(np.asarray(part)[first:end] for part in course.reference)
         numbers = vision.draw_normals(n), *world.sensors.draw_noise(n)
         with world.stopwatch("physics"):
-            n, reckoned, true, f2f, online = _fly(
-                vision.last_pose, vision.last_normals, vehicle.state, gauges, errors,
-                navigator.dead_reckoning, navigator.aiding(1 / rate_hz), pilot.state, reference, numbers, n_steps, rate_hz,
+            n, state, true, f2f, online = _fly(
+                vision.last_pose, vision.last_normals, vehicle.state, sensors, errors,
+                navigator.dead_reckoning, navigator.aiding(interval_s), pilot.state, reference, numbers, n_steps,
+                interval_s,
             )  # fmt: skip
         times_s = np.arange(len(world), len(world) + n) / rate_hz
         world.record(true[:n])
         vision.last_pose, vision.last_normals = true[n - 1], numbers[0][n - 1]
-        navigator.adopt(reckoned)
+        navigator.adopt(state)
         navigator.log.append(times_s, f2f[:n], online[:n])
         vehicle.advance_clock(n / rate_hz)
         return end
@@ -51,23 +53,32 @@ def compiled_loop(
 
 
 @njit(cache=True, nogil=True)
-def _fly(last, last_numbers, body, gauges, errors, reckoned, instruments, helm, reference, numbers, n_steps, rate_hz):
-    """Frames flown (fewer where the physics diverged), reckoning after them, poses (n, 4, 4): true, f2f, online."""
+def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, reference, normals, n_steps, interval_s):
+    """Runs the closed loop over n frames.
+
+    Returns:
+        The number of frames (fewer where the physics diverged), the dead reckoning state after them, and the poses
+        (n, 4, 4): true, by F2F alone, online.
+    """
     positions, velocities, yaws, accelerations = reference
-    of_vision, of_gauges, of_log = numbers
+    vision_normals, sensor_normals, dvl_normals = normals
     n = len(positions)
     true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
     for k in range(n):
-        geometry.put(true[k], geometry.compose(body.pose, gauges.body_from_camera))
-        height, angles, velocity = read_per_frame_sensors(gauges, body.pose, body_twist(body), of_gauges[k], of_log[k])
-        a_from_b = sample_f2f_motion(errors, last, true[k], of_vision[k], last_numbers if k == 0 else of_vision[k - 1])
-        reckoned, aided = dead_reckon(reckoned, instruments, a_from_b, errors.cov, height, angles, velocity)
-        geometry.put(f2f[k], reckoned.f2f)
-        geometry.put(online[k], reckoned.online)
+        geometry.put(true[k], geometry.compose(body.pose, sensors.body_from_camera))
+        height, angles, velocity = read_per_frame_sensors(
+            sensors, body.pose, body_twist(body), sensor_normals[k], dvl_normals[k]
+        )
+        a_from_b = sample_f2f_motion(
+            errors, last, true[k], vision_normals[k], last_normals if k == 0 else vision_normals[k - 1]
+        )
+        state, motion = dead_reckon(state, aiding, a_from_b, errors.cov, height, angles, velocity)
+        geometry.put(f2f[k], state.f2f)
+        geometry.put(online[k], state.online)
         last = true[k]
-        twist = geometry.log(aided) * rate_hz
-        command = steer(helm, reckoned.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
+        twist = geometry.log(motion) * (1 / interval_s)  # the expression of `Navigator.update`, to the last bit
+        command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
         if has_diverged(body):
-            return k + 1, reckoned, true, f2f, online
-    return n, reckoned, true, f2f, online
+            return k + 1, state, true, f2f, online
+    return n, state, true, f2f, online

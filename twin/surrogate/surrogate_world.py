@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
-from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s
+from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.surrogate.compiled_loop import compiled_loop
 from twin.surrogate.error_model import ErrorModel
@@ -64,7 +64,11 @@ class SurrogateWorld(World):
         return CameraImages(_BLANK, _BLANK if step.keyframe else None, lambda: self.vision.scene.floor.depth(pose, rig))
 
     def fast_forward(self, navigator: Navigator, pilot: PilotOfEstimates) -> FastForward:
-        if isinstance(self.vehicle, CompiledVehicle) and isinstance(pilot, RovPilot) and navigator.vision is self.vision:
+        if (
+            isinstance(self.vehicle, CompiledVehicle)
+            and isinstance(pilot, RovPilot)
+            and navigator.vision is self.vision
+        ):
             return compiled_loop(self, self.vehicle, self.vision, navigator, pilot)
         return super().fast_forward(navigator, pilot)
 
@@ -82,6 +86,8 @@ def surrogate_vision(
     """
     scenario, terrain = mission.scenario, mission.terrain
     map_model = MapModel(mission.grid, true_heights(mission.grid, terrain.height_at), mission.rig)
-    scene = TrueScene(true_pose, FloorRayCaster(terrain), Matchability(scenario, mission.illumination, terrain), map_model)
+    scene = TrueScene(
+        true_pose, FloorRayCaster(terrain), Matchability(scenario, mission.illumination, terrain), map_model
+    )
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(mission.rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

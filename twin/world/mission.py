@@ -163,8 +163,12 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     if t.kind != "file":
         if t.height_file or t.texture_file:
             key = "height_file" if t.height_file else "texture_file"
-            raise TwinError(f"terrain.{key}", f"has no effect on a generated floor (terrain.kind = {t.kind!r})", 'terrain.kind = "file"')
-        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # without images the texture is not needed
+            raise TwinError(
+                f"terrain.{key}",
+                f"has no effect on a generated floor (terrain.kind = {t.kind!r})",
+                'terrain.kind = "file"',
+            )
+        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # no image, no texture
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
@@ -237,7 +241,9 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
 def _check_current(scenario: Scenario) -> None:
     """Rejects a current on a kinematic vehicle, which it does not move."""
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
-        raise TwinError("current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"')
+        raise TwinError(
+            "current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
+        )
 
 
 def _illumination(scenario: Scenario) -> Illumination:

@@ -23,7 +23,7 @@ PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns a pilot: a function of the estimate and the reference of the left camera that returns the vehicle's command."""
+    """Returns the pilot: a function from estimate and reference of the left camera to the command of the vehicle."""
     return RovPilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
 
 

@@ -12,10 +12,10 @@ from twin.core.timing import StageTimer
 from twin.imaging.camera import StereoCamera
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.renderer import Renderer
-from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.hull import physics_timestep_s
-from twin.simulate.sensors import NavigationSensors
+from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import Coverage
 from twin.world.mission import Mission, Step
 from twin.world.world import CameraImages, World, streams

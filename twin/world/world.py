@@ -14,8 +14,8 @@ from twin.core.geometry import Array
 from twin.core.growing_array import GrowingArray
 from twin.core.records import Frame, Image, StereoRig, Trajectory, Truth
 from twin.core.timing import StageTimer
-from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import true_heights
 from twin.world.mission import Course, Mission, Step
@@ -23,6 +23,8 @@ from twin.world.pilot import PilotOfEstimates
 
 if TYPE_CHECKING:
     from twin.simulate.mujoco_vehicle import MujocoVehicle
+
+    AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
 #: Random streams in the order in which seeds are spawned: appending one leaves the draws of the others unchanged.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
@@ -54,7 +56,11 @@ class World(ABC):
     warnings: tuple[str, ...] = ()
 
     def __init__(
-        self, mission: Mission, stopwatch: StageTimer, vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle, sensors: NavigationSensors
+        self,
+        mission: Mission,
+        stopwatch: StageTimer,
+        vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle,
+        sensors: NavigationSensors,
     ):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         self._true_poses = GrowingArray(4, 4)
@@ -133,7 +139,7 @@ class World(ABC):
         )
 
 
-def left_camera(vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle, rig: StereoRig) -> Array:
+def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:
     """Returns the true world_from_camera (4, 4) of the left camera."""
     return geometry.compose(vehicle.world_from_body, rig.body_from_camera)
 
