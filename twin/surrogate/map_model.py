@@ -124,8 +124,8 @@ class MapModel:
 
 @njit(cache=True, nogil=True)
 def _window(pose, camera, geotransform, lowest, size):
-    focal, cx, cy, _, _, _ = camera
     """Compiled kernel of `MapModel._window`."""
+    focal, cx, cy, _, _, _ = camera
     west, north, cell = geotransform
     rows, cols = size
     x_low = x_high = pose[0, 3]
