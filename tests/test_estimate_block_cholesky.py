@@ -83,7 +83,8 @@ def test_inverse_blocks_are_those_of_the_dense_inverse(factored):
     for node in {0, n // 2, n - 1}:
         np.testing.assert_allclose(factor.inverse_block(node), expected[node], atol=1e-9 * np.abs(expected).max())
     blocks = factor.invert_in_place()
-    np.testing.assert_allclose(blocks, expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
+    # the dense inverse is exact to the condition number (1e9) times 1e-16 only
+    np.testing.assert_allclose(blocks, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
 def test_fill_in_of_a_lawnmower_survey_is_below_3_percent_of_the_dense_triangle():

@@ -1,4 +1,4 @@
-"""Faults of a scenario that only show beside its floor are told by line, before anything is flown."""
+"""Errors of a scenario that depend on its floor are reported by line, before anything is flown."""
 
 import pytest
 
@@ -16,7 +16,7 @@ BAD_BEACONS = [
         "[[beacons]]\nposition_m = [1, 1, 0.4]",
         [
             "5: beacons.1.position_m: (5, 1) lies outside the terrain (allowed: x -4.50 to 4.50, y -3.50 to 3.50 m)",
-            "7: beacons.2.position_m: z 0.4 lies in the floor (allowed: above 0.500 m)",
+            "7: beacons.2.position_m: z 0.4 is below the floor (allowed: above 0.500 m)",
         ],
     ),
 ]
@@ -46,20 +46,20 @@ BAD_SENSORS = [
 ]
 
 
-@pytest.mark.parametrize(("text", "faults"), BAD_SENSORS)
-def test_a_sensor_that_cannot_be_is_told_by_line_all_at_once(tmp_path, text, faults):
+@pytest.mark.parametrize(("text", "errors"), BAD_SENSORS)
+def test_invalid_sensors_are_reported_by_line_all_at_once(tmp_path, text, errors):
     file = tmp_path / "sensor.toml"
     file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file))
-    assert told.value.lines == [f"{file}:{fault}" for fault in faults]
+    assert caught.value.lines == [f"{file}:{error}" for error in errors]
 
 
-@pytest.mark.parametrize(("text", "faults"), BAD_BEACONS)
-def test_beacons_that_cannot_be_are_told_by_line_all_at_once(tmp_path, text, faults):
+@pytest.mark.parametrize(("text", "errors"), BAD_BEACONS)
+def test_invalid_beacons_are_reported_by_line_all_at_once(tmp_path, text, errors):
     file = tmp_path / "beacons.toml"
     file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
     flat = ["terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.5"]
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file, flat))
-    assert told.value.lines == [f"{file}:{fault}" for fault in faults]
+    assert caught.value.lines == [f"{file}:{error}" for error in errors]

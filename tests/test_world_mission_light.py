@@ -1,4 +1,4 @@
-"""Water, lamps and sun that cannot be are told with file, line, key and what is allowed, before anything is flown."""
+"""Invalid water, lamps and sun are reported with file, line, key and allowed values, before anything is flown."""
 
 import pytest
 
@@ -32,24 +32,24 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
         (["sun.depth_m=1.5"], r"sun\.depth_m: 1\.5: the cameras are above the surface \(allowed: more than 2\)"),
         (
             ["lamps.0.position_m=[0.25, 0.35, -2.0]"],
-            r"lamps\.0\.position_m: lies 0\.\d\d m in the floor at x .*allowed: -1\.\d\d up or more",
+            r"lamps\.0\.position_m: is 0\.\d\d m below the floor at x .*allowed: -1\.\d\d up or more",
         ),
     ],
 )
-def test_light_that_cannot_be_is_told(overrides, fault):
+def test_invalid_light_is_reported(overrides, fault):
     with pytest.raises(ScenarioError, match=fault) as told:
         prepare(load_scenario("quickstart", [*SMALL, *overrides]))
     assert len(told.value.lines) == 1
 
 
-def test_a_lamp_that_is_told_to_be_in_the_floor_is_free_at_the_height_that_is_allowed():
+def test_a_lamp_below_the_floor_is_accepted_at_the_allowed_height():
     with pytest.raises(ScenarioError) as told:
         prepare(load_scenario("quickstart", [*SMALL, "lamps.0.position_m=[0.25, 0.35, -2.0]"]))
     height_m = float(told.value.lines[0].rpartition("allowed: ")[2].split()[0])
     prepare(load_scenario("quickstart", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
 
 
-def test_water_lamps_and_sun_survive_a_round_trip_and_a_spectrum_lies_beside_its_scenario(tmp_path):
+def test_water_lamps_and_sun_survive_a_round_trip_with_a_relative_spectrum_file(tmp_path):
     (tmp_path / "lake.csv").write_text("400, 0.1, 0.2\n700, 0.3, 0.2\n")
     file = tmp_path / "lake.toml"
     file.write_text(

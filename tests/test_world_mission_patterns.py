@@ -1,4 +1,4 @@
-"""Whole surveys beside the lawnmower on the ROV: loops, the paper's flat motion; and every scene can be planned."""
+"""Surveys other than the lawnmower of the ROV: loops and the paper's level motion; every scene can be planned."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def edges(folder):
     return np.array([line.split()[1:3] for line in lines if line.startswith("EDGE")], dtype=int)
 
 
-def test_loops_are_flown_by_sight_and_mapped(looped):
+def test_loops_are_flown_and_mapped_by_vision(looped):
     m = looped.metrics
     assert m["status"] == "complete"
     assert m["trajectory"]["final"]["ate_rmse_m"] < 0.01
@@ -52,7 +52,7 @@ def test_loops_are_flown_by_sight_and_mapped(looped):
     assert m["overlap"]["across_p05"] > 1 - 0.2 * 1.5
     assert [row["track"] for row in m["tracks"]] == [1, 2]
     assert all(row["farthest_error_m"] < 0.01 for row in m["tracks"])
-    assert "<th>far end</th>" in (looped.folder / "report.html").read_text()
+    assert "<th>RMSE at far end</th>" in (looped.folder / "report.html").read_text()
 
 
 def test_a_loop_is_linked_with_its_own_start_and_with_the_loop_before(looped):
@@ -63,7 +63,7 @@ def test_a_loop_is_linked_with_its_own_start_and_with_the_loop_before(looped):
     assert ((i < n_first) & (j >= n_first)).sum() > n_first  # neighbours all around
 
 
-def test_the_carrier_moves_in_a_plane_without_rotation_and_the_survey_is_complete(flat):
+def test_the_kinematic_vehicle_moves_in_a_plane_without_rotation_and_the_survey_is_complete(flat):
     assert flat.status == "complete"
     path = Trajectory.load(flat.folder / "trajectory_truth.tum")
     rotations = path.world_from_camera[:, :3, :3]
@@ -74,7 +74,7 @@ def test_the_carrier_moves_in_a_plane_without_rotation_and_the_survey_is_complet
     assert flat.metrics["control"]["cross_track_rmse_m"] < 0.01
 
 
-def test_a_carrier_goes_where_it_is_told_at_once_but_never_up():
+def test_a_kinematic_vehicle_has_the_commanded_horizontal_velocity():
     pose = np.eye(4)
     pose[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # bow to the north
     carrier = KinematicVehicle(pose)
@@ -98,17 +98,18 @@ def test_a_carrier_goes_where_it_is_told_at_once_but_never_up():
         (["plan.altitude_m=0.7"], "--set: plan.altitude_m: 0.7: the cameras come within "),
         (
             ["vehicle.dynamics=kinematic", "current.velocity_mps=[0.1, 0.0, 0.0]"],
-            '--set: current.velocity_mps: moves no kinematic vehicle (allowed: zero, or vehicle.dynamics = "rigid")',
+            "--set: current.velocity_mps: has no effect on a kinematic vehicle "
+            '(allowed: zero, or vehicle.dynamics = "rigid")',
         ),
     ],
 )
-def test_what_cannot_be_flown_is_refused_with_its_key(overrides, message):
+def test_an_impossible_plan_is_rejected_with_its_key(overrides, message):
     with pytest.raises(ScenarioError) as refused:
         prepare(load_scenario("quickstart", [*LOOPS, *overrides]))
     assert message in str(refused.value)
 
 
-def test_the_lawnmower_may_fly_as_fast_as_the_bow_allows_and_a_carrier_faster():
+def test_the_speed_limit_is_that_of_the_bow_and_a_kinematic_vehicle_has_none():
     lawnmower = [*SMALL, "plan.area_m=[2.0, 1.0]"]
     prepare(load_scenario("quickstart", [*lawnmower, "plan.speed_mps=0.7"]))
     prepare(load_scenario("quickstart", [*lawnmower, "plan.speed_mps=1.0", "vehicle.dynamics=kinematic"]))

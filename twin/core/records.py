@@ -90,6 +90,15 @@ class StereoRig:
             principal_point_px=centre and ((centre[0] + 0.5) / by - 0.5, (centre[1] + 0.5) / by - 0.5),
         )
 
+    def with_square_pixels(self) -> StereoRig:
+        """Returns the rig of images resampled along their columns so that fy equals fx."""
+        scale = self.fx_px / self.fy_px
+        if scale == 1:
+            return self
+        height = int(self.height_px * scale)
+        centre = self.cx_px, (self.cy_px + 0.5) * scale - 0.5
+        return replace(self, height_px=height, focal_y_px=None, principal_point_px=centre)
+
     def project(self, points: Array) -> Array:
         """Returns the pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind the camera."""
         depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
@@ -340,14 +349,17 @@ class ElevationMap:
     """Digital elevation model with its uncertainty and orthomosaic; NaN (black) in cells without a measurement.
 
     Args:
-        height_m, sigma_m: (rows, cols) float32, height and its standard deviation [m].
+        grid: cells in x and y of the map's axes.
+        height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m].
         mosaic: (rows, cols, 3) uint8 RGB.
+        map_from_world: (4, 4) pose of the world in the map's axes; the identity for a rig that looks down.
     """
 
     grid: MapGrid
     height_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
     mosaic: Image
+    map_from_world: Array = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass

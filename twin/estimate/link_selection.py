@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,20 +16,33 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
 _SAME_SWATH = 2  # the paper's two previous keyframes on the same swath
-_NEAREST_M = 1e-3  # of a point before a camera
+_NEAREST_M = 1e-3  # least depth of a visible point
+
+
+class _View(NamedTuple):
+    """Intrinsics [px], image size [px], and the distance of a point from the border at which it counts as visible."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    margin: int
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
-    """Shares (n,) of the node's points that the left images at poses (n, 4, 4) show: overlap of true 3-D footprints.
+    """Returns the overlaps (n,) of a node with the left images at poses (n, 4, 4), 0 to 1.
 
-    Predicted from poses and depth (P11), not from a flat floor.
+    The overlap is the fraction of the node's matched points that project into the other image (P11): it is predicted
+    from poses and depth, not from a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
     world = np.ascontiguousarray(geometry.transform(node.world_from_camera, node.points.xyz))
-    camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
-    here, reach_m = node.world_from_camera[:3, 3].copy(), _reach_m(node.points.xyz, rig)
-    return _overlaps(world, here, np.ascontiguousarray(poses), reach_m, *camera)
+    camera = _View(rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
+    position, reach_m = node.world_from_camera[:3, 3].copy(), _reach_m(node.points.xyz, rig)
+    return _overlaps(world, position, np.ascontiguousarray(poses), reach_m, camera)
 
 
 def choose_links(
@@ -40,13 +54,23 @@ def choose_links(
     max_links: int,
     patch_px: int,
 ) -> list[tuple[Keyframe, float]]:
-    """Earlier nodes to link with: the two previous ones, the farthest on the same swath, and the best of other swaths.
+    """Selects the earlier nodes that a new node is linked to.
 
-    The last link of a run of overlapping nodes carries the longest base; links to other swaths tie the legs together,
-    and the oldest of them ties loops to where they all began.
+    These are the two previous nodes, the farthest node of the same swath, and nodes of other swaths in the order of
+    their overlap. The farthest node of a swath gives the longest base; links to other swaths connect the legs, and the
+    oldest of them closes loops.
 
     Args:
-        poses: (n, 4, 4) of the earlier ones.
+        node: the new node.
+        earlier: candidate nodes in the order of time.
+        poses: (n, 4, 4) world_from_camera of the candidates.
+        rig: believed calibration.
+        min_overlap: smallest overlap of a link, 0 to 1.
+        max_links: largest number of links.
+        patch_px: side of the matching window.
+
+    Returns:
+        The nodes with their overlaps.
     """
     shares = overlaps(node, poses, rig, patch_px)
     linked = np.flatnonzero(shares >= min_overlap)[::-1].tolist()
@@ -61,21 +85,22 @@ def choose_links(
 
 
 def share_noise(links: Sequence[Link]) -> list[Link]:
-    """The links of one new node with the covariance that they have together.
+    """Returns the links of one new node with inflated covariances, because their errors are correlated.
 
-    They all start from the node's own stereo points, whose noise is most of what a link's motion errs by. Taken as
-    independent, n links would count the node's one look n times: positions came out over-sure by n, about 5.
+    All n links use the same stereo points of the node, whose noise dominates their error. Treated as independent, they
+    would count one stereo observation n times, and the positions would be overconfident by a factor of about 5 in
+    variance. The covariance of each is multiplied by n.
     """
     return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Those that follow one another without a gap, back from the newest: the node's own swath."""
+    """Returns the consecutive nodes back from the newest one: the node's own swath."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """The best of other swaths, no two of them neighbours on theirs as long as there is a choice."""
+    """Returns up to `count` nodes of other swaths by overlap; neighbours of a chosen node come last."""
     chosen: list[int] = []
     for k in others:
         if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
@@ -84,32 +109,33 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """No camera farther away sees the same floor: the image's diagonal at the largest depth of the points (n, 3)."""
-    return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / rig.focal_px)
+    """Returns the distance beyond which no camera sees the points (n, 3): the image diagonal at their largest depth."""
+    return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
 @njit(cache=True, nogil=True)
-def _overlaps(world, here, poses, reach, focal, cx, cy, width, height, margin):
-    """As `overlaps`, of points (m, 3) in the world; cameras out of reach of the node's (3,) share nothing."""
+def _overlaps(world, position, poses, reach, view):
+    """Compiled kernel of `overlaps`: points (m, 3) in the world, position (3,) of the node's camera."""
     shares = np.zeros(len(poses))
     for k in range(len(poses)):
         pose, count = poses[k], 0
-        if np.sum((here - pose[:3, 3]) ** 2) >= reach * reach:
+        if np.sum((position - pose[:3, 3]) ** 2) >= reach * reach:
             continue
         for x, y, z in world:
             dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
             depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
             if depth < _NEAREST_M:
                 continue
-            u = focal * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + cx
-            v = focal * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + cy
-            count += margin <= u < width - margin and margin <= v < height - margin
+            u = view.fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + view.cx
+            v = view.fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + view.cy
+            inside_columns = view.margin <= u < view.width - view.margin
+            count += inside_columns and view.margin <= v < view.height - view.margin
         shares[k] = count / len(world)
     return shares
 
 
-def to_link(node: Keyframe, other: Keyframe, share: float, result: Motion) -> Link:
-    """The network's record of a measured motion."""
+def to_link(node: Keyframe, other: Keyframe, overlap: float, result: Motion) -> Link:
+    """Returns the link of a measured motion from an earlier node to a new one."""
     return Link(
-        other.number, node.number, result.a_from_b, result.cov, share, result.n_points, closed_form=result.closed_form
+        other.number, node.number, result.a_from_b, result.cov, overlap, result.n_points, closed_form=result.closed_form
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self
@@ -24,6 +25,7 @@ from twin.estimate.network import KeyframeNetwork
 from twin.estimate.pose_log import PoseLog
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import interpolate_between_keyframes
+from twin.estimate.viewing_plane import viewing_plane
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision_interface import Vision
 
@@ -161,8 +163,11 @@ class Navigator:
     ) -> ElevationMap | None:
         """Builds the elevation map along the final trajectory.
 
+        Its heights are along z of the world if the first keyframe looks down within 45 degrees, otherwise along its
+        optical axis (`ElevationMap.map_from_world`).
+
         Args:
-            grid: cells of the map, in x and y of the world; by default all that the keyframes show.
+            grid: cells of the map; by default all that the keyframes show.
             progress: called with the fraction done.
 
         Returns:
@@ -171,9 +176,12 @@ class Navigator:
         n_keyframes = len(result.keyframe_rows)
         if n_keyframes == 0:
             return None
-        report = progress or (lambda _: None)
-        cells = grid or footprint_grid(result, self.rig)
-        return self.vision.build_map(result, cells, result.step_cov, lambda done: report(done / n_keyframes))
+        report, final = progress or (lambda _: None), result.final
+        map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
+        turned = replace(result, final=Trajectory(final.times_s, map_from_world @ final.world_from_camera))
+        cells = grid or footprint_grid(turned, self.rig)
+        found = self.vision.build_map(turned, cells, result.step_cov, lambda done: report(done / n_keyframes))
+        return replace(found, map_from_world=map_from_world)
 
     @property
     def dead_reckoning(self) -> DeadReckoningState:

@@ -15,6 +15,7 @@ from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObserva
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
+from twin.estimate.viewing_plane import viewing_plane
 from twin.estimate.vision import disparity, image_scale, matching, stereo
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
@@ -24,7 +25,8 @@ from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
-_LEAST_POINTS = 12  # of a keyframe
+_MIN_POINTS = 12  # of a keyframe
+_SAME_INTERVAL = 1e-6  # relative; timestamps are rounded
 
 
 class StereoVision:
@@ -50,9 +52,11 @@ class StereoVision:
         cell_m: float | None = None,
         stopwatch: StageTimer | None = None,
     ):
-        self.full_rig, self.settings, self.stopwatch = rig, settings, stopwatch or Stopwatch()
+        self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()
+        self._row_scale = rig.fx_px / rig.fy_px
         self._cell_m, self._folder = cell_m, folder
         self._times_s: tuple[float, float] = (np.nan, np.nan)  # of the last two frames
+        self._plane_from_world: Array | None = None
         self._configure(binning=1)
         self.stereo_observations: list[StereoObservation] = []
         self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
@@ -87,6 +91,23 @@ class StereoVision:
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
 
+    def _square(self, image: Image) -> Image:
+        """Returns the image resampled to square pixels."""
+        return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
+
+    def _interval_ratio(self, time_s: float) -> float:
+        """Returns the time since the last frame divided by the interval before it; 1 where only rounding differs."""
+        before, last = self._times_s
+        self._times_s = last, time_s
+        ratio = (time_s - last) / (last - before) if last > before else 1.0
+        return ratio if abs(ratio - 1) > _SAME_INTERVAL else 1.0
+
+    def _on_plane(self, world_from_camera: Array) -> Array:
+        """Returns a pose (4, 4) in the axes of the mosaic, which are chosen at the first keyframe."""
+        if self._plane_from_world is None:
+            self._plane_from_world = viewing_plane(world_from_camera)
+        return self._plane_from_world @ world_from_camera
+
     def _choose_scale(self, left: Image, right: Image) -> None:
         """Chooses the image scale by the first stereo pair, before anything is stored."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
@@ -103,25 +124,26 @@ class StereoVision:
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         with self.stopwatch("f2f"):
-            self._set_image(frame.left)
-            return self.f2f.step(self._image)
+            self._set_image(self._square(frame.left))
+            return self.f2f.step(self._image, self._interval_ratio(frame.time_s))
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None
+        left_image, right_image = self._square(frame.left), self._square(frame.right)
         with self.stopwatch("stereo"):
             if self._points is None:
-                self._choose_scale(frame.left, frame.right)
-            right = matching.gray(frame.right, self.binning)
+                self._choose_scale(left_image, right_image)
+            right = matching.gray(right_image, self.binning)
             dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
             self.search_range.update(dense_px)
             points = stereo.match_stereo_points(
                 self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
             )
         self.stereo_observations.append(StereoObservation(row, len(points.xyz), matching.contrast(self._gray)))
-        if len(points.xyz) < _LEAST_POINTS:
+        if len(points.xyz) < _MIN_POINTS:
             return None
         self._points, self._depth_m = points, _depth(dense_px, self.rig)
-        self.spool.put(row, frame.left, frame.right, (self._gray, right))
+        self.spool.put(row, left_image, right_image, (self._gray, right))
         return points
 
     def restart_tracking(self) -> None:
@@ -131,10 +153,10 @@ class StereoVision:
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
         assert self._points is not None
         half_m = half_window_m(self._points, self.rig)
-        return self.mosaic.register(self._image, self._depth_m, world_from_camera, half_m, self.rig)
+        return self.mosaic.register(self._image, self._depth_m, self._on_plane(world_from_camera), half_m, self.rig)
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        self.mosaic.add(number, self._image, self._depth_m, world_from_camera, self.rig)
+        self.mosaic.add(number, self._image, self._depth_m, self._on_plane(world_from_camera), self.rig)
         self._depth_of_keyframe[number] = self._depth_m.astype(np.float16)
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
@@ -143,7 +165,7 @@ class StereoVision:
         for key in keyframes:
             image = matching.normalise(self.spool.gray(key.row)[0])
             depth_m = self._depth_of_keyframe[key.number].astype(np.float32)
-            self.mosaic.add(key.number, image, depth_m, key.world_from_camera, self.rig)
+            self.mosaic.add(key.number, image, depth_m, self._on_plane(key.world_from_camera), self.rig)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
         with self.stopwatch("flow"):

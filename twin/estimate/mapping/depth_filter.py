@@ -84,10 +84,11 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
         step_cov: (6, 6) covariance of that relative pose [rotation, translation], in the new camera (rad, m).
         rig: calibration.
     """
-    args = (rig.focal_px, rig.focal_px * rig.baseline_m, JUMP_PX)
+    camera = (rig.focal_px, rig.cx_px, rig.cy_px)
+    args = (camera, rig.focal_px * rig.baseline_m, JUMP_PX)
     old_from_new = geometry.inverse(new_from_old)
     guess = new.depth_m.copy()
-    _forward_project(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, args[0])
+    _forward_project(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, camera)
     prior = DepthMap(
         *_backward_warp(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args)
     )
@@ -125,7 +126,7 @@ def motion_depth(
         old_from_new[:3, :3].copy(),
         old_from_new[:3, 3].copy(),
         step_cov,
-        rig.focal_px,
+        (rig.focal_px, rig.cx_px, rig.cy_px),
         focal_baseline,
     )
     sigma = np.sqrt(flow.measurement_sigma_px**2 + pose_variance + np.float32(MOTION_MIN_SIGMA_PX**2))
@@ -153,10 +154,10 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 
 @njit(cache=True, nogil=True)
-def _forward_project(old, rotation, translation, guess, focal):
+def _forward_project(old, rotation, translation, guess, camera):
     """Fills unknown pixels of `guess` (H, W) with the nearest old depth that projects to them."""
     height, width = old.shape
-    cx, cy = (width - 1) / 2, (height - 1) / 2
+    focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
     for v in range(height):
         for u in range(width):
@@ -229,10 +230,10 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 
 @njit(cache=True, nogil=True)
-def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, focal, focal_baseline, jump):
+def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
     """Returns depth and variance (H, W) of the old map at the pixels of the new map, linearised at `guess`."""
     height, width = old.shape
-    cx, cy = (width - 1) / 2, (height - 1) / 2
+    focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
     is_uncertain = np.trace(step_cov) > 0
     row = np.empty(6)
@@ -275,13 +276,13 @@ def _quadratic(row, cov):
 
 
 @njit(cache=True, nogil=True)
-def _pose_variance(disparity, rotation, translation, step_cov, focal, focal_baseline):
+def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
     """Returns the variance (H, W) of disparity from motion due to the relative pose: J cov J' [px^2].
 
     The component along the epipolar line of a displacement of the image point is interpreted as a change of depth.
     """
     height, width = disparity.shape
-    cx, cy = (width - 1) / 2, (height - 1) / 2
+    focal, cx, cy = camera
     result = np.zeros(disparity.shape, np.float32)
     if np.trace(step_cov) <= 0:
         return result

@@ -63,7 +63,12 @@ def rasterise(
         The patch, or None if the surface does not overlap the grid.
     """
     points, bounds = _grid_points(
-        depth_map.depth_m, world_from_camera, rig.focal_px, grid.west_m, grid.north_m, grid.cell_m
+        depth_map.depth_m,
+        world_from_camera,
+        (rig.focal_px, rig.cx_px, rig.cy_px),
+        grid.west_m,
+        grid.north_m,
+        grid.cell_m,
     )
     window = _window(bounds, grid)
     if window is None:
@@ -121,20 +126,20 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
 
 @njit(cache=True, nogil=True)
-def _grid_points(depth, pose, focal, west, north, cell):
+def _grid_points(depth, pose, camera, west, north, cell):
     """Converts a depth map to grid coordinates.
 
     Returns:
         Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; their bounds (4,):
         lowest row and column, highest row and column.
     """
-    height, width = depth.shape
+    (focal, cx, cy), (height, width) = camera, depth.shape
     points = np.empty((height, width, 3))
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     for v in range(height):
-        y = (v - (height - 1) / 2) / focal
+        y = (v - cy) / focal
         for u in range(width):
-            x, z = (u - (width - 1) / 2) / focal, depth[v, u]
+            x, z = (u - cx) / focal, depth[v, u]
             col = (z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3] - west) / cell - 0.5
             row = (north - z * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]) - pose[1, 3]) / cell - 0.5
             points[v, u, 0], points[v, u, 1] = row, col

@@ -69,11 +69,12 @@ class FrameToFrame:
             _Reference(image, points.pixels[strongest], points.measured[strongest], points.cov[strongest])
         )
 
-    def step(self, image: matching.Image) -> tuple[two_view_motion.Motion, str]:
+    def step(self, image: matching.Image, interval_ratio: float = 1.0) -> tuple[two_view_motion.Motion, str]:
         """Estimates the motion from the last frame to this one.
 
         Args:
             image: (height, width) normalised frame.
+            interval_ratio: time since the last frame divided by the time between the two frames before.
 
         Returns:
             The motion, and "ok" or the reason for a failure. The covariance is that of the pose in the reference, so
@@ -82,6 +83,8 @@ class FrameToFrame:
         if not self.started:
             self.started = True
             return two_view_motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
+        if interval_ratio != 1:
+            self.last_motion = geometry.exp(interval_ratio * geometry.log(self.last_motion))
         previous, predicted = self.reference_from_current, self.reference_from_current @ self.last_motion
         located = None if self.reference is None else self._locate(image, self.reference, predicted)
         if located is None:

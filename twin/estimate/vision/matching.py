@@ -83,6 +83,13 @@ def binned(image: Pixels, by: int) -> Pixels:
     return smaller
 
 
+def scaled_rows(image: Image, scale: float) -> Image:
+    """Returns an image (H, W, ...) resampled to int(H scale) rows; row v of the input is row (v + 0.5) scale - 0.5."""
+    rows, columns = int(image.shape[0] * scale), image.shape[1]
+    matrix = np.array([[1, 0, 0], [0, scale, 0.5 * scale - 0.5]])
+    return np.asarray(cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+
 @njit(cache=True, nogil=True, fastmath=True)
 def _normalise(gray, mean, square, normalised):
     """Compiled kernel of `normalise`: writes `normalised` (n,) uint8 from grey levels and their local moments (n,)."""

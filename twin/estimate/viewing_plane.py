@@ -1,0 +1,26 @@
+"""The plane that a mosaic or an elevation map is drawn on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+
+_MAX_TILT_RAD = np.deg2rad(45.0)  # up to this angle from straight down, heights above z = 0 describe the scene well
+
+
+def viewing_plane(world_from_camera: Array) -> Array:
+    """Returns plane_from_world (4, 4): axes in which a camera looks down on the plane z = 0.
+
+    The identity for a camera (4, 4) that looks down within 45 degrees; otherwise the smallest rotation about the
+    origin that turns its optical axis to -z.
+    """
+    axis = world_from_camera[:3, 2]
+    angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
+    if angle <= _MAX_TILT_RAD:
+        return np.eye(4)
+    turn = np.cross(axis, [0.0, 0.0, -1.0])
+    length = np.linalg.norm(turn)
+    direction = np.array([1.0, 0.0, 0.0]) if length < 1e-9 else turn / length  # straight up: any horizontal axis
+    return geometry.pose(geometry.so3_exp(direction * angle), np.zeros(3))
