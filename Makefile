@@ -15,9 +15,10 @@ $(READY): pyproject.toml constraints.txt .ci/system-packages
 demo: env ## a small complete survey
 	$(BIN)/twin demo
 
-test: env ## style and the fast tests
+test: env ## style, types and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/pyright
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 slow: env ## whole surveys and benchmarks

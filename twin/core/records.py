@@ -312,10 +312,10 @@ class SurveyResult:
     node_cov: Array
     keyframe_depth_m: Array = field(default_factory=lambda: np.zeros(0))
     links: Links = field(default_factory=Links)
-    alignments: list[Alignment] = field(default_factory=list)
-    before_ga: list[Array] = field(default_factory=list)
-    after_ga: list[Array] = field(default_factory=list)
-    stereo_observations: list[StereoObservation] = field(default_factory=list)
+    alignments: list[Alignment] = field(default_factory=list[Alignment])
+    before_ga: list[Array] = field(default_factory=list[Array])
+    after_ga: list[Array] = field(default_factory=list[Array])
+    stereo_observations: list[StereoObservation] = field(default_factory=list[StereoObservation])
 
     @property
     def step_cov(self) -> Array:

@@ -77,10 +77,10 @@ class AlignmentHistory:
         before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
     """
 
-    alignments: list[Alignment] = field(default_factory=list)
-    dropped: list[Link] = field(default_factory=list)
-    before_ga: list[Array] = field(default_factory=list)
-    after_ga: list[Array] = field(default_factory=list)
+    alignments: list[Alignment] = field(default_factory=list[Alignment])
+    dropped: list[Link] = field(default_factory=list[Link])
+    before_ga: list[Array] = field(default_factory=list[Array])
+    after_ga: list[Array] = field(default_factory=list[Array])
 
 
 class KeyframeNetwork:

@@ -176,11 +176,16 @@ class Navigator:
         n_keyframes = len(result.keyframe_rows)
         if n_keyframes == 0:
             return None
-        report, final = progress or (lambda _: None), result.final
+        final = result.final
         map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
         turned = replace(result, final=Trajectory(final.times_s, map_from_world @ final.world_from_camera))
         cells = grid or footprint_grid(turned, self.rig)
-        found = self.vision.build_map(turned, cells, result.step_cov, lambda done: report(done / n_keyframes))
+
+        def report(n_done: int) -> None:
+            if progress is not None:
+                progress(n_done / n_keyframes)
+
+        found = self.vision.build_map(turned, cells, result.step_cov, report)
         return replace(found, map_from_world=map_from_world)
 
     @property

@@ -53,7 +53,15 @@ def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def dead_reckon(last, aiding, a_from_b, cov, height_m, rpy_rad, velocity_mps):
+def dead_reckon(
+    last: DeadReckoningState,
+    aiding: FrameAiding,
+    a_from_b: Array,
+    cov: Array,
+    height_m: float,
+    rpy_rad: Array,
+    velocity_mps: Array,
+) -> tuple[DeadReckoningState, Array]:
     """Computes the state after one frame.
 
     Args:
