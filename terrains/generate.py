@@ -95,7 +95,7 @@ def _reef(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
 
 
 def _staircase(level: Heights) -> Heights:
-    """Rounds levels down to whole steps, joined by smooth risers."""
+    """Returns terraces: levels rounded down to integers, with smooth transitions between them."""
     step = np.floor(level)
     t = np.clip((level - step - 0.35) / 0.3, 0, 1)
     return (step + t * t * (3 - 2 * t)).astype(np.float32)

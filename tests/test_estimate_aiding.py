@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from twin.core import geometry
 from twin.core.links import Link
-from twin.core.records import Displacement, Readings, SensorNoise, Sighting, StereoRig
+from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.alignment import align
 from twin.estimate.navigation import aiding
 from twin.estimate.navigation.dvl import DvlIntegrator, body_displacement, fuse_displacement, fuse_dvl
@@ -36,7 +36,7 @@ def pixels_of(pose):
 
 
 def sightings_of(pixels):
-    return tuple(Sighting(k, (float(u), float(v))) for k, (u, v) in enumerate(pixels))
+    return tuple(BeaconDetection(k, (float(u), float(v))) for k, (u, v) in enumerate(pixels))
 
 
 def dense_update(cov, jacobian, noise_cov, residual):
@@ -68,7 +68,7 @@ def test_fusion_of_a_beacon_is_a_kalman_update():
     pixel = pixels_of(POSE)[2] + [0.4, -0.3]
     jacobian = numeric(lambda m: pixels_of(POSE @ geometry.exp(m))[2], np.zeros(6))
     moved, after = dense_update(cov, jacobian, np.eye(2) * 0.2**2, pixel - pixels_of(POSE)[2])
-    pose_filter.fuse_position_fixes(Readings(beacons=(Sighting(2, tuple(pixel)),)))
+    pose_filter.fuse_position_fixes(Readings(beacons=(BeaconDetection(2, tuple(pixel)),)))
     np.testing.assert_allclose(geometry.log(geometry.inverse(POSE) @ pose_filter.world_from_camera), moved, atol=1e-9)
     np.testing.assert_allclose(pose_filter.cov, after, rtol=1e-5, atol=1e-12)
 
@@ -76,7 +76,7 @@ def test_fusion_of_a_beacon_is_a_kalman_update():
 def test_a_beacon_behind_the_camera_is_ignored():
     above = geometry.pose(MOUNT[:3, :3], np.array([0.3, 0.2, -1.0]))
     pose_filter = PoseFilter(above, RIG, NOISE)
-    pose_filter.fuse_position_fixes(Readings(beacons=(Sighting(0, (100.0, 100.0)),)))
+    pose_filter.fuse_position_fixes(Readings(beacons=(BeaconDetection(0, (100.0, 100.0)),)))
     np.testing.assert_array_equal(pose_filter.world_from_camera, above)
 
 

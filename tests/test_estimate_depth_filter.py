@@ -10,6 +10,7 @@ from twin.estimate.mapping.depth_filter import GATE, DepthMap, fuse, motion_dept
 
 RIG = small_rig(160, 120)
 EXACT = np.zeros((6, 6))
+CAMERA = (RIG.focal_px, 1.0, 1.0)  # of an image of 3 x 3 pixels
 FOCAL_BASELINE = RIG.focal_px * RIG.baseline_m
 
 
@@ -133,6 +134,6 @@ def test_the_variance_of_motion_depth_includes_that_of_the_relative_pose():
         expected = np.sum(shift * along, 1) / np.sum(along**2, 1)
         cov = np.outer(motion, motion)
         variance = depth_filter._pose_variance(
-            disparity, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), cov, RIG.focal_px, FOCAL_BASELINE
+            disparity, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), cov, CAMERA, FOCAL_BASELINE
         )
         np.testing.assert_allclose(np.sqrt(variance.ravel()), np.abs(expected), rtol=2e-3, atol=1e-9)

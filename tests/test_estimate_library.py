@@ -7,11 +7,13 @@ import seafloor_scene as scene
 
 from twin.core import geometry
 from twin.errors import TwinError
-from twin.estimate import EstimatorSettings, Frame, Navigator, Readings, SensorNoise, StereoRig
+from twin.estimate import EstimatorSettings, Frame, MapGrid, Navigator, Readings, SensorNoise, StereoRig
+from twin.estimate.mapping import depth_filter, surface
+from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.viewing_plane import viewing_plane
 
 RENDERED = scene.small_rig(400, 300, 55.0, 0.15)
-CROP, ROW_SCALE = (slice(10, 290), slice(20, 360)), 0.9
+CROP, ROW_SCALE = (slice(0, 280), slice(20, 360)), 0.9
 #: The same images cropped off centre, with rows resampled: fx / fy = 1 / 0.9.
 RIG = StereoRig(
     width_px=340,
@@ -20,7 +22,7 @@ RIG = StereoRig(
     baseline_m=0.15,
     frame_rate_hz=15.0,
     focal_y_px=RENDERED.focal_px * ROW_SCALE,
-    principal_point_px=(RENDERED.cx_px - 20, (RENDERED.cy_px - 10 + 0.5) * ROW_SCALE - 0.5),
+    principal_point_px=(RENDERED.cx_px - 20, (RENDERED.cy_px + 0.5) * ROW_SCALE - 0.5),
 )
 SIDEWAYS = geometry.pose(geometry.rotation_from_rpy(0.3, 1.4, 0.5), np.array([5.0, -2.0, 1.0]))
 
@@ -109,9 +111,18 @@ def test_the_map_covers_the_view_and_is_accurate(recorded, flown):
     np.testing.assert_array_equal(elevation.map_from_world, np.eye(4))
 
 
-def test_a_rig_that_looks_sideways_gives_the_same_path_and_map(recorded, flown):
-    """The same images with a start in a world turned by 80 degrees."""
+def test_a_rig_that_looks_sideways_gives_the_same_path_and_map(recorded, flown, monkeypatch):
+    """The same images with a start in a world turned by 80 degrees; F2M registers as well as from above."""
+    corrections = []
+    register = StereoVision.register_with_mosaic
+
+    def counted(self, world_from_camera):
+        corrections.append(register(self, world_from_camera))
+        return corrections[-1]
+
+    monkeypatch.setattr(StereoVision, "register_with_mosaic", counted)
     _, result, elevation = navigate(recorded[1], SIDEWAYS @ recorded[2][0])
+    assert sum(found is not None for found in corrections) >= len(corrections) - 1 > 2
     moved = geometry.transform(SIDEWAYS, flown[1].final.positions)
     assert np.linalg.norm(result.final.positions - moved, axis=1).max() < 0.002
     assert np.abs(elevation.map_from_world - np.eye(4)).max() > 0.5
@@ -121,6 +132,44 @@ def test_a_rig_that_looks_sideways_gives_the_same_path_and_map(recorded, flown):
     there = geometry.transform(geometry.inverse(elevation.map_from_world @ SIDEWAYS), points)
     error_m = np.abs(there[:, 2] - recorded[0].height_at(there[:, 0], there[:, 1]))
     assert known.mean() > 0.5 and np.percentile(error_m, 90) < 0.01
+
+
+def test_cropped_depth_maps_with_their_principal_point_give_the_crop_of_the_result():
+    """Propagation to the next keyframe, pose variance and rasterisation see the rays, not the image centre."""
+    full, (top, left) = scene.small_rig(120, 100, 50.0, 0.15), (12, 23)
+    rows, cols = slice(top, top + 70), slice(left, left + 80)
+    cropped = StereoRig(80, 70, full.focal_px, 0.15, principal_point_px=(full.cx_px - left, full.cy_px - top))
+    _, depth = scene.render_view(hills(), full, scene.down_camera(0, 0, 1.6))
+    whole = depth_filter.DepthMap(depth.astype(np.float32), np.full(depth.shape, 1e-4, np.float32))
+    step, cov = geometry.exp(np.array([0.03, -0.02, 0.3, 0.02, 0.01, 0.03])), np.eye(6) * 1e-6
+    part = depth_filter.DepthMap(whole.depth_m[rows, cols], whole.variance_m2[rows, cols])
+    ends = [depth_filter.propagate(one, one, step, cov, rig).fused for one, rig in ((whole, full), (part, cropped))]
+    inner = np.s_[25:45, 30:50]
+    for a, b in zip(ends[0], ends[1], strict=True):
+        np.testing.assert_allclose(b[inner], a[rows, cols][inner], rtol=1e-5)
+    rotation, translation = step[:3, :3].copy(), step[:3, 3].copy()
+    variances = [
+        depth_filter._pose_variance(
+            (15 / one.depth_m).astype(np.float32),
+            rotation,
+            translation,
+            cov,
+            (rig.focal_px, rig.cx_px, rig.cy_px),
+            20.0,
+        )
+        for one, rig in ((whole, full), (part, cropped))
+    ]
+    np.testing.assert_allclose(variances[1][inner], variances[0][rows, cols][inner], rtol=1e-5)
+    grid = MapGrid(-1.0, 1.0, 0.02, 100, 100)
+    pose = scene.down_camera(0, 0, 1.6)
+    heights = [np.full((100, 100), np.nan, np.float32) for _ in range(2)]
+    for height, one, rig in zip(heights, (whole, part), (full, cropped), strict=True):
+        patch = surface.rasterise(one, pose, cov, rig, grid)
+        size = patch.height_m.shape
+        height[patch.row : patch.row + size[0], patch.col : patch.col + size[1]] = patch.height_m
+    both = np.isfinite(heights[0]) & np.isfinite(heights[1])
+    assert both.sum() > 1000
+    np.testing.assert_allclose(heights[1][both], heights[0][both], atol=1e-5)
 
 
 @pytest.mark.parametrize("axis", [[0, 0, -1.0], [0.5, 0, -1], [1, 0, 0], [0.3, -0.9, 0.2], [0, 0, 1]])

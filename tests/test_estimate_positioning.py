@@ -205,6 +205,23 @@ def test_frame_to_frame_continues_after_most_of_the_keyframe_has_left_the_image(
     assert np.linalg.norm(error_of(true, estimated)[3:]) < 0.02
 
 
+def test_frame_to_frame_predicts_over_uneven_intervals(diver):
+    """A frame after 14 intervals is 28 px away, found from velocity times interval but not from the last motion."""
+    pose, step = scene.down_camera(-1, 0, ALTITUDE_M), geometry.exp(np.array([0.0, 0, 0, 0, -0.02, 0]))
+    keyframe, image, _ = diver.keyframe(pose)
+    error_m = {}
+    for ratio in (14.0, 1.0):
+        f2f, true = FrameToFrame(RIG, PATCH_PX), pose
+        f2f.step(image)
+        f2f.restart(image, keyframe.points)
+        for interval in (1, 1, 14):
+            true = true @ np.linalg.matrix_power(step, interval)
+            picture = matching.normalise(matching.gray(diver.frame(true)[0]))
+            motion, _ = f2f.step(picture, ratio if interval == 14 else 1.0)
+        error_m[ratio] = np.linalg.norm(error_of(np.linalg.matrix_power(step, 14), motion.a_from_b)[3:])
+    assert error_m[14.0] < 0.01 < 0.05 < error_m[1.0], error_m
+
+
 def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees(diver):
     cell_m = ALTITUDE_M / RIG.focal_px
     mosaic = Mosaic(cell_m, diver.spool.folder / "mosaic")
@@ -325,7 +342,7 @@ def test_links_to_another_swath_are_spread_along_it():
 
 def test_links_of_one_node_together_have_the_information_of_one_link():
     link = Link(0, 3, np.eye(4), np.eye(6) * 1e-6, 0.8, 200)
-    links = link_selection.share_noise([link, link._replace(i=1), link._replace(i=2)])
+    links = link_selection.inflate_for_shared_noise([link, link._replace(i=1), link._replace(i=2)])
     together = np.linalg.inv(sum(np.linalg.inv(shared.cov) for shared in links))
     np.testing.assert_allclose(together, link.cov)
     for shared in links:

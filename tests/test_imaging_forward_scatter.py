@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.forward_scatter import FORWARD_DEG, ForwardScatter, forward_lobe
+from twin.imaging.forward_scatter import FORWARD_DEG, ForwardScatter, forward_scattering
 from twin.imaging.water import medium, phase_function
 from twin.scenario.model import Scenario, WaterConfig
 
@@ -13,7 +13,7 @@ SHAPE = (RIG.height_px, RIG.width_px)
 
 
 def forward_scattering_per_m(water):
-    return forward_lobe().share * medium(water).scattering_per_m
+    return forward_scattering().share * medium(water).scattering_per_m
 
 
 def ranges(depth):
@@ -63,7 +63,7 @@ def test_a_spot_spreads_by_the_variance_of_small_angle_theory(jerlov, depth_m):
         mean_u = (weight * u).sum()
         assert abs(mean_u - 159.5) < 1 and abs((weight * v).sum() - 119.5) < 1
         scatterings = thickness[band] / (1 - np.exp(-thickness[band]))
-        expected = RIG.focal_px**2 * forward_lobe().variance_rad2 / 3 * scatterings
+        expected = RIG.focal_px**2 * forward_scattering().variance_rad2 / 3 * scatterings
         # minus the variance of the spot itself, which is moved by up to half a bin
         assert (weight * (u - mean_u) ** 2).sum() - (18**2 - 1) / 12 == pytest.approx(expected, rel=0.05)
 
@@ -72,8 +72,8 @@ def test_the_forward_lobe_agrees_with_quadrature_of_the_phase_function():
     limit = np.deg2rad(FORWARD_DEG)
     share, _ = quad(lambda a: 2 * np.pi * np.sin(a) * phase_function(np.cos(a)), 0, limit)
     moment, _ = quad(lambda a: 2 * np.pi * np.sin(a) * phase_function(np.cos(a)) * a**2 / 2, 0, limit)
-    assert forward_lobe().share == pytest.approx(share, rel=1e-5) and 0.7 < share < 0.78
-    assert forward_lobe().variance_rad2 == pytest.approx(moment / share, rel=1e-5)
+    assert forward_scattering().share == pytest.approx(share, rel=1e-5) and 0.7 < share < 0.78
+    assert forward_scattering().variance_rad2 == pytest.approx(moment / share, rel=1e-5)
 
 
 def test_water_without_scattering_adds_no_forward_scatter():

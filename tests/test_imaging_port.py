@@ -59,10 +59,13 @@ def tangents_by_fermat(port: PortConfig, point_m: np.ndarray) -> np.ndarray:
         return [(optical_path_m(coordinates + h) - optical_path_m(coordinates - h)) / 2e-5 for h in 1e-5 * np.eye(4)]
 
     scale = port.distance_m if port.kind == "flat" else 1.0
-    start = np.tile(point_m[:2] / point_m[2] * scale, 2)
-    found = min((root(slopes, start, method=m, tol=1e-12) for m in ("hybr", "lm")), key=lambda r: np.abs(r.fun).max())
-    assert np.abs(found.fun).max() < 1e-8
-    x, y, z = on_face(found.x[:2], 0.0)
+    found = root(slopes, np.tile(point_m[:2] / point_m[2] * scale, 2), tol=1e-12).x
+    for _ in range(8):  # Newton's method where `root` stops early
+        steps = 1e-5 * np.eye(4)
+        hessian = [(np.array(slopes(found + h)) - slopes(found - h)) / 2e-5 for h in steps]
+        found = found - np.linalg.solve(hessian, slopes(found))
+    assert np.abs(slopes(found)).max() < 1e-8
+    x, y, z = on_face(found[:2], 0.0)
     return np.array([x, y]) / z
 
 

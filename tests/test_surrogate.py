@@ -281,7 +281,7 @@ def test_a_height_error_of_the_pose_shifts_the_patch_without_the_cells_of_the_ne
 
 def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
     scenario = load_scenario("quickstart", SHORT)
-    results = [survey.run(scenario, tmp_path / name, shows=()) for name in "ab"]
+    results = [survey.run(scenario, tmp_path / name, outputs=()) for name in "ab"]
     metrics = results[0].metrics
     assert metrics["status"] == "complete"
     assert 1e-4 < metrics["trajectory"]["final"]["ate_rmse_m"] < 0.02
@@ -292,7 +292,7 @@ def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
 
 def test_water_without_matches_aborts_the_survey_with_a_reason(tmp_path):
     scenario = load_scenario("quickstart", [*SHORT, 'water.jerlov="9C"', "water.turbidity=4"])
-    metrics = survey.run(scenario, tmp_path, shows=()).metrics
+    metrics = survey.run(scenario, tmp_path, outputs=()).metrics
     assert metrics["status"] == "aborted"
     assert "9C" in metrics["reason"] and "too few points" in metrics["reason"]
 
@@ -460,7 +460,7 @@ import sys
 from pathlib import Path
 from twin import survey
 from twin.scenario.file import load_scenario
-result = survey.run(load_scenario("quickstart", {SHORT!r}), Path({str(tmp_path / "run")!r}), shows=None)
+result = survey.run(load_scenario("quickstart", {SHORT!r}), Path({str(tmp_path / "run")!r}), outputs=None)
 assert result.status == "complete"
 print(*(name for name in ("mujoco", "OpenGL", "matplotlib", "rerun", "rasterio", "trimesh") if name in sys.modules))
 """

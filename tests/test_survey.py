@@ -257,7 +257,7 @@ def test_a_full_disk_in_the_background_is_reported_and_partial_results_are_kept(
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("twin.estimate.link_selection.share_noise", full)
+    monkeypatch.setattr("twin.estimate.link_selection.inflate_for_shared_noise", full)
     result = fly(tmp_path / "run", "plan.area_m=[0.3, 0.5]", "estimate.use_ga=false")
     assert (result.status, result.metrics["reason"]) == ("aborted", "[Errno 28] No space left on device")
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05

@@ -24,7 +24,7 @@ def run(
     out: Path,
     progress: Callable[[SurveyProgress], None] = lambda _: None,
     live: bool = False,
-    shows: Collection[str] | None = PICTURES,
+    outputs: Collection[str] | None = PICTURES,
 ) -> RunResult:
     """Flies a scenario and writes a run folder; an aborted survey keeps its partial results.
 
@@ -32,14 +32,14 @@ def run(
         out: the run folder.
         progress: called with the progress after every frame.
         live: show the survey in Rerun while it runs.
-        shows: pictures to draw at the end, of "report" and "recording"; None writes metrics only.
+        outputs: pictures to draw at the end, of "report" and "recording"; None writes metrics only.
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
     """
     mission = prepare(scenario)
     stopwatch, reason = Stopwatch(), ""
-    with open_world(mission, stopwatch) as world, RunFolder(out, scenario, shows) as folder:
+    with open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
         if mission.terrain.n_filled:
             folder.log("terrain holes filled", cells=mission.terrain.n_filled)
         for warning in world.warnings:

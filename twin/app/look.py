@@ -23,7 +23,7 @@ WINDOW_SHARE = 1 / 20
 SATURATED = 255
 
 _LABELS = {
-    "gray_level": "gray level, fraction of full scale",
+    "gray_level": "grey level, fraction of full scale",
     "contrast": "contrast, local standard deviation / mean",
     "veil_share": "backscatter, fraction of the light",
     "saturated_share": "saturated pixels",
@@ -152,7 +152,7 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def noise_image(view: ViewLayers) -> Array:
-    """Returns the (H, W, 3) left image minus the same image without noise [gray levels of 255]."""
+    """Returns the image noise (H, W, 3): left image minus the same image without noise [grey levels, 0 to 255]."""
     return view.stereo_pair.left.astype(np.float64) - view.decomposed.noise_free
 
 

@@ -85,14 +85,14 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
     range_m = range_of(a.depth, scenario.believed_rig())
     reach = max(3 * noise.std(), 1.0)
     panels = [
-        Panel("left", "gray level", stereo_pair.left, stereo_pair.left / 255),
-        Panel("right", "gray level", stereo_pair.right, stereo_pair.right / 255),
+        Panel("left", "grey level", stereo_pair.left, stereo_pair.left / 255),
+        Panel("right", "grey level", stereo_pair.right, stereo_pair.right / 255),
         Panel("range", "m", range_m, range_m, colours=("viridis_r", *_ends(range_m))),
         Panel("albedo", "1", a.albedo / 255, a.albedo / 255),
         _light("light on the sea floor", "lx", a.components.floor_lx, 0.0),
         _light("direct signal", "cd/m2", a.components.direct, a.gain),
         _light("backscatter", "cd/m2", a.components.backscatter, a.gain),
-        Panel("noise", "gray level", noise, noise.mean(axis=2), "mean of the bands", ("RdBu_r", -reach, reach)),
+        Panel("noise", "grey level", noise, noise.mean(axis=2), "mean of the bands", ("RdBu_r", -reach, reach)),
     ]
     if a.components.forward is not None:
         panels.append(_light("forward scatter", "cd/m2", a.components.forward, a.gain))
@@ -104,7 +104,7 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
 def _light(
     title: str, unit: str, layer: NDArray[np.float32], gain: float, percentile: float = SHOWN_PERCENTILE
 ) -> Panel:
-    """Returns the panel of a layer of light in its colours.
+    """Returns the panel of one layer of the image formation, shown in colour.
 
     Args:
         gain: gain of the image; the panel is as bright as in the image, or scaled by the factor in the note. 0: the
@@ -150,7 +150,7 @@ def _in_numbers(values: NDArray[Any]) -> str:
 
 
 def _short(value: float) -> str:
-    """Returns the value with three significant digits; integers from 100."""
+    """Returns the value with three significant digits, or as an integer from 100 on."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

@@ -1,4 +1,4 @@
-"""Forecast of a survey without simulation: its numbers and a picture of the plan."""
+"""Forecast of a survey without simulation: its figures and a picture of the plan."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
 def numbers(mission: Mission) -> list[tuple[str, str]]:
-    """Returns name and value of the numbers of a plan, each after those that it depends on."""
+    """Returns the figures of a plan as (name, value) pairs, each after those that it depends on."""
     f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     width_m, height_m = f.footprint_m
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]

@@ -20,7 +20,7 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 
 
 @njit(cache=True, nogil=True)
-def put(target: Array, values: Array) -> None:
+def copy_into(target: Array, values: Array) -> None:
     """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
     Numba's own slice assignment compiles an error message for unequal shapes into every caller, a third of all
@@ -44,8 +44,8 @@ def skew(v: Array) -> Array:
 def pose(rotation: Array, position: Array) -> Array:
     """Returns the pose (4, 4) with a rotation (3, 3) and a position (3,) [m]."""
     result = np.zeros((4, 4))
-    put(result[:3, :3], rotation)
-    put(result[:3, 3], position)
+    copy_into(result[:3, :3], rotation)
+    copy_into(result[:3, 3], position)
     result[3, 3] = 1.0
     return result
 
@@ -77,7 +77,7 @@ def compose(a_from_b: Array, b_from_c: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def sandwich(matrix: Array, cov: Array) -> Array:
+def transform_covariance(matrix: Array, cov: Array) -> Array:
     """Returns matrix @ cov @ matrix.T (6, 6) of a symmetric cov, symmetric to the last bit."""
     half, result = np.empty((6, 6)), np.empty((6, 6))
     for i in range(6):
@@ -127,7 +127,7 @@ def _nearest_rigid(matrices):
             a, b, c = motion[0, :3], motion[1, :3], motion[2, :3]
             cofactors = np.stack((np.cross(b, c), np.cross(c, a), np.cross(a, b)))
             step = 0.5 * (cofactors / np.sum(a * cofactors[0]) - motion[:3, :3])
-            put(motion[:3, :3], motion[:3, :3] + step)
+            copy_into(motion[:3, :3], motion[:3, :3] + step)
             change = np.abs(step).max()
     return result
 
@@ -203,7 +203,7 @@ def exp(motion: Array) -> Array:
     """Returns the pose (4, 4) that a constant twist (6,) [rotation, translation] (rad, m) reaches in unit time."""
     w, result = motion[:3], np.zeros((4, 4))
     jacobian = _left_jacobian(w)
-    put(result[:3, :3], so3_exp(w))
+    copy_into(result[:3, :3], so3_exp(w))
     for i in range(3):
         for k in range(3):
             result[i, 3] += jacobian[i, k] * motion[3 + k]
@@ -241,15 +241,15 @@ def log_derivative(motion: Array) -> Array:
         for k in range(3):
             coupling[i, k] += c * (v[i] * w[k] + w[i] * v[k]) + square[i, k]
         coupling[i, i] -= 2.0 * c * along + 1.0
-    put(result[:3, :3], rotation_block)
-    put(result[3:, 3:], rotation_block)
-    put(result[3:, :3], coupling)
+    copy_into(result[:3, :3], rotation_block)
+    copy_into(result[3:, 3:], rotation_block)
+    copy_into(result[3:, :3], coupling)
     return result
 
 
 @njit(cache=True, nogil=True)
 def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
-    """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and its derivative by a^2, given the squared angle a^2."""
+    """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and dc/d(a^2), given the squared angle a^2."""
     if angle2 < 1e-2:
         return (
             1 / 12 + angle2 * (1 / 720 + angle2 * (1 / 30240 + angle2 / 1209600)),

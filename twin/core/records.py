@@ -139,7 +139,7 @@ class SensorNoise:
         return np.array([self.attitude_rad, self.attitude_rad, self.heading_rad])
 
 
-class Sighting(NamedTuple):
+class BeaconDetection(NamedTuple):
     """A beacon detected in the left image: its index among the surveyed beacons, and its (column, row) [px]."""
 
     beacon: int
@@ -162,7 +162,7 @@ class Readings:
     ahrs_rpy_rad: Array | None = None
     dvl_mps: Array | None = None
     usbl_m: Array | None = None
-    beacons: tuple[Sighting, ...] | None = None
+    beacons: tuple[BeaconDetection, ...] | None = None
 
 
 class Displacement(NamedTuple):

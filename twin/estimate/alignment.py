@@ -1,4 +1,4 @@
-"""Global alignment (P15, P16): maximum-likelihood poses of all nodes given the motions measured between them.
+"""Global alignment: maximum-likelihood poses of all nodes given the motions measured between them.
 
 Eliminating the Lagrange multipliers of the mixed-adjustment model, eq. (7), leaves a least-squares problem with one
 residual block per link. It is solved as a factor graph with Huber loss; links that contradict all others are removed

@@ -1,4 +1,4 @@
-"""Selection of links (P10, P11, P13): which earlier nodes a new node is linked to, by predicted overlap."""
+"""Selection of links: which earlier nodes a new node is linked to, by predicted overlap."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class _View(NamedTuple):
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Returns the overlaps (n,) of a node with the left images at poses (n, 4, 4), 0 to 1.
 
-    The overlap is the fraction of the node's matched points that project into the other image (P11): it is predicted
-    from poses and depth, not from a flat floor.
+    The overlap is the fraction of the node's matched points that project into the other image: it is predicted from
+    poses and depth and does not assume a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -84,7 +84,7 @@ def choose_links(
     return [(earlier[k], float(shares[k])) for k in chosen]
 
 
-def share_noise(links: Sequence[Link]) -> list[Link]:
+def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     """Returns the links of one new node with inflated covariances, because their errors are correlated.
 
     All n links use the same stereo points of the node, whose noise dominates their error. Treated as independent, they

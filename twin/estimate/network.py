@@ -1,4 +1,4 @@
-"""The keyframe network (P10 to P16): keyframes, the links between its nodes, and their global alignment."""
+"""The keyframe network: keyframes, the links between its nodes, and their global alignment."""
 
 from __future__ import annotations
 
@@ -215,10 +215,12 @@ class KeyframeNetwork:
     ) -> list[Link]:
         """Returns all links of one new node."""
         measured = self._measure(node, others)
-        return link_selection.share_noise([*measured, chain] if chain else measured) + ([bridge] if bridge else [])
+        return link_selection.inflate_for_shared_noise([*measured, chain] if chain else measured) + (
+            [bridge] if bridge else []
+        )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Returns the links from earlier nodes (each with its overlap) that could be measured."""
+        """Measures the links from earlier nodes, given with their overlaps; returns those that succeeded."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         return [
             link_selection.to_link(node, other, overlap, motion)
@@ -240,7 +242,7 @@ class KeyframeNetwork:
             raise
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
-        """Aligns the last nodes; older nodes that are linked to them are fixed. All keyframes move with their nodes."""
+        """Aligns the last nodes; older nodes linked to them are fixed. Keyframes between nodes move with their node."""
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())
@@ -268,9 +270,9 @@ class KeyframeNetwork:
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}
-        owner = np.maximum.accumulate([k if keyframe.number in numbers else 0 for k, keyframe in enumerate(moving)])
+        node_row = np.maximum.accumulate([k if keyframe.number in numbers else 0 for k, keyframe in enumerate(moving)])
         new = np.array([poses.get(keyframe.number, pose) for keyframe, pose in zip(moving, old, strict=True)])
-        shift = new[owner] @ np.linalg.inv(old[owner])
+        shift = new[node_row] @ np.linalg.inv(old[node_row])
         # without orthogonalisation, rounding errors triple with every alignment
         for keyframe, pose in zip(moving, geometry.nearest_rigid(shift @ old), strict=True):
             keyframe.world_from_camera = pose

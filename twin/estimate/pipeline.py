@@ -111,7 +111,7 @@ class Navigator:
         motion, status = self.vision.track_frame(frame)
         aiding = readings_as_arrays(frame.readings)
         state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
-        self.adopt(state)
+        self.set_dead_reckoning(state)
         if self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
@@ -190,22 +190,22 @@ class Navigator:
 
     @property
     def dead_reckoning(self) -> DeadReckoningState:
-        """State that every frame advances."""
+        """Dead-reckoning state, which `dead_reckon` advances by one frame."""
         online = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the models of the sensors that read at every frame, for an interval between frames [s]."""
+        """Returns the models of the sensors with a reading at every frame, for an interval between frames [s]."""
         return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
 
-    def adopt(self, state: DeadReckoningState) -> None:
-        """Takes over the dead reckoning state after a frame."""
+    def set_dead_reckoning(self, state: DeadReckoningState) -> None:
+        """Sets the poses and covariances to a dead-reckoning state."""
         self.f2f_pose = state.f2f
         self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
     def _image_vision(self, folder: Path | None) -> StereoVision:
-        """Creates vision from images; what it creates is released by `close`."""
+        """Returns the visual measurements from images; `close` releases them and their temporary folder."""
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
@@ -248,7 +248,7 @@ class Navigator:
         return status
 
     def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion since the last node and replaces the F2F motion in the online pose by it.
+        """Measures the motion since the last node, and replaces the F2F motion in the online pose by it.
 
         Two stereo pairs determine the motion more accurately than the frames between them (the paper's better start
         values for GA, section IV-5). Corrections by navigation sensors since the last node are kept.
@@ -264,7 +264,7 @@ class Navigator:
         return link
 
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
-        """Corrects the online pose by the mosaic (F2M).
+        """Corrects the online pose by registration with the mosaic (F2M).
 
         The mosaic carries the pose error of the keyframe that was added to it, so the correction is weighted by the
         covariance of the motion since then only.
@@ -294,7 +294,7 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, node_cov: Array) -> None:
-        """Moves the online pose with the last keyframe after an alignment; (6, 6) covariance of its node."""
+        """Moves the online pose with the last keyframe after an alignment; `node_cov` (6, 6) is that of its node."""
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))

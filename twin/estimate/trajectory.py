@@ -49,4 +49,4 @@ def _distribute(world_from_start, f2f, misclosure, out):
     step = 1 / len(f2f)
     for k in range(len(f2f)):
         pose = geometry.compose(world_from_start, f2f[k])
-        geometry.put(out[k], geometry.compose(pose, geometry.exp(misclosure * (k * step))))
+        geometry.copy_into(out[k], geometry.compose(pose, geometry.exp(misclosure * (k * step))))

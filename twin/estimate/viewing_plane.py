@@ -1,4 +1,4 @@
-"""The plane that a mosaic or an elevation map is drawn on."""
+"""Reference plane of a mosaic or an elevation map."""
 
 from __future__ import annotations
 

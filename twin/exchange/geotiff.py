@@ -42,7 +42,7 @@ def write_mosaic(path: Path, mosaic: Image, grid: MapGrid) -> None:
 
 
 def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
-    """Returns the rasterio profile of a file with the cells of `grid`."""
+    """Returns the rasterio profile of a GeoTIFF file on `grid`."""
     return {
         "driver": "GTiff",
         "width": grid.cols,

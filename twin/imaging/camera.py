@@ -66,7 +66,7 @@ class DecomposedImage(NamedTuple):
 
 
 class StereoCamera:
-    """Two cameras that share one auto-exposure; the noise of the left one is independent of the right one.
+    """Two cameras that share one auto-exposure; their image noise is independent.
 
     Args:
         renderer: renders albedo and depth of the floor.
@@ -74,7 +74,7 @@ class StereoCamera:
         scenario: sensor settings.
         left_rng, right_rng: random streams of the image noise.
         stopwatch: measures the time of rendering and optics.
-        true_cameras: geometry of the true cameras; that of the scenario where None.
+        true_cameras: geometry of the true cameras; None for that of the scenario.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class StereoCamera:
         self._n_captures = 0
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
-        """Returns the image of the left camera and, where `stereo`, the simultaneous one of the right camera.
+        """Returns the image of the left camera and, if `stereo`, the simultaneous image of the right camera.
 
         Each call advances the time by one frame.
 

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import fft
 
-from twin.imaging.forward_scatter import forward_lobe
+from twin.imaging.forward_scatter import forward_scattering
 from twin.imaging.illumination import Illumination
 from twin.imaging.water import Medium
 
@@ -89,7 +89,7 @@ def _blur(k: Array, depth_m: float, water: Medium) -> Array:
     A share exp(-t) of the light, t the optical thickness of forward scattering, is not scattered; the rest is scattered
     n = t / (1 - exp(-t)) times on average.
     """
-    lobe = forward_lobe(water.mean_cosine)
+    lobe = forward_scattering(water.mean_cosine)
     thickness = lobe.share * float(water.scattering_per_m[1]) * depth_m
     unscattered = np.exp(-thickness)
     n_scatterings = thickness / (1 - unscattered) if thickness > 1e-9 else 1.0

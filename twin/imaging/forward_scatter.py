@@ -37,25 +37,25 @@ STEP_M = 0.02  # range step of the table of levels
 MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
 
 
-class Lobe(NamedTuple):
+class ForwardScattering(NamedTuple):
     """Forward part of the scattering: its share of b, and the variance of its angle along one axis [rad2]."""
 
     share: float
     variance_rad2: float
 
 
-def forward_lobe(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> Lobe:
+def forward_scattering(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> ForwardScattering:
     """Returns the scattering by less than `FORWARD_DEG`, integrated numerically over the phase function."""
     angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
     density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
-    return Lobe(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
+    return ForwardScattering(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
 
 
 class ForwardScatter:
     """Computes the forward-scattered radiance of the floor from its direct signal."""
 
     def __init__(self, rig: StereoRig, water: Medium):
-        lobe = forward_lobe(water.mean_cosine)
+        lobe = forward_scattering(water.mean_cosine)
         scattered_per_m = max(lobe.share - water.kept_share, 0.0) * water.scattering_per_m
         thickness = scattered_per_m * np.arange(0.0, PATH_MAX_M, STEP_M)[:, None]
         n_scatterings = np.where(thickness > 1e-9, thickness / -np.expm1(-np.maximum(thickness, 1e-9)), 1.0)
@@ -99,7 +99,7 @@ class ForwardScatter:
 
 
 def _level_of(ratio: Array) -> Array:
-    """Returns the fractional level of variances of `ratio` times the smallest: levels double, linear in between."""
+    """Returns fractional levels for variances of `ratio` times the smallest; each level doubles, linear in between."""
     below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
     return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 

@@ -1,4 +1,4 @@
-"""Water and daylight of a scenario, computed once and passed to everything that depends on them."""
+"""Optical properties of the water, and the daylight in it, computed once per scenario."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Daylight(NamedTuple):
     """Daylight from the zenith for R, G, B.
 
     Args:
-        surface_lx: (3,) illuminance just below the water surface; on the floor where there is no surface.
+        surface_lx: (3,) illuminance just below the water surface; without a surface, that on the floor.
         illuminance_lx: (3,) illuminance of a horizontal plane at the planned altitude.
         attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
-        reference_depth_m: depth of the reference plane z = 0 below the surface; 0 = there is no surface.
+        reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
         camera_depth_m: depth of the planned altitude below the surface; 0 where there is no surface.
         focused_share: share of the daylight that the surface waves focus into caustics.
     """

@@ -141,7 +141,7 @@ def _weighted_mean(light, weights):
 
 @njit(cache=True, nogil=True)
 def _tone(raw, tones, out, first, end):
-    """Fills rows `first` to `end` of `out` with the tones of `raw` (H, W, 1 or 3)."""
+    """Fills rows `first` to `end` of `out` with the 8-bit values of `raw` (H, W, 1 or 3), by the tone table."""
     _, width, bands = raw.shape
     for v in range(first, end):
         for u in range(width):

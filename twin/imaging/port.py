@@ -111,7 +111,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the plane at a depth in the glass of a flat pane."""
+    """Returns intersections and normals (..., 3) of rays with a flat pane, on the plane `depth_m` into its glass."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     along = ray @ normal
@@ -120,7 +120,7 @@ def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tup
 
 
 def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays from inside with the sphere at a depth in a dome's glass."""
+    """Returns intersections and normals (..., 3) of rays with a dome, on the sphere `depth_m` into its glass."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre
     along = (from_centre * ray).sum(axis=-1)

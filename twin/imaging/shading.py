@@ -99,7 +99,11 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
-    """Computes for a lamp over a row: illuminance in clear water by an isotropic beam, sqrt(1 - cos), distance."""
+    """Computes the light of a lamp on the floor of a row of pixels.
+
+    Fills `out` (3, W): illuminance by an isotropic lamp in clear water, sqrt(1 - cos(angle from the beam axis)), and
+    distance from the lamp.
+    """
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
     width = here.size
@@ -121,7 +125,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp of this beam, attenuated from the lamp and to the camera."""
+    """Adds to `light` (3, W) the illuminance by a lamp with this beam, attenuated from lamp to floor to camera."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)

@@ -85,7 +85,7 @@ class Shadows:
 
 
 def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns the highest node [m] and the steepest triangle slope [m per cell] of each block, borders included."""
+    """Returns the largest height [m] and the steepest triangle slope [m per cell] of each block, borders included."""
     along_x, along_y = np.diff(height, axis=1), np.diff(height, axis=0)
     south_east = np.hypot(along_x[:-1], along_y[:, 1:])
     north_west = np.hypot(along_x[1:], along_y[:, :-1])
@@ -142,7 +142,7 @@ def _fill_between(height, tops, rises, west, south, spacing, depth, focal, pose,
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u):
-    """Returns 0 where the floor occludes the ray from a pixel's floor to a lamp at (column, row, height), else 1."""
+    """Returns 0 if the floor occludes the lamp at (column, row, height) from the floor point of a pixel, else 1."""
     z = np.float64(depth[v, u])
     if not np.isfinite(z):
         return np.uint8(1)

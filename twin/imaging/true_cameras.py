@@ -1,4 +1,4 @@
-"""True cameras: from the rendered images to the raw images of the true cameras and to rectified frames.
+"""True cameras: convert rendered images to the raw images of the true cameras, and those to rectified frames.
 
 The floor is rendered for two parallel pinhole cameras in water, with larger images than the frames where necessary.
 Each pixel of a raw image has its own ray through lens and port; its radiance is sampled where that ray intersects the
@@ -79,7 +79,7 @@ class SamplingMap(NamedTuple):
 
     Args:
         positions: positions of points at infinity.
-        parallax_px_m: displacement of nearer points, times their depth; None without a port.
+        parallax_px_m: displacement for points at a finite depth, times that depth; None without a port.
     """
 
     positions: Positions
@@ -216,7 +216,7 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the positions (H, W, 2) of the frame's pixels in the raw image, for points at a depth [m]."""
+    """Returns the positions (H, W, 2) in the raw image of the frame's pixels, exact for points at `depth_m`."""
     tangents = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
     points_m = np.concatenate([tangents, np.ones_like(tangents[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)

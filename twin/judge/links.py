@@ -64,7 +64,7 @@ def _motion_errors(true_i, true_j, estimates):
     errors = np.empty((len(true_i), 6))
     for k in range(len(true_i)):
         j_from_i = geometry.compose(geometry.inverse(true_j[k]), true_i[k])
-        geometry.put(errors[k], geometry.log(geometry.compose(j_from_i, estimates[k])))
+        geometry.copy_into(errors[k], geometry.log(geometry.compose(j_from_i, estimates[k])))
     return errors
 
 

@@ -63,7 +63,7 @@ def overlap_metrics(
 def footprints(
     keyframe_rows: NDArray[np.int64], truth: Truth, rig: StereoRig, grid: MapGrid | None, pattern: str = "lawnmower"
 ) -> Footprints:
-    """Returns the true footprints of the keyframes (n,), for a survey of the given pattern."""
+    """Returns the footprints of n keyframes from their true poses; `pattern` (of the plan) defines the swaths."""
     pose = truth.trajectory.world_from_camera[keyframe_rows]
     angle = geometry.heading_of_camera(pose)
     heading = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -103,16 +103,16 @@ def _window(height_m: NDArray[np.float32], grid: MapGrid, position: Array, half_
 
 
 def along_overlap(prints: Footprints) -> Array:
-    """Returns (m,) shared share of the area of consecutive keyframes of the same swath."""
+    """Returns the overlap (m,), as a fraction of the area, of consecutive keyframes of the same swath."""
     first = np.flatnonzero((prints.swath[:-1] == prints.swath[1:]) & (prints.swath[1:] >= 0))
     return _shared_area(prints, first, first + 1, prints.centre_m[first + 1] - prints.centre_m[first])
 
 
 def across_overlap(prints: Footprints) -> Array:
-    """Returns (m,) shared share of the area of each keyframe and the nearest keyframe of the next swath.
+    """Returns the overlap (m,) of each keyframe with the nearest keyframe of the next swath.
 
-    Only the component of their offset across the direction of travel counts. Where the vehicle heads along the legs,
-    this is the shared width (sidelap).
+    It is a fraction of the area, computed from the component of their offset across the direction of travel. Where the
+    vehicle heads along the legs, it is the sidelap.
     """
     pairs = [_nearest_in_next(prints, swath) for swath in range(int(prints.swath.max(initial=-1)))]
     if not pairs:
@@ -133,7 +133,7 @@ def _nearest_in_next(prints: Footprints, swath: int) -> NDArray[np.int64]:
 
 
 def _shared_area(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64], offset: Array) -> Array:
-    """Returns (m,) share of the area that two footprints of their mean size share.
+    """Returns the overlap (m,), as a fraction of the area, of pairs of footprints, both of their mean size.
 
     Args:
         first, second: (m,) numbers of the keyframes. Both footprints are oriented as the first.

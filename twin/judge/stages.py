@@ -47,7 +47,7 @@ def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, flo
 
 
 def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
-    """Returns the poses (n, 4, 4) of the nodes in the first one, composed of the links between consecutive nodes.
+    """Returns the poses (n, 4, 4) of the nodes relative to the first, by composing the links of consecutive nodes.
 
     Returns an empty array (0, 4, 4) if a link between consecutive nodes is missing.
     """

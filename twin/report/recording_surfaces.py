@@ -16,7 +16,7 @@ from twin.report.run_folder import Raster
 
 #: Largest number of vertices of a surface; finer maps are subsampled.
 N_VERTICES = 100_000
-#: Group of a point that no camera observes.
+#: Group number of a point that no camera observes.
 NOT_OBSERVED = np.iinfo(np.int64).max
 
 

@@ -57,15 +57,15 @@ class RunFolder:
     Args:
         folder: created if it does not exist.
         scenario: the resolved scenario of the run.
-        shows: which of `PICTURES` to produce at the end. In a study they take longer than a short flight. None: write
+        outputs: which of `PICTURES` to produce at the end. In a study they take longer than a short flight. None: write
             the metrics only, without trajectories and maps.
 
     Raises:
         TwinError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, shows: Collection[str] | None = PICTURES):
-        self.path, self._reserve, self._shows = folder, folder / ".reserve", shows
+    def __init__(self, folder: Path, scenario: Scenario, outputs: Collection[str] | None = PICTURES):
+        self.path, self._reserve, self._outputs = folder, folder / ".reserve", outputs
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
@@ -102,10 +102,10 @@ class RunFolder:
         temporary = ".metrics.json.part"
         self._write(temporary, json.dumps(metrics, indent=1))
         try:
-            if self._shows is not None:
+            if self._outputs is not None:
                 self._write_trajectories(record)
                 self._write_maps(record)
-                self._write_pictures(self._shows, metrics)
+                self._write_pictures(self._outputs, metrics)
         except OSError as error:
             metrics = metrics | {"status": "aborted", "reason": metrics["reason"] or str(error)}
             self._write(temporary, json.dumps(metrics, indent=1))
@@ -149,13 +149,13 @@ class RunFolder:
         geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, "estimated minus true elevation [m]")
         mesh.write_glb(self.path / "mesh.glb", elevation)
 
-    def _write_pictures(self, shows: Collection[str], metrics: dict[str, Any]) -> None:
+    def _write_pictures(self, outputs: Collection[str], metrics: dict[str, Any]) -> None:
         """Writes report and recording; their libraries are imported only here."""
-        if "report" in shows:
+        if "report" in outputs:
             from twin.report import survey_page
 
             survey_page.write_report(self.path, metrics)
-        if "recording" in shows:
+        if "recording" in outputs:
             from twin.report import recording
 
             recording.write_recording(self.path, metrics)

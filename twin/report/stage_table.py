@@ -1,4 +1,4 @@
-"""Table of the positioning stages: error, improvement, inputs and disabled parts of each."""
+"""Table of the positioning stages: error, improvement, inputs and disabled corrections of each."""
 
 from __future__ import annotations
 

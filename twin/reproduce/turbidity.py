@@ -113,7 +113,7 @@ def summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
 
 def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
     """Returns the summary as the rows of a table, for green light."""
-    header = ("turbidity", "attenuation c", "contrast", "backscatter", "gray level SD", "texture SNR", "visibility")
+    header = ("turbidity", "attenuation c", "contrast", "backscatter", "grey level SD", "texture SNR", "visibility")
     max_range_m = summary["contrast_left"]["range_m"][-1]
     rows = [
         (

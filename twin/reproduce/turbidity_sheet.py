@@ -52,7 +52,7 @@ def _picture(axes: Axes, level: TurbidityLevel) -> None:
 
 
 def _histogram_of(image: Any, band: int) -> Any:
-    """Returns the fraction of the pixels in bins of two gray levels."""
+    """Returns the histogram (128,) of a band: the fraction of the pixels in each bin of two grey levels."""
     return np.histogram(image[..., band], bins=128, range=(0, 256))[0] / image[..., band].size
 
 
@@ -62,7 +62,7 @@ def _histogram(axes: Axes, level: TurbidityLevel, top: float, first: bool) -> No
         share = 100 * _histogram_of(level.image, band)
         axes.fill_between(centres, share, color=colour, alpha=0.25, linewidth=0)
         axes.plot(centres, share, color=colour, linewidth=1.1, label=name)
-    axes.set(xlim=(0, 255), ylim=(0, 105 * top), xticks=[0, 64, 128, 192, 255], xlabel="gray level")
+    axes.set(xlim=(0, 255), ylim=(0, 105 * top), xticks=[0, 64, 128, 192, 255], xlabel="grey level")
     deviations = ", ".join(f"{sd:.0f}" for sd in level.image.std(axis=(0, 1)))
     axes.text(0.98, 0.93, f"SD {deviations}", transform=axes.transAxes, ha="right", va="top", color="#44545c")
     if first:

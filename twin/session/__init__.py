@@ -1,1 +1,1 @@
-"""One survey assembled, watched and concluded."""
+"""Assembly of one survey, its monitoring, and its evaluation and output."""

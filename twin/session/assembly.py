@@ -40,14 +40,14 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
 
 
 def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:
-    """Returns visual measurements from images, given only what an estimator may know."""
+    """Returns the visual measurements from images, with the believed calibration and without the truth."""
     cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
     settings = mission.scenario.estimator_settings()
     return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch)
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators, given what they may know: believed calibration and noise, settings, planned start."""
+    """Returns the estimators, with believed calibration and noise, settings and planned start, but not the truth."""
     scenario = mission.scenario
     return Navigator(
         mission.rig,

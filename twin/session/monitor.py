@@ -32,7 +32,7 @@ class SurveyProgress(NamedTuple):
 
 
 class SurveyMonitor:
-    """Observer of every frame of a survey.
+    """Reports every frame of a survey, and aborts the survey if vision is lost for too long.
 
     Args:
         progress: called with the progress after every frame.
@@ -53,7 +53,7 @@ class SurveyMonitor:
         self.n_blind, self.status = 0, "ok"
 
     def __call__(self, estimate: Estimate, frame: Frame) -> None:
-        """Reports one frame.
+        """Reports the progress and the vision status of one frame.
 
         Raises:
             SurveyAborted: vision has been lost for too long.

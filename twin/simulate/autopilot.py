@@ -1,6 +1,6 @@
 """Pose controller of the BlueROV2, with published vehicle parameters.
 
-The controller does not use the factors by which a scenario changes drag and added mass: those are unknown to it.
+The controller does not use the factors by which a scenario changes drag and added mass: they act as model errors.
 """
 
 from __future__ import annotations

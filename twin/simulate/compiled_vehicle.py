@@ -123,12 +123,12 @@ def advance(body, command, n_steps):
     for _ in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
         wrench = thruster_wrench(thrusters)
-        geometry.put(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
+        geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
         velocity += body.kick[0] * body.timestep_s * acceleration
         body.kick[0] = 1.0
         rotation = geometry.so3_exp(body.timestep_s * velocity[3:])
         next_pose = geometry.compose(pose, geometry.pose(rotation, np.zeros(3)))
         for i in range(3):
             next_pose[i, 3] += body.timestep_s * velocity[i]
-        geometry.put(pose, next_pose)
+        geometry.copy_into(pose, next_pose)
         step_thrusters(thrusters)

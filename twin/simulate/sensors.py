@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import Readings, SensorNoise, Sighting, StereoRig
+from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
 from twin.scenario.model import NavigationConfig
 
 Array = NDArray[np.float64]
@@ -228,7 +228,7 @@ def detect_beacons(
     project: Callable[[Array], Array],
     noise: SensorNoise,
     rng: np.random.Generator,
-) -> tuple[Sighting, ...]:
+) -> tuple[BeaconDetection, ...]:
     """Simulates the detection of beacons in the left image; beacons behind the floor are not detected.
 
     Noise is drawn for every beacon, so that random numbers do not depend on which beacons are in view.
@@ -245,7 +245,7 @@ def detect_beacons(
     points = geometry.transform(geometry.inverse(world_from_camera), beacons)
     pixels = project(points)
     visible = (k for k in range(len(beacons)) if _in_view(pixels[k], points[k, 2], depth_m))
-    return tuple(Sighting(k, (float(u), float(v))) for k in visible for u, v in [pixels[k] + errors_px[k]])
+    return tuple(BeaconDetection(k, (float(u), float(v))) for k in visible for u, v in [pixels[k] + errors_px[k]])
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:

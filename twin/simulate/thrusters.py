@@ -90,7 +90,7 @@ class LaggedThrusters:
 def set_thruster_command(thrusters, command):
     """Compiled kernel of `LaggedThrusters.command`."""
     clipped = np.minimum(np.maximum(command, -1.0), 1.0)
-    geometry.put(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients))
+    geometry.copy_into(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients))
 
 
 @njit(cache=True, nogil=True)

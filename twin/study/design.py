@@ -61,7 +61,9 @@ def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int)
 
 
 def _saltelli(pairs: Array) -> Array:
-    """Returns A, B, and for each axis A with that column of B (Saltelli et al. 2010, Comput. Phys. Commun. 181, 259).
+    """Returns the Saltelli design: A, B, and for each axis the matrix A with that column taken from B.
+
+    Saltelli et al. 2010, Comput. Phys. Commun. 181, 259.
 
     Args:
         pairs: (n, 2 d), the points of A in the first d columns and those of B in the others.
@@ -81,7 +83,7 @@ def axis_names(study: Study) -> list[str]:
 
 
 def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any]]]]:
-    """Yields for each sampled axis the function from coordinates (0 to 1) to values by key."""
+    """Yields for each sampled axis the function that converts coordinates (0 to 1) to values by key."""
     if study.sampling.method == "grid":
         return
     for key, distribution in study.vary.items():
@@ -92,7 +94,7 @@ def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any
 
 
 def _grid_axes(study: Study) -> Iterator[list[list[tuple[str, Any]]]]:
-    """Yields for each axis of the grid its (key, value) pairs."""
+    """Yields for each axis of the grid its grid points, each a list of (key, value) pairs."""
     all_axes = study.sampling.method == "grid"
     for key, distribution in study.vary.items():
         if all_axes or not distribution.is_sampled:

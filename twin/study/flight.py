@@ -35,7 +35,7 @@ def fly(survey: Survey) -> Row:
         shutil.rmtree(leftover, ignore_errors=True)  # of an attempt that was killed
     scratch = survey.folder.with_name(f".{survey.folder.name}.{uuid4().hex[:8]}")
     try:
-        metrics = single_survey.run(survey.scenario, scratch, shows=OUTPUTS[survey.keep]).metrics
+        metrics = single_survey.run(survey.scenario, scratch, outputs=OUTPUTS[survey.keep]).metrics
         _move_kept_files(scratch, survey)
     except ScenarioError as error:
         return row_of(survey, "refused", "; ".join(error.lines))

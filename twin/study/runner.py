@@ -126,7 +126,7 @@ def fly_surveys(
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
-    """Returns the row of a survey, also if it failed."""
+    """Returns the row of a survey from the outcome of its task, whether it succeeded or failed."""
     row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
     return row | {"timing.attempts": outcome.attempts}
 

@@ -58,7 +58,7 @@ class SamplingConfig(Section):
 
 
 class TuningConfig(Section):
-    """Search of `twin tune`: each candidate plan flies all surveys of the study."""
+    """Search of `twin tune`: every survey of the study is flown with each candidate plan."""
 
     search: Annotated[dict[str, Distribution], Field(min_length=1)] = Field(
         description="keys of the scenario to optimise: each uniform, log_uniform or choice"

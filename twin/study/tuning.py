@@ -1,4 +1,4 @@
-"""Search of a survey plan: candidates are evaluated under common conditions, finalists again with new seeds."""
+"""Search of a survey plan: candidates share samples and seeds; finalists are evaluated again with new ones."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def required_probability(study: Study) -> float:
 
 
 class CandidateSurveys:
-    """Surveys of the candidates: all candidates have the same conditions and the same seeds.
+    """Surveys of the candidates: all candidates are flown with the same samples and seeds of the study.
 
     Keeps the results of the surveys flown so far.
     """
@@ -203,7 +203,7 @@ class CandidateSurveys:
         return Candidate(number, values, objectives, passing, shortfall)
 
     def _objective(self, name: str, scores: list[SurveyScore]) -> float:
-        """Returns the risk, or the median of a metric over the completed surveys."""
+        """Returns an objective: the risk, or the median of a metric over the completed surveys."""
         if name == "risk":
             return 1.0 - sum(score.passed for score in scores) / len(scores) if scores else 1.0
         complete = [score.metrics[name] for score in scores if score.status == "complete"]

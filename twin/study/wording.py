@@ -117,13 +117,13 @@ def _threshold(study: Study, analysis: StudyAnalysis) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns the number of surveys with a warning, and the first warning."""
+    """Returns a sentence with the number of surveys with a warning and the first warning; "" without any."""
     warned = analysis.warning[analysis.warning != ""]
     return f" Warning in {len(warned)} of {len(analysis.warning)} surveys: {warned[0]}." if len(warned) else ""
 
 
 def _main_reason(analysis: StudyAnalysis) -> str:
-    """Returns the most frequent reason if no survey passed."""
+    """Returns a sentence on the most frequent reason of failure if no survey passed, else ""."""
     if analysis.passed.any() or not analysis.failure_reasons:
         return ""
     return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
@@ -140,7 +140,7 @@ def limit_relation(metric: str) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns whether the required pass probability is met, and whether the confidence interval is conclusive."""
+    """Returns a sentence on whether the required pass probability is met, and whether the interval is conclusive."""
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None or analysis.study.seek is not None:
         return ""

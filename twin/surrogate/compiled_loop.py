@@ -44,7 +44,7 @@ def compiled_loop(
         times_s = np.arange(len(world), len(world) + n) / rate_hz
         world.record(true[:n])
         vision.last_pose, vision.last_normals = true[n - 1], numbers[0][n - 1]
-        navigator.adopt(state)
+        navigator.set_dead_reckoning(state)
         navigator.log.append(times_s, f2f[:n], online[:n])
         vehicle.advance_clock(n / rate_hz)
         return end
@@ -65,7 +65,7 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     n = len(positions)
     true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
     for k in range(n):
-        geometry.put(true[k], geometry.compose(body.pose, sensors.body_from_camera))
+        geometry.copy_into(true[k], geometry.compose(body.pose, sensors.body_from_camera))
         height, angles, velocity = read_per_frame_sensors(
             sensors, body.pose, body_twist(body), sensor_normals[k], dvl_normals[k]
         )
@@ -73,8 +73,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
             errors, last, true[k], vision_normals[k], last_normals if k == 0 else vision_normals[k - 1]
         )
         state, motion = dead_reckon(state, aiding, a_from_b, errors.cov, height, angles, velocity)
-        geometry.put(f2f[k], state.f2f)
-        geometry.put(online[k], state.online)
+        geometry.copy_into(f2f[k], state.f2f)
+        geometry.copy_into(online[k], state.online)
         last = true[k]
         twist = geometry.log(motion) * (1 / interval_s)  # the expression of `Navigator.update`, to the last bit
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])

@@ -41,7 +41,7 @@ class FractionLaw(NamedTuple):
     exponent: float
 
     def __call__(self, bound_px: float) -> float:
-        """Returns the fraction."""
+        """Returns the fraction, 0 to 1."""
         return float(self.maximum / (1 + (bound_px / self.half_px) ** self.exponent))
 
 

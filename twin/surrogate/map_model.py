@@ -52,7 +52,7 @@ class MapModel:
         rig: true calibration.
 
     Attributes:
-        seen: (rows, cols) cells that at least one keyframe saw; modified in geotransform by `mark_seen`.
+        seen: (rows, cols) cells that at least one keyframe observed; modified in place by `mark_seen`.
     """
 
     def __init__(self, grid: MapGrid, height_m: Map, rig: StereoRig):

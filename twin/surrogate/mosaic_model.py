@@ -1,4 +1,4 @@
-"""Model of the mosaic: which keyframe each floor cell was first seen by, as the mosaic keeps the oldest view."""
+"""Model of the mosaic: the first keyframe that shows each floor cell, as the mosaic keeps the oldest view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Cells = NDArray[np.int64]  #: floor cells: column and row packed into one intege
 
 @njit(cache=True, nogil=True)
 def floor_cells(pose, points, baseline):
-    """Returns the floor cell (n,) of each of the points (n, 3), normalised (x, y, disparity), of a camera at (4, 4)."""
+    """Returns the floor cells (n,) of points (n, 3), normalised (x, y, disparity), of a camera at `pose` (4, 4)."""
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -36,7 +36,7 @@ class MosaicView(NamedTuple):
     Args:
         numbers: numbers of the keyframes, ascending.
         estimated: (n, 4, 4) poses at which they were added to the mosaic.
-        fractions: (n,) fraction of the covered part of the view that shows each of them.
+        fractions: (n,) fraction of the mosaic in view that each of them covers.
     """
 
     numbers: list[int]
@@ -45,7 +45,7 @@ class MosaicView(NamedTuple):
 
 
 class MosaicModel:
-    """Keyframes by the floor cells that they were the first to show."""
+    """Mosaic without images: for each floor cell, the number of the first keyframe that shows it."""
 
     def __init__(self) -> None:
         self._first_keyframe: dict[int, int] = {}

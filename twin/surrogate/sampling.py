@@ -79,8 +79,8 @@ def sample_link(
     a, b, earlier_cov = a[:n], b[:n], cov * (1 + growth)
     later_covs, earlier_covs = np.empty((n, 3, 3)), np.empty((n, 3, 3))
     for k in range(n):
-        geometry.put(later_covs[k], cov)
-        geometry.put(earlier_covs[k], earlier_cov)
+        geometry.copy_into(later_covs[k], cov)
+        geometry.copy_into(earlier_covs[k], earlier_cov)
     measured = observation_equations.PairMeasurements(a, b, earlier_covs, later_covs)
     observations = observation_equations.linearise(measured, b, earlier_from_later, baseline)
     normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, np.ones(n))
@@ -116,14 +116,14 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
 
 @njit(cache=True, nogil=True)
 def mosaic_correction(estimated, true, fractions, true_pose, predicted_pose):
-    """Returns the error-free correction (6,) of a predicted pose by registration with the mosaic.
+    """Returns the correction (6,) of a predicted pose that an error-free registration with the mosaic would give.
 
-    The mosaic shows each keyframe displaced by the error of the pose at which it was added; the correction is the mean
-    over the keyframes in view.
+    In the mosaic, each keyframe is displaced by the error of the pose at which it was added; the correction is the
+    mean over the keyframes in view, weighted by `fractions`.
 
     Args:
         estimated, true: (n, 4, 4) estimated and true poses of the keyframes in view.
-        fractions: (n,) fraction of the view that shows each of them.
+        fractions: (n,) fraction of the view that each of them covers.
         true_pose, predicted_pose: (4, 4) true and predicted pose of the frame to register.
     """
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)

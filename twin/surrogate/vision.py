@@ -100,7 +100,7 @@ class TrueScene(NamedTuple):
 
 
 class SurrogateVision:
-    """`Vision` by sampling from an error model.
+    """Implementation of `Vision` that samples measurements from an error model.
 
     Args:
         rig: true calibration.
@@ -247,7 +247,7 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns square root and covariance (6, 6) of a motion estimated from flow of this standard deviation."""
+        """Returns the square root of a covariance and the covariance (6, 6): motion from flow with this sigma."""
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2

@@ -31,7 +31,7 @@ BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
 
 
 class ComparisonVision:
-    """`Vision` by images that collects statistics of the comparison with a surrogate.
+    """`Vision` from images that collects statistics of the comparison with a surrogate.
 
     Args:
         images: vision whose measurements are returned.
@@ -111,7 +111,7 @@ class ComparisonVision:
         self.surrogate.discard(numbers)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns the links from images; compares them with links sampled with all errors and with one error alone."""
+        """Measures links in images; compares them with links sampled with all errors and with each error alone."""
         measured = {"images": self.images.measure_motions(node, others)}
         models = {"all": self.surrogate.model, **single_error_models(self.surrogate.model)}
         measured |= {name: self.surrogate.sample_links(node, others, model) for name, model in models.items()}
@@ -149,7 +149,7 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images; compares it with maps sampled along the same path with one error alone."""
+        """Returns the map from images; compares it with maps sampled along the same path with each error alone."""
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         models = {
             "pose": model._replace(depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0),

@@ -165,7 +165,7 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
 def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
     """Returns the error ratio of patches without lamps, and its growth with the lamps' share of the light.
 
-    Least squares of the relative errors of the squared error ratios (n,).
+    Fitted to the squared error ratios (n,) by least squares of their relative errors.
     """
     effects = np.column_stack([np.ones_like(error_ratios), lamp_share**2]) / error_ratios[:, None] ** 2
     constant, growth = nnls(effects, np.ones(len(error_ratios)))[0]

@@ -1,1 +1,1 @@
-"""Left of the wall: the mission, the simulated world, its truth, and the pilot."""
+"""The mission, the simulated world, its ground truth, and the pilot. Estimators do not import this package."""

@@ -64,7 +64,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Mission:
-    """A checked survey."""
+    """A survey ready to be flown: scenario, floor, plan, cameras and illumination, all checked."""
 
     scenario: Scenario
     terrain: terrains.Terrain
@@ -308,7 +308,7 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
-    """Returns the grid of the map: all that the plan shows of the reference plane, and a margin of half a metre."""
+    """Returns the grid of the map: the reference plane in view along the planned path, plus a margin of 0.5 m."""
     corners = plan.outline()[:, :2]
     across_m, along_m = plan.footprint_m
     margin = np.array([along_m, across_m]) / 2 + 0.5

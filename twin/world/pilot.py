@@ -81,7 +81,7 @@ class RovPilot:
 @njit(cache=True, nogil=True)
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
     """Returns thruster commands for an estimated pose (4, 4) and twist (6,) of the camera and its reference."""
-    geometry.put(
+    geometry.copy_into(
         state.twist,
         state.twist + state.smoothing * (state.body_from_camera_twist @ camera_velocity - state.twist),
     )

@@ -118,10 +118,11 @@ class World(ABC):
     def fast_forward(self, navigator: Any, pilot: PilotOfEstimates) -> FastForward:
         """Returns a function that advances the closed loop over frames without images.
 
-        This one advances no frame; a world without images overrides it.
+        The function of this base class advances no frame; `SurrogateWorld` overrides it.
 
         Args:
             navigator: the estimator in the loop.
+            pilot: the controller in the loop.
         """
         return lambda course, k: k
 

@@ -114,7 +114,7 @@ def _set_diagonal(s, diagonal, panels):
     for k in range(len(diagonal)):
         p = s.panel_of[s.permutation[k]]
         x = s.permutation[k] - s.panel_start[p]
-        geometry.put(_panel_matrix(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
+        geometry.copy_into(_panel_matrix(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
 
 
 @njit(cache=True, nogil=True)
@@ -150,10 +150,10 @@ def _factorise(s, original, panels):
         inverse = np.zeros((n, n))
         if not _invert_root(panel[:n], original[_D * s.panel_start[p] : _D * s.panel_start[p + 1]], inverse):
             return False
-        geometry.put(panel[:n], inverse)
+        geometry.copy_into(panel[:n], inverse)
         if len(panel) > n:
             below, positions = np.dot(panel[n:], inverse.T), s.rows[s.row_start[p] : s.row_start[p + 1]]
-            geometry.put(panel[n:], below)
+            geometry.copy_into(panel[n:], below)
             start = 0
             while start < len(positions):
                 end, ancestor, at = _next_ancestor(s, positions, start)
@@ -270,10 +270,10 @@ def _invert(s, panels, diagonal):
                     current += np.dot(part[_D * (end - start) :].T, weight[_D * end :])
                 start = end
             own += np.dot(weight.T, product)
-            geometry.put(panel[n:], -product)
-        geometry.put(panel[:n], own)
+            geometry.copy_into(panel[n:], -product)
+        geometry.copy_into(panel[:n], own)
         for k in range(width):
-            geometry.put(diagonal[s.panel_start[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
+            geometry.copy_into(diagonal[s.panel_start[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
 
 
 @njit(cache=True, nogil=True)
@@ -282,7 +282,7 @@ def _solve_in_place(s, panels, x):
     for p in range(len(s.panel_start) - 1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)
-        geometry.put(own, np.dot(panel[: len(own)], own))
+        geometry.copy_into(own, np.dot(panel[: len(own)], own))
         if len(panel) > len(own):
             product = np.dot(panel[len(own) :], own)
             for k in range(s.row_start[p], s.row_start[p + 1]):
@@ -297,4 +297,4 @@ def _solve_in_place(s, panels, x):
                 for i in range(_D):
                     below[_D * (k - s.row_start[p]) + i] = x[_D * s.rows[k] + i]
             own -= np.dot(panel[len(own) :].T, below)
-        geometry.put(own, np.dot(panel[: len(own)].T, own))
+        geometry.copy_into(own, np.dot(panel[: len(own)].T, own))

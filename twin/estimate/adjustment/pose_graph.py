@@ -1,4 +1,4 @@
-"""Factor graph of poses and its maximum-likelihood solution, the core of the global alignment (P15).
+"""Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
 The cost is F(X) = sum over motions of rho(|log(Z_ij^-1 X_i^-1 X_j)|), with the residual whitened by the covariance of
 the measured motion Z_ij, plus the cost of factors of single poses. rho(r) is r^2 / 2 or Huber's loss. F is minimised
@@ -39,7 +39,8 @@ class UnaryFactors(NamedTuple):
         pose_index: (m,) index of the constrained pose.
         information: (m, d, d) information matrices.
         residuals: function of the poses (m, 4, 4) that returns residuals (m, d).
-        jacobians: function of poses and residuals that returns the Jacobians (m, d, 6) by the increment of the pose.
+        jacobians: function of poses and residuals that returns the Jacobians (m, d, 6) with respect to the increment of
+            the pose.
     """
 
     pose_index: Indices
@@ -55,8 +56,9 @@ class BinaryFactors(NamedTuple):
         i, j: (m,) indices of the poses.
         information: (m, d, d) information matrices.
         residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
-        jacobians: function of i_from_j, the shared parameter and the residuals that returns the Jacobians (m, d, 6) by
-            the increment of pose j, and (m, d) by the shared parameter or None if the factors do not depend on it.
+        jacobians: function of i_from_j, the shared parameter and the residuals that returns the Jacobians (m, d, 6)
+            with respect to the increment of pose j, and (m, d) with respect to the shared parameter, or None if the
+            factors do not depend on it.
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
 
@@ -69,7 +71,7 @@ class BinaryFactors(NamedTuple):
 
 
 class FactorGraph(NamedTuple):
-    """Factors of n poses and the prior standard deviation of the shared parameter, whose mean is 0 (None: no such)."""
+    """Factors of n poses, and the prior standard deviation of the shared parameter, of mean 0; None without one."""
 
     n_poses: int
     unary: Sequence[UnaryFactors]
@@ -106,10 +108,10 @@ class _NormalEquations(NamedTuple):
 
     Args:
         diagonal: (n, 6, 6) diagonal blocks.
-        gradient: (n, 6) gradient of F by the poses.
-        border: (n, 6) second derivatives by poses and shared parameter.
-        corner: second derivative by the shared parameter; 0: there is no such parameter.
-        shared_gradient: gradient of F by the shared parameter.
+        gradient: (n, 6) gradient of F with respect to the poses.
+        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter.
+        corner: second derivative of F with respect to the shared parameter; 0 if there is no such parameter.
+        shared_gradient: derivative of F with respect to the shared parameter.
     """
 
     diagonal: Array
@@ -128,8 +130,8 @@ class Solution(NamedTuple):
         chi2: (m,) squared whitened residuals of each kind of binary factors, without robust weights.
         converged: false if the iterations ended before the minimum was reached.
         cholesky: factor of the normal matrix of the poses, undamped.
-        border: (n, 6) derivative of the poses by the shared parameter, and the marginal information of that parameter;
-            None: there is no shared parameter.
+        border: (n, 6) derivative of the poses with respect to the shared parameter, and the marginal information of
+            that parameter; None if there is no shared parameter.
     """
 
     state: GraphState
@@ -282,7 +284,7 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
     """Adds the normal equations of binary factors to the diagonal blocks and the gradient of both poses.
 
-    The Jacobian by the increment of pose i is that by pose j times -Ad(j_from_i).
+    The Jacobian with respect to the increment of pose i is that of pose j times -Ad(j_from_i).
 
     Args:
         off_diagonal: (m, 6, 6), filled with the blocks (i, j).
@@ -303,7 +305,7 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
                 for k in range(n):
                     total += half[a, k] * jacobian[k, b]
                 matrix[a, b] = matrix[b, a] = total
-        geometry.put(to_i, geometry.adjoint(geometry.inverse(i_from_j[m])).T)
+        geometry.copy_into(to_i, geometry.adjoint(geometry.inverse(i_from_j[m])).T)
         for a in range(6):
             for b in range(6):
                 off_diagonal[m, a, b] = 0.0
@@ -312,15 +314,15 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
                 diagonal[j, a, b] += matrix[a, b]
                 gradient[i, a] -= to_i[a, b] * slope[b]
             gradient[j, a] += slope[a]
-        geometry.put(diagonal[i], diagonal[i] + geometry.sandwich(to_i, matrix))
+        geometry.copy_into(diagonal[i], diagonal[i] + geometry.transform_covariance(to_i, matrix))
 
 
 @njit(cache=True, nogil=True)
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the second derivatives of binary factors by their poses and the shared parameter to the border (n, 6).
+    """Adds the mixed second derivatives of binary factors (poses and shared parameter) to the border (n, 6).
 
     Args:
-        weighted: (m, d) Jacobian by the shared parameter times information and robust weight.
+        weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
     """
     for m in range(len(first)):
         slope = np.zeros(6)
@@ -372,16 +374,16 @@ def pose_residuals(measured, estimated):
     """Returns log(measured^-1 estimated) (m, 6) of poses (m, 4, 4)."""
     residuals = np.empty((len(estimated), 6))
     for k in range(len(estimated)):
-        geometry.put(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), estimated[k])))
+        geometry.copy_into(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), estimated[k])))
     return residuals
 
 
 @njit(cache=True, nogil=True)
 def pose_residual_jacobians(residuals):
-    """Returns the Jacobians (m, 6, 6) of `pose_residuals` (m, 6) by increments of the estimated poses."""
+    """Returns the Jacobians (m, 6, 6) of `pose_residuals` (m, 6) with respect to increments of the estimated poses."""
     jacobians = np.empty((len(residuals), 6, 6))
     for k in range(len(residuals)):
-        geometry.put(jacobians[k], geometry.log_derivative(residuals[k]))
+        geometry.copy_into(jacobians[k], geometry.log_derivative(residuals[k]))
     return jacobians
 
 
@@ -390,7 +392,7 @@ def _retract(poses, increments):
     """Returns poses (n, 4, 4) moved by increments (n, 6) in their own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
-        geometry.put(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
+        geometry.copy_into(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
     return moved
 
 
@@ -399,7 +401,7 @@ def _relative_poses(poses, i, j):
     """Returns i_from_j (m, 4, 4) of pairs of poses with indices i, j (m,)."""
     relative = np.empty((len(i), 4, 4))
     for k in range(len(i)):
-        geometry.put(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))
+        geometry.copy_into(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))
     return relative
 
 

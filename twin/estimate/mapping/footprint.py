@@ -1,4 +1,4 @@
-"""The area that the keyframes of a survey show."""
+"""Map grid over the area that the keyframes of a survey show."""
 
 from __future__ import annotations
 

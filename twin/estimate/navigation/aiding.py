@@ -1,4 +1,4 @@
-"""Factors of the navigation sensors in the graph of the global alignment (P17).
+"""Factors of the navigation sensors in the graph of the global alignment.
 
 Pressure, acoustic position fixes and attitude each constrain one node. Beacons have surveyed positions, so their pixels
 resect the camera of a node. The DVL constrains the displacement between two nodes. Its scale error is one parameter
@@ -39,7 +39,7 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
 
 def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    """Returns factors of the camera's height by pressure."""
+    """Returns the factors of the heights measured by the pressure sensor."""
     index = [k for k, node in enumerate(nodes) if node.readings.pressure_z_m is not None]
     height_m = np.array([nodes[k].readings.pressure_z_m for k in index], dtype=np.float64)
 
@@ -55,7 +55,7 @@ def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFacto
 
 
 def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns factors of the camera's rotation by the AHRS."""
+    """Returns the factors of the camera rotations measured by the AHRS."""
     index = [k for k, node in enumerate(nodes) if node.readings.ahrs_rpy_rad is not None]
     angles = np.array([nodes[k].readings.ahrs_rpy_rad for k in index]).reshape(-1, 3)
     camera_from_body = geometry.inverse(rig.body_from_camera)
@@ -81,12 +81,12 @@ def _camera_poses_at_origin(angles, body_from_camera):
     mount_rotation[:3, 3] = 0.0
     for k in range(len(angles)):
         body = geometry.pose(geometry.rotation_from_rpy(angles[k, 0], angles[k, 1], angles[k, 2]), np.zeros(3))
-        geometry.put(poses[k], geometry.compose(body, mount_rotation))
+        geometry.copy_into(poses[k], geometry.compose(body, mount_rotation))
     return poses
 
 
 def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    """Returns factors of the camera's position by acoustic fixes (USBL)."""
+    """Returns the factors of the camera positions measured by acoustic positioning (USBL)."""
     index = [k for k, node in enumerate(nodes) if node.readings.usbl_m is not None]
     position_m = np.array([nodes[k].readings.usbl_m for k in index]).reshape(-1, 3)
 
@@ -100,7 +100,7 @@ def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFac
 
 
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns factors of the reprojection errors of beacons in the left image."""
+    """Returns the factors of the reprojection errors of beacons in the left image."""
     sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
     beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
     pixels = np.array([sighting.pixel for _, sighting in sightings]).reshape(-1, 2)
@@ -119,7 +119,7 @@ def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNois
 
 
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:
-    """Returns factors of the displacements by the DVL between nodes, (1 + s) d = measured.
+    """Returns the factors of the displacements between nodes measured by the DVL, (1 + s) d = measured.
 
     d is the displacement of the body's origin in the axes of the earlier body, s the scale error (shared parameter).
 
@@ -150,6 +150,6 @@ def _body_displacements(motions, body_from_camera):
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
         displacement, jacobian = body_displacement(motions[k], body_from_camera)
-        geometry.put(displacements[k], displacement)
-        geometry.put(by_motion[k], jacobian)
+        geometry.copy_into(displacements[k], displacement)
+        geometry.copy_into(by_motion[k], jacobian)
     return displacements, by_motion

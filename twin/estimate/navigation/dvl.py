@@ -100,7 +100,8 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
         body_from_camera: (4, 4) mount.
 
     Returns:
-        Displacement (3,) [m] in the axes of the earlier body, and its Jacobian (3, 6) by an increment of the motion.
+        Displacement (3,) [m] in the axes of the earlier body, and its Jacobian (3, 6) with respect to an increment of
+        the motion.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -127,7 +128,7 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
         The motion (4, 4) and its covariance (6, 6); the visual ones unless there are readings at both ends.
     """
     last = state.velocity.copy()
-    geometry.put(state.velocity, velocity)
+    geometry.copy_into(state.velocity, velocity)
     if np.isnan(last[0]) or np.isnan(velocity[0]):
         state.complete[0] = False
         return a_from_b, cov
@@ -183,15 +184,15 @@ def _accumulate(state, model, step, a_from_b, cov):
         )
         state.cov[i, i] += model.white_m2
     rotation = _body_motion(a_from_b, model.body_from_camera)[:3, :3]
-    geometry.put(node_from_body, geometry.product(node_from_body, rotation))
+    geometry.copy_into(node_from_body, geometry.product(node_from_body, rotation))
     node_from_camera = geometry.product(node_from_body, model.body_from_camera[:3, :3])
     added = geometry.product(geometry.product(node_from_camera, cov[:3, :3]), node_from_camera.T)
-    geometry.put(state.rotation_cov, state.rotation_cov + added)
+    geometry.copy_into(state.rotation_cov, state.rotation_cov + added)
 
 
 @njit(cache=True, nogil=True)
 def _displacement_cov(state):
-    """Returns the covariance (3, 3) of the displacement since the node by white noise and attitude error."""
+    """Returns the covariance (3, 3) of the displacement since the node due to white noise and attitude error."""
     lever = geometry.skew(state.displacement_m)  # conservative: the attitude error at the end applies to the whole path
     return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
 
@@ -199,7 +200,7 @@ def _displacement_cov(state):
 @njit(cache=True, nogil=True)
 def _restart(state):
     """Resets the integration at a node; the last reading is kept."""
-    geometry.put(state.node_from_body, np.eye(3))
+    geometry.copy_into(state.node_from_body, np.eye(3))
     state.rotation_cov[:], state.displacement_m[:], state.cov[:], state.path_m[:] = 0.0, 0.0, 0.0, 0.0
     state.complete[:] = True
 

@@ -77,7 +77,7 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     """Projects a beacon (3,) into the left image.
 
     Returns:
-        Pixel (2,), NaN behind the camera, and its Jacobian (2, 6) by an increment of the pose.
+        Pixel (2,), NaN behind the camera, and its Jacobian (2, 6) with respect to an increment of the pose.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -114,7 +114,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     pose = world_from_camera
     if not np.isnan(height_m):
         by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
-        geometry.put(by_pose[0, 3:], pose[2, :3])
+        geometry.copy_into(by_pose[0, 3:], pose[2, :3])
         residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
         pose, cov = kalman_update(pose, cov, residual, by_pose, height_cov)
     if not np.isnan(rpy_rad[0]):
@@ -146,7 +146,7 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
 @njit(cache=True, nogil=True)
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
     """Returns the covariance (6, 6) of pose a expressed in the axes of b, which is rigidly attached."""
-    return geometry.sandwich(geometry.adjoint(geometry.inverse(a_from_b)), cov)
+    return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
 @njit(cache=True, nogil=True)
@@ -169,7 +169,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
                 keep[i, k] -= gain[i, m] * jacobian[m, k]
                 for n in range(len(residual)):
                     noise[i, k] += gain[i, m] * cov[m, n] * gain[k, n]
-    return geometry.compose(world_from_camera, geometry.exp(step)), geometry.sandwich(keep, prior) + noise
+    return geometry.compose(world_from_camera, geometry.exp(step)), geometry.transform_covariance(keep, prior) + noise
 
 
 @njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ _UNKNOWN_VARIANCE = 1.0  # of the disparity, which a single image does not measu
 
 
 class _Reference(NamedTuple):
-    """Image that frames are matched with, and its points (see `StereoPoints`)."""
+    """Reference image that frames are matched with, and its stereo points (fields as in `StereoPoints`)."""
 
     image: matching.Image
     pixels: matching.Points
@@ -99,7 +99,7 @@ class FrameToFrame:
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> two_view_motion.Motion | None:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
-        If too few points are tracked, the image becomes the reference, with those points.
+        If many points are lost, the image becomes the new reference, with the points tracked in it.
 
         Returns:
             The motion from the reference, or None if there are too few inliers.

@@ -1,10 +1,10 @@
 """Choice of the image scale: pixels are binned if the texture of the floor is coarser than the image noise.
 
 Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
-corners
-of the full image are matched in the right image: the others are noise, and F2F tracking fails within 18 s. With pixels
-binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full image resolves, it
-is 95 to 99 % without binning. Larger patches alone do not help, because they keep the corners that are noise.
+corners of the full image are matched in the right image: the others are noise, and F2F tracking fails within 18 s. With
+pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full image
+resolves, 95 to 99 % are matched without binning. Larger patches alone do not help, because they keep the corners that
+are noise.
 """
 
 from __future__ import annotations

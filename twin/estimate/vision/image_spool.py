@@ -58,7 +58,7 @@ class ImageSpool:
             writing.result()
 
     def close(self) -> None:
-        """Waits until all pairs are written, and ends the writing thread."""
+        """Waits until all pairs are written, and ends the thread that writes them."""
         self._writer.shutdown()
 
     def pair(self, row: int) -> tuple[Image, Image]:

@@ -1,10 +1,9 @@
 """Local 2.5-D mosaic, and the registration of frames with it (F2M): six degrees of freedom over any relief.
 
 The mosaic is a raster in world coordinates: normalised brightness and elevation per cell, and the keyframe that each
-cell was taken from. Cells are never overwritten, because the oldest view has drifted least. A frame is registered by
-direct
-image alignment: textured cells are projected into the frame, and the pose is optimised until the brightness agrees
-(Gauss-Newton with Huber weights).
+cell was taken from. Cells are never overwritten, because the pose of the oldest keyframe has drifted least. A frame is
+registered by direct image alignment: textured cells are projected into the frame, and the pose is optimised until the
+brightness agrees (Gauss-Newton with Huber weights).
 
 The residuals are dominated by errors of height and by uneven illumination rather than by pixel noise, and neighbouring
 cells share them. A covariance for independent cells claimed 0.4 mrad where the error was 1.4 to 6 mrad, over a floor of
@@ -216,8 +215,8 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
         max_residual: largest brightness residual of an inlier.
 
     Returns:
-        Jacobian (m, 6) of the projected brightness by the motion, with the depth of the mosaic; the same with the depth
-        of the frame; residuals (m,); block of the image (m,); and which cells are used (n,) bool.
+        Jacobian (m, 6) of the projected brightness with respect to the motion, with the depth of the mosaic; the same
+        with the depth of the frame; residuals (m,); block of the image (m,); and which cells are used (n,) bool.
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS

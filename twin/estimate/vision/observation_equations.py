@@ -35,8 +35,8 @@ class LinearisedObservations(NamedTuple):
 
     Args:
         residual: (n, 3) of the measurements in a, minus their prediction from the measurements in b.
-        jacobian_point: (n, 3, 3) derivative of the prediction by the point (x, y, disparity) in b.
-        jacobian_motion: (n, 3, 6) derivative of the prediction by the twist of the motion a_from_b.
+        jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
+        jacobian_motion: (n, 3, 6) derivative of the prediction with respect to the twist of the motion a_from_b.
         information: (n, 3, 3) inverse covariance of the residual.
         normalised_residual: (n,) root of the squared Mahalanobis distance of the residual per degree of freedom.
     """
@@ -50,7 +50,7 @@ class LinearisedObservations(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def image_jacobian(x, y, depth):
-    """Returns the derivative of image coordinates by the camera's twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
+    """Returns the Jacobian of image coordinates for the camera's twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
 
     Args:
         x, y: (n,) normalised image coordinates.
@@ -97,8 +97,8 @@ def transfer(points_b, a_from_b, baseline):
         baseline: baseline of the rig [m].
 
     Returns:
-        (n, 3) normalised (x, y, disparity) in a, and its derivatives by the point (n, 3, 3) and by the twist of
-        the motion (n, 3, 6).
+        (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point (n, 3, 3) and to the
+        twist of the motion (n, 3, 6).
     """
     n = len(points_b)
     points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
@@ -107,7 +107,7 @@ def transfer(points_b, a_from_b, baseline):
         translation[r] = a_from_b[r, 3] / baseline
         for c in range(3):
             rotation[r, c] = a_from_b[r, c]
-    q, q_jacobian = np.empty(3), np.empty((3, 9))  # point in a, times disparity / baseline; by point and motion
+    q, q_jacobian = np.empty(3), np.empty((3, 9))  # point in a, times disparity / baseline; its derivatives
     for i in range(n):
         x, y, d = points_b[i]
         for r in range(3):
@@ -185,8 +185,8 @@ def motion_normal_equations(observations, weight):
         weight: (n,) robust weights; points of weight 0 are skipped.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), and derivative of the right-hand side (6, 3) by a bias that all
-        points share.
+        Normal matrix (6, 6), right-hand side (6,), and derivative of the right-hand side (6, 3) with respect to
+        a bias that all points share.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     normal, right, bias_jacobian = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))

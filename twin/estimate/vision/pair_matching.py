@@ -89,7 +89,7 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns the pixels (n, 2) of normalised points (n, 3) in the left image, and their (disparity, 0) (n, 2)."""
+        """Returns the left pixels (n, 2) of normalised points (n, 3), and (disparity, 0) [px] of each (n, 2)."""
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
