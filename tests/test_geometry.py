@@ -77,7 +77,7 @@ def test_poses_compose_as_matrices_multiply(a, b):
     np.testing.assert_allclose(g.compose(a, b), a @ b, atol=1e-12)
 
 
-def test_the_sandwich_product_is_exactly_symmetric():
+def test_transformed_covariances_are_exactly_symmetric():
     rng = np.random.default_rng(0)
     matrix, root = rng.normal(size=(2, 6, 6))
     product = g.sandwich(matrix, root @ root.T)
