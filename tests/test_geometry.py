@@ -80,7 +80,7 @@ def test_poses_compose_as_matrices_multiply(a, b):
 def test_transformed_covariances_are_exactly_symmetric():
     rng = np.random.default_rng(0)
     matrix, root = rng.normal(size=(2, 6, 6))
-    product = g.sandwich(matrix, root @ root.T)
+    product = g.transform_covariance(matrix, root @ root.T)
     np.testing.assert_allclose(product, matrix @ root @ root.T @ matrix.T, atol=1e-12)
     np.testing.assert_array_equal(product, product.T)
 
