@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class ThrustAllocation(NamedTuple):
-    """Distributes a wrench [moment, force] over n thrusters.
+    """Thrust allocation: distributes a wrench [moment, force] over n thrusters.
 
     Args:
         thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrust configuration matrix.

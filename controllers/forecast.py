@@ -14,16 +14,16 @@ Array = NDArray[np.float64]
 
 
 class Forecast(NamedTuple):
-    """Figures of a survey plan, for a floor at the reference plane z = 0.
+    """Predicted properties of a survey, for a floor at the reference plane z = 0.
 
     Args:
         n_frames_per_keyframe: N, frames from one keyframe to the next.
-        keyframes_per_swath: M, keyframes of a leg or a loop.
+        keyframes_per_swath: M, number of keyframes on a leg or loop.
         n_tracks: L, number of tracks.
         n_keyframes, n_frames: totals of the survey, without station keeping.
         duration_s, path_m: totals of the survey, without station keeping.
         speed_mps: cruise speed along the swaths.
-        footprint_m: width (across the bow) and height (along the bow) of the image on the floor.
+        footprint_m: width (across the heading) and height (along the heading) of the image on the floor.
         keyframe_spacing_m: distance between consecutive keyframes.
         swath_spacing_m: greatest distance between neighbouring swaths.
         overlap_along: overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`.
@@ -108,7 +108,7 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     path = plan.outline()[:, :2]
     along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along x
     south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
-    # Row by row, to limit memory on a large floor.
+    # Processed row by row to limit memory on a large floor.
     tops = []
     for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
         near = path[np.abs(path[:, 1] - y) <= across_m + 1e-9, 0]

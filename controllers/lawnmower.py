@@ -27,7 +27,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     check_request(request)
     length_m, width_m = request.area_m
     max_spacing_m = (1 - request.overlap_across) * request.footprint_m[0]
-    # The tolerance: a strip that exceeds the limit only by rounding must not add a track.
+    # Tolerance: a strip that exceeds the limit only by rounding must not add a track.
     n_filling = math.ceil(width_m / max_spacing_m / 2 - 1e-9)
     n_tracks = n_tracks_to_fly(request, n_filling)
     spacing_m = width_m / (2 * n_filling)

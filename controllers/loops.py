@@ -59,7 +59,7 @@ def loop_spacing_m(loop_diameter_m: float, n_loops: int) -> float:
 
 def n_loops_to_fill(loop_diameter_m: float, max_spacing_m: float) -> int:
     """Returns the least number of loops, at least two, whose spacing is at most `max_spacing_m`."""
-    # The tolerance: a spacing that exceeds the limit only by rounding must not add a loop.
+    # Tolerance: a spacing that exceeds the limit only by rounding must not add a loop.
     return math.ceil(math.pi / math.asin(min(1.0, max_spacing_m / loop_diameter_m)) - 1e-9)
 
 
@@ -70,10 +70,10 @@ def _loop(request: SurveyRequest, diameter_m: float, angle: float) -> Circle:
 
 
 def _disc_diameter_m(area_m: tuple[float, float]) -> float:
-    """Returns the diameter D of the disc inscribed in the area, which must be a square. Raises TwinError."""
+    """Returns the diameter D of the disc inscribed in the area, and raises TwinError if the area is not a square."""
     length_m, width_m = area_m
     if not math.isclose(length_m, width_m):
         least = min(area_m)
-        problem = f"{length_m:g} x {width_m:g} m: loops cover a disc"
+        problem = f"{length_m:g} x {width_m:g} m: loops need a square area"
         raise TwinError("plan.area_m", problem, f"the disc's diameter for both, as in [{least:g}, {least:g}]")
     return length_m

@@ -17,7 +17,7 @@ _CIRCLE_POINTS = 181  # one point every 2 degrees
 
 
 class Reference(NamedTuple):
-    """Reference of the camera or the body in the world: position [m], velocity [m/s], yaw [rad], acceleration [m/s2].
+    """Reference of the camera or body in the world: position [m], velocity [m/s], yaw [rad] and acceleration [m/s2].
 
     Shapes: (3,) and a scalar yaw for one time, (n, 3) and yaw (n,) for n times.
     """
@@ -28,7 +28,7 @@ class Reference(NamedTuple):
     acceleration: Array
 
     def row(self, k: int) -> Reference:
-        """Returns the reference of time k."""
+        """Returns the reference at the time with index k."""
         return Reference(*(part[k] for part in self))  # type: ignore[index]
 
 
@@ -114,6 +114,6 @@ def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: fl
 def max_circle_speed_mps(radius_m: float, acceleration_mps2: float) -> float:
     """Returns the speed limit on a circle [m/s].
 
-    v^2 / r = a / sqrt(2) leaves as much tangential acceleration as the centripetal acceleration.
+    It satisfies v^2 / r = a / sqrt(2), so the centripetal and the available tangential acceleration are equal.
     """
     return math.sqrt(radius_m * acceleration_mps2 / math.sqrt(2))

@@ -43,7 +43,7 @@ class SurveyRequest(NamedTuple):
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Returns the width (across the bow) and height (along the bow) of the image on the reference plane [m]."""
+        """Returns width (across the heading) and height (along it) of the image on the reference plane [m]."""
         per_px = self.altitude_m / self.focal_px
         return float(self.image_width_px * per_px), float(self.image_height_px * per_px)
 
@@ -61,7 +61,7 @@ class SurveyPlan:
         n_frames_per_keyframe: N, frames from one keyframe to the next.
         swath_length_m: length of a swath (a leg or a loop).
         swath_spacing_m: greatest distance between neighbouring swaths.
-        footprint_m: width (across the bow) and height (along the bow) of the image on the reference plane.
+        footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.
         side_along_m: side of the footprint along which consecutive keyframes are displaced.
         side_across_m: side of the footprint along which neighbouring swaths are displaced.
         focal_px: focal length of the cameras.
@@ -145,7 +145,7 @@ def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
         fastest = 2 * advance_m * request.frame_rate_hz
         raise TwinError(
             "plan.speed_mps",
-            f"{speed_mps:g} is too fast: keyframes less than one frame apart",
+            f"{speed_mps:g} is too fast: less than one frame per keyframe",
             f"below {fastest:.3g}",
         )
     return n

@@ -13,13 +13,13 @@ from controllers.segments import Reference
 
 Array = NDArray[np.float64]
 
-ATTITUDE_BANDWIDTH = 2.0  # attitude bandwidth over position bandwidth: the inner loop must be faster
-INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action over the natural frequency
+ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: the inner loop must be faster
+INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action divided by the natural frequency
 INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: more than any survey current requires
 
 
 class HullModel(NamedTuple):
-    """Model of the hull in the controller; (6,) arrays are about, then along the body's x, y, z axes.
+    """Hull model of the controller; (6,) arrays are [rotation about, translation along] the x, y, z axes of the body.
 
     Args:
         inertia: (6,) moments of inertia [kg m2] and masses [kg], including added mass.
@@ -36,7 +36,7 @@ class HullModel(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
-    """Returns the wrench (6,) that sustains a body velocity (3,) in still water: drag, and minus the Munk moment.
+    """Returns the wrench (6,) that sustains a body velocity (3,) in still water against drag and the Munk moment.
 
     The Munk moment -v x M_A v turns a hull broadside. At survey speed it exceeds the righting moment in
     pitch of the BlueROV2.
@@ -81,7 +81,7 @@ def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
-    """Returns the velocity command (3,) [m/s]: reference velocity plus a correction of the position error at rate w.
+    """Returns the velocity command (3,) [m/s]: reference velocity plus w times the position error.
 
     Args:
         position: (3,) estimated position [m].

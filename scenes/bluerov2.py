@@ -2,7 +2,8 @@
 
 Source: von Benzon et al. 2022, "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot",
 J. Mar. Sci. Eng. 10, 1898, Table A1. That paper's body axes are x forward, y right, z down; here they are x forward,
-y left, z up, about the centre of gravity, so y and z change sign (the horizontal thrusters are 0.085 m BELOW it).
+y left, z up, about the centre of gravity, so y and z change sign (the horizontal thrusters are 0.085 m below
+the centre of gravity).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def _array(*rows: object) -> Array:
-    """Returns a read-only array."""
+    """Returns the rows as a read-only array."""
     values = np.array(rows, dtype=np.float64)
     values.setflags(write=False)
     return values

@@ -16,7 +16,7 @@ from scenes.gl import MjSpec, mujoco
 from terrains import Terrain
 from twin.core.grid_triangles import grid_triangles
 
-TILE_CELLS = 48  #: cells along a tile; measured: smaller tiles cost state changes, larger ones vertices out of view
+TILE_CELLS = 48  #: side of a tile; measured: smaller tiles cost state changes, larger ones unseen vertices
 MAX_TILES = 900  #: MuJoCo supports at most 1000 textures
 MARGIN_TEXELS = 16  #: margin of neighbouring texture around each tile: enough to filter 4 mip-map levels
 FLOOR_GROUP = 0
@@ -43,7 +43,7 @@ def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
 
 
 def tile_cells(n_rows: int, n_cols: int) -> int:
-    """Returns the cells along a tile's side: TILE_CELLS, or more where that would exceed MAX_TILES tiles."""
+    """Returns the number of cells along a tile's side: TILE_CELLS, or more if that gave over MAX_TILES tiles."""
     cells = TILE_CELLS
     while -(-n_rows // cells) * -(-n_cols // cells) > MAX_TILES:
         cells += 16
@@ -51,7 +51,7 @@ def tile_cells(n_rows: int, n_cols: int) -> int:
 
 
 def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
-    """Adds the tile of these grid nodes: texture, material, mesh and geom."""
+    """Adds the tile of the given grid rows and columns: texture, material, mesh and geom."""
     name = f"floor_{rows.start}_{cols.start}"
     texture, texcoord = _tile_texture(terrain, rows, cols)
     image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)

@@ -21,7 +21,7 @@ def _configure_egl() -> str:
     PyOpenGL 3.1.0, which pyrender pins, lacks the type EGLDeviceEXT that MuJoCo needs; it is an opaque pointer.
 
     Returns:
-        Why EGL cannot be loaded; "" if it can, or if another backend is selected.
+        Reason why EGL cannot be loaded; "" if it can, or if another backend is selected.
     """
     if sys.platform != "linux" or os.environ.setdefault("MUJOCO_GL", "egl").strip().lower() != "egl":
         return ""
@@ -70,5 +70,5 @@ def offscreen_context(width_px: int, height_px: int) -> Any:
 
 def _opengl_missing(reason: str) -> TwinError:
     """Returns the error that reports missing OpenGL and the command that installs it."""
-    allowed = f"a working EGL, on Debian or Ubuntu by: {INSTALL_LINE}"
+    allowed = f"a working EGL; on Debian or Ubuntu, install it with: {INSTALL_LINE}"
     return TwinError("rendering", f"no OpenGL on this machine: {reason}", allowed)

@@ -39,7 +39,7 @@ def generate(
         texture_px_m: side of a texel.
         seed: seed of shape and texture.
     Raises:
-        TwinError: the kind is unknown, or the terrain too large for memory.
+        TwinError: the kind is unknown, or the terrain is too large for memory.
     """
     if kind not in KINDS:
         raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
@@ -66,7 +66,7 @@ def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
 
 
 def _ripples(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates asymmetric ripples with meandering crests, height up to 0.1 wavelength, on broad undulations."""
+    """Generates asymmetric ripples with meandering crests and heights up to 0.1 wavelength, on broad undulations."""
     length_m = max(0.35, 8 * grid_m)
     crest_m = min(0.1 * length_m, 0.6 * relief_m)
     row, col = np.indices(shape, dtype=np.float32)

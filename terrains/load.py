@@ -64,7 +64,7 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
         height_spacing_m: grid spacing if the file does not contain one.
         height_range_m: height difference between white and black in a PNG.
     Raises:
-        TwinError: the file is unreadable, an image, all NaN, or has a single row or column.
+        TwinError: the file cannot be read, does not contain heights, is all NaN, or has a single row or column.
     """
     if not file.is_file():
         raise TwinError(FIELD, f"no such file {str(file)!r}", ALLOWED)
@@ -82,7 +82,7 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
 
 
 def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Replaces every NaN by the nearest height; returns the heights and the number of replaced ones."""
+    """Replaces every NaN by the nearest height; returns the heights and the number of replaced values."""
     holes = ~np.isfinite(height_m)
     if not holes.any():
         return height_m, 0

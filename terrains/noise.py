@@ -41,11 +41,12 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Generates 8-bit pink noise: equal contrast in every octave, so that images have texture at any range.
 
-    It is built from the coarsest octave, doubling the size each time, at 4/3 of the cost of the finest octave.
+    Starting with the coarsest octave, the field is repeatedly doubled in size and the next octave is added. The total
+    cost is 4/3 of that of the finest octave.
 
     Args:
         shape: (rows, cols) of the result.
-        octaves: number of octaves, the finest of single texels.
+        octaves: number of octaves; the cells of the finest are single texels.
         contrast: standard deviation of one octave [grey levels].
         rng: random generator.
     Returns:

@@ -129,7 +129,7 @@ def test_clearance_ignores_the_floor_out_of_view_and_reports_a_path_outside_the_
         (
             {"speed_mps": 60.0},
             "plan.speed_mps",
-            "plan.speed_mps: 60 is too fast: keyframes less than one frame apart (allowed: below ",
+            "plan.speed_mps: 60 is too fast: less than one frame per keyframe (allowed: below ",
         ),
         ({"altitude_m": 0.0}, "plan.altitude_m", "plan.altitude_m: the camera has no footprint (allowed: above 0)"),
         ({"focal_px": np.inf}, "rig.hfov_deg", "rig.hfov_deg: the camera has no footprint (allowed: above 0)"),

@@ -149,14 +149,14 @@ def test_clearance_ignores_the_corners_of_the_square_but_not_the_inside_of_a_loo
     [
         (
             {"area_m": (10.0, 8.0)},
-            "plan.area_m: 10 x 8 m: loops cover a disc (allowed: the disc's diameter for both, as in [8, 8])",
+            "plan.area_m: 10 x 8 m: loops need a square area (allowed: the disc's diameter for both, as in [8, 8])",
         ),
         ({"tracks": 35}, "plan.tracks: 35 is too many: 34 fill the area at this overlap (allowed: 0 to 34)"),
         ({"altitude_m": 0.0}, "plan.altitude_m: the camera has no footprint (allowed: above 0)"),
         ({"overlap_across": 1.0}, "plan.overlap_across: 1 (allowed: between 0 and 1, both excluded)"),
         (
             {"frame_rate_hz": 0.1},
-            "plan.speed_mps: 0.594604 is too fast: keyframes less than one frame apart (allowed: below 0.0625)",
+            "plan.speed_mps: 0.594604 is too fast: less than one frame per keyframe (allowed: below 0.0625)",
         ),
     ],
 )

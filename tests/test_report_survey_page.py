@@ -128,7 +128,7 @@ def test_metrics_without_stages_and_links_have_a_report(folder):
     assert (
         '<section id="network">' in page
         and '<section id="stages">' not in page
-        and "Eq. (2) takes the depth" not in page
+        and "Eq. (2) treats the depth" not in page
     )
 
 

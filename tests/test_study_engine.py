@@ -108,7 +108,7 @@ def test_a_pipe_is_closed_only_once_when_the_pool_is_closed_during_a_task():
 
 def test_an_unreachable_scheduler_is_reported(monkeypatch):
     monkeypatch.setattr("twin.study.dask_engine._CONNECT_TIMEOUT_S", 0.5)
-    with pytest.raises(TwinError, match=r"--scheduler: nowhere:1 does not answer: .*e\.g\. tcp://host:8786\)"):
+    with pytest.raises(TwinError, match=r"--scheduler: nowhere:1 does not respond: .*e\.g\. tcp://host:8786\)"):
         with open_engine(scheduler="nowhere:1"):
             pass
 

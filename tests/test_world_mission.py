@@ -9,7 +9,7 @@ from twin.world.mission import prepare
 BAD_BEACONS = [
     (
         '[navigation]\naiding = ["beacons"]',
-        ["3: navigation.aiding: 'beacons': the scenario has none (allowed: with a [[beacons]] position_m)"],
+        ["3: navigation.aiding: 'beacons': the scenario defines no beacon (allowed: with a [[beacons]] section)"],
     ),
     (
         "[[beacons]]\nposition_m = [0, 0, 1]\n[[beacons]]\nposition_m = [5, 1, 1]\n"

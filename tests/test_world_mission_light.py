@@ -32,7 +32,7 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
         (["sun.depth_m=1.5"], r"sun\.depth_m: 1\.5: the cameras are above the surface \(allowed: more than 2\)"),
         (
             ["lamps.0.position_m=[0.25, 0.35, -2.0]"],
-            r"lamps\.0\.position_m: is 0\.\d\d m below the floor at x .*allowed: -1\.\d\d up or more",
+            r"lamps\.0\.position_m: is 0\.\d\d m below the floor at x .*allowed: -1\.\d\d or more for z \(up\)",
         ),
     ],
 )

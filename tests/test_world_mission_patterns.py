@@ -91,7 +91,7 @@ def test_a_kinematic_vehicle_has_the_commanded_horizontal_velocity():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["plan.area_m=[2.0, 1.0]"], "--set: plan.area_m: 2 x 1 m: loops cover a disc (allowed: the disc's diameter"),
+        (["plan.area_m=[2.0, 1.0]"], "--set: plan.area_m: 2 x 1 m: loops need a square area (allowed: the disc"),
         (["plan.area_m=[7.0, 7.0]"], "--set: plan.area_m: 7 x 7 m is larger than the terrain (allowed: up to 6.00 x"),
         # sideways the vehicle is slower than ahead; on a disc of 3 m only the wish is too fast
         (["plan.speed_mps=0.7"], "--set: plan.speed_mps: 0.7: too fast for the thrusters (allowed: up to 0.63)"),

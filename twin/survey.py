@@ -29,10 +29,10 @@ def run(
     """Flies a scenario and writes a run folder; an aborted survey keeps its partial results.
 
     Args:
-        out: the run folder.
-        progress: called with the progress after every frame.
-        live: show the survey in Rerun while it runs.
-        outputs: pictures to draw at the end, of "report" and "recording"; None writes metrics only.
+        out: run folder.
+        progress: function called with the progress after every frame.
+        live: whether to show the survey in Rerun while it runs.
+        outputs: outputs to write at the end ("report", "recording"); None: metrics only.
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
@@ -57,7 +57,7 @@ def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[
     """Runs the closed loop: the pilot steers by the estimates, and its commands move the true vehicle.
 
     Args:
-        observe: called with every estimate and its frame.
+        observe: function called with every estimate and its frame.
     """
     pilot = make_pilot(mission)
     fast_forward = world.fast_forward(navigator, pilot)

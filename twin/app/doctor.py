@@ -1,6 +1,6 @@
 """Checks of this machine: Python, packages, rendering and disk, each with the command that fixes a failure.
 
-`python -m twin.app.doctor` renders one image: a process of its own, because a broken driver can crash it.
+`python -m twin.app.doctor` renders one image. It runs in a process of its own, which a broken driver can crash.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Check(NamedTuple):
 
     Args:
         name: what was checked.
-        ok: whether it is sufficient.
+        ok: whether the check passed.
         found: version, size or error message.
         remedy: command or action that fixes a failure.
     """
@@ -54,7 +54,7 @@ def check_machine(folder: Path) -> list[Check]:
 
 
 def check_rendering() -> Check:
-    """Returns whether OpenGL renders an image without a screen."""
+    """Checks whether OpenGL renders an image without a screen."""
     try:
         command = [sys.executable, "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)

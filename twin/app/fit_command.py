@@ -20,12 +20,12 @@ def run(files: Sequence[str], out: Path, runs: Path) -> int:
     """Flies the rendered surveys of the studies, fits the error model to them and writes it.
 
     Args:
-        files: studies; the built-in ones if empty.
+        files: study files; the built-in studies if empty.
         out: error model to write (TOML).
         runs: folder of the rendered surveys; finished ones are reused.
 
     Returns:
-        the exit status.
+        The exit status.
 
     Raises:
         TwinError: a study is invalid, or too few surveys are complete.

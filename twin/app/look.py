@@ -19,7 +19,7 @@ from twin.world.rendered_world import RenderedWorld
 
 #: Side of the window in which contrast is computed, as a fraction of the image width.
 WINDOW_SHARE = 1 / 20
-#: A channel with this value or more is saturated [of 255].
+#: A channel is saturated at this value or above [grey levels, 0 to 255].
 SATURATED = 255
 
 _LABELS = {
@@ -38,7 +38,7 @@ class ViewLayers(NamedTuple):
     Args:
         world_from_left: (4, 4) pose of the left camera.
         stereo_pair: the stereo pair, with noise.
-        decomposed: the left image without noise, and the light that it consists of.
+        decomposed: the left image without noise, and its components of light.
     """
 
     world_from_left: Array
@@ -135,7 +135,7 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
 
 
 def _exposure(decomposed: DecomposedImage) -> dict[str, float]:
-    """Returns exposure time and analogue gain of a physical sensor; empty for the plain sensor."""
+    """Returns exposure time and analogue gain of a physical sensor; empty without a [sensor] section."""
     if decomposed.raw is None:
         return {}
     return {"exposure_ms": 1000 * decomposed.setting.exposure_s, "analogue_gain": decomposed.setting.analogue_gain}

@@ -30,7 +30,7 @@ class Panel(NamedTuple):
     Args:
         title: name of the layer.
         unit: unit of the values.
-        values: minimum, median and maximum of these are printed; NaN is ignored.
+        values: values whose minimum, median and maximum are printed; NaN is ignored.
         picture: (H, W, 3) colours from 0 to 1, or (H, W) values for the colour map.
         note: text in the corner of the picture.
         colours: name of the colour map, and the values at its ends.
@@ -107,8 +107,8 @@ def _light(
     """Returns the panel of one layer of the image formation, shown in colour.
 
     Args:
-        gain: gain of the image; the panel is as bright as in the image, or scaled by the factor in the note. 0: the
-            layer is not part of the image, and the note gives the value shown as white.
+        gain: gain of the image. The panel is as bright as in the image, or scaled by the factor in the note.
+            If 0, the layer is not part of the image, and the note gives the value shown as white.
         percentile: percentile of the layer that is shown as white.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0

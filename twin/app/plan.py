@@ -1,4 +1,4 @@
-"""Forecast of a survey without simulation: its figures and a picture of the plan."""
+"""Prediction of a survey from its plan, without simulation: a table of numbers and a picture."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from twin.world.mission import Mission
 #: Standard deviation of the disparity on good texture [px]; the predicted depth error is proportional to it.
 DISPARITY_SIGMA_PX = 0.1
 _SHADE_SAMPLES = 400
-#: Name of a swath of each pattern, and the swaths of a track.
+#: For each pattern: name of a swath, and the swaths that make up a track.
 _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
 def numbers(mission: Mission) -> list[tuple[str, str]]:
-    """Returns the figures of a plan as (name, value) pairs, each after those that it depends on."""
+    """Returns the numbers of a plan as (name, value) pairs; each comes after the numbers from which it is computed."""
     f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     width_m, height_m = f.footprint_m
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]

@@ -22,7 +22,7 @@ SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
 
 class StudyOptions(NamedTuple):
-    """Options of the command line."""
+    """Command-line options of `twin study` and `twin tune`."""
 
     out: Path | None = None
     jobs: int | None = None
@@ -38,11 +38,11 @@ class StudyOptions(NamedTuple):
 
 @contextmanager
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """Yields an engine, and stops the workers that it has started at the end.
+    """Yields an engine; stops the workers that it started when the context ends.
 
     Args:
         jobs: number of local processes or SLURM jobs; one per core if not given.
-        scheduler: None for processes of this machine; "slurm" for SLURM jobs; else the address of a running Dask
+        scheduler: None for processes on this machine; "slurm" for SLURM jobs; else the address of a running Dask
             scheduler, e.g. tcp://host:8786, whose workers must have this package installed.
 
     Raises:
@@ -69,7 +69,7 @@ def run(file: str, options: StudyOptions) -> int:
     """Runs a study and prints its results; returns the exit status.
 
     Raises:
-        TwinError: a bad study file or option; nothing was flown.
+        TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load_study(file)
     folder = (options.out or Path("runs") / f"study-{study.name}").absolute()  # workers have other working folders
@@ -89,7 +89,7 @@ def tune(file: str, options: StudyOptions) -> int:
     """Runs the search of a study file and prints the recommended plan; returns the exit status.
 
     Raises:
-        TwinError: a bad study file or option; nothing was flown.
+        TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load_study(file)
     config = tuning.tuning_config(study)

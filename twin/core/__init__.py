@@ -1,1 +1,1 @@
-"""The types that every room shares."""
+"""Types, geometry and settings shared by all packages."""

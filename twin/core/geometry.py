@@ -23,8 +23,8 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 def copy_into(target: Array, values: Array) -> None:
     """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
-    Numba's own slice assignment compiles an error message for unequal shapes into every caller, a third of all
-    compiled code.
+    Numba's own slice assignment compiles an error message for unequal shapes into every caller, which was a
+    third of all compiled code.
     """
     for i in range(target.shape[0]):
         if target.ndim == 1:
@@ -109,7 +109,7 @@ def product(a: Array, b: Array) -> Array:
 def nearest_rigid(matrices: Array) -> Array:
     """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    Removes rounding errors from long products of motions: `inverse` doubles a deviation from orthogonality.
+    Removes rounding errors from long products of motions: `inverse` doubles an orthogonality error.
     """
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
@@ -229,7 +229,7 @@ def log_derivative(motion: Array) -> Array:
     """Returns the inverse right Jacobian (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) = motion + J d.
 
     For the rotation alone it is I + K / 2 + c K^2 with K = skew(w). A motion is a rotation by the dual vector w + e v,
-    so the block of translation by rotation is the derivative of that matrix along v (Selig 2005).
+    so the lower left block (translation from rotation) is the derivative of that matrix along v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
     c, slope = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])

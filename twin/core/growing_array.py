@@ -17,8 +17,8 @@ class GrowingArray:
     than the copies of a growing one.
 
     Args:
-        shape: of one row; nothing for scalars.
-        dtype: of the elements.
+        shape: shape of one row; omitted for scalars.
+        dtype: type of the elements.
     """
 
     def __init__(self, *shape: int, dtype: DTypeLike = float):

@@ -1,4 +1,4 @@
-"""Interpolation kernels between the pixels of an image, compiled.
+"""Compiled kernels that interpolate between the pixels of an image.
 
 All kernels take the position between the middle two samples as a fraction in [0, 1).
 """
@@ -31,10 +31,10 @@ def catmull_rom(a, b, c, e, t):
 
 @njit(cache=True, nogil=True, inline="always")
 def bicubic_with_gradient(image, x, y):
-    """Returns the Catmull-Rom value of an image at (x, y) and its derivatives by x and y.
+    """Returns the Catmull-Rom value of an image at (x, y) and its derivatives with respect to x and y.
 
     (x, y) lies inside the image; samples beyond the border repeat the border pixel. On an exact row, as in rectified
-    stereo, the derivative by y is the central difference.
+    stereo, the derivative with respect to y is the central difference.
     """
     height, width = image.shape
     i, j = int(x), int(y)
@@ -53,7 +53,7 @@ def bicubic_with_gradient(image, x, y):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def bspline_weights(s):
-    """Returns the weights of four cubic B-spline coefficients at float32 fraction s between the middle two."""
+    """Returns the weights of four cubic B-spline coefficients at a fraction s (float32) between the middle two."""
     one, sixth = np.float32(1), np.float32(1 / 6)
     left, right = (one - s) * (one - s) * (one - s) * sixth, s * s * s * sixth
     middle = np.float32(2 / 3) - s * s * (one - s * np.float32(0.5))

@@ -1,4 +1,4 @@
-"""Measured motions between nodes of the keyframe network, as single records and as columns."""
+"""Measured motions between nodes of the keyframe network, stored as single records or as columns."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Link(NamedTuple):
         overlap: fraction of image j that is visible in image i (0 to 1).
         n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
         shared_by: number of links that share the stereo observation of node j. Their errors are correlated, which `cov`
-            accounts for: it is this many times the covariance of the single measurement.
-        closed_form: (4, 4) motion by the closed form of eq. (2), with depth treated as exact; None: not computed.
+            accounts for: it is the covariance of the single measurement times this number.
+        closed_form: (4, 4) motion from the closed form of eq. (2), with depth treated as exact; None: not computed.
     """
 
     i: int
@@ -59,7 +59,7 @@ class Links(Sequence[Link]):
 
     @classmethod
     def from_sequence(cls, links: Sequence[Link]) -> Links:
-        """Returns the links as columns; the argument itself if it is stored so already."""
+        """Returns the links stored as columns; the argument itself if it is a `Links` already."""
         return links if isinstance(links, cls) else cls(links)
 
     def add(self, links: Iterable[Link]) -> None:

@@ -26,7 +26,7 @@ class StereoRig:
         width_px, height_px: image size.
         focal_px: focal length along the rows of the image (fx).
         baseline_m: distance between the cameras.
-        frame_rate_hz: nominal number of frames per second; the times of the frames count where they differ from it.
+        frame_rate_hz: nominal number of frames per second; the times of the frames take precedence.
         body_from_camera: (4, 4) pose of the left camera in the vehicle's body.
         focal_y_px: focal length along the columns of the image (fy); equal to `focal_px` by default.
         principal_point_px: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
@@ -77,7 +77,7 @@ class StereoRig:
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
-        """Returns the rig of images whose pixels are blocks of `by` x `by` pixels of this one."""
+        """Returns the rig of images whose pixels are blocks of `by` x `by` pixels of this rig."""
         if by == 1:
             return self
         centre = self.principal_point_px
@@ -111,14 +111,14 @@ class StereoRig:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Believed noise of the navigation sensors: standard deviations by data sheet, and surveyed beacon positions.
+    """Believed noise of the navigation sensors: standard deviations from data sheets, and surveyed beacon positions.
 
     Args:
-        pressure_m: height from pressure [m].
-        attitude_rad: roll and pitch [rad].
-        heading_rad: heading [rad].
-        dvl_mps: white noise of each axis of the velocity [m/s].
-        dvl_scale: relative scale error, constant over a survey (speed of sound, beam angles).
+        pressure_m: height from the pressure sensor [m].
+        attitude_rad: roll and pitch from the AHRS [rad].
+        heading_rad: heading from the AHRS [rad].
+        dvl_mps: white noise of each axis of the DVL velocity [m/s].
+        dvl_scale: relative scale error of the DVL, constant over a survey (speed of sound, beam angles).
         usbl_m: each axis of an acoustic position fix [m].
         beacon_px: column and row of a beacon in the image [px].
         beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
@@ -153,9 +153,9 @@ class Readings:
     Args:
         pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
         ahrs_rpy_rad: (3,) roll, pitch, yaw of the body in the world [rad].
-        dvl_mps: (3,) velocity of the body's origin over ground, in the body [m/s].
+        dvl_mps: (3,) velocity of the body's origin over ground, in body axes [m/s].
         usbl_m: (3,) position of the left camera in the world, at some keyframes [m].
-        beacons: the beacons in view, at keyframes.
+        beacons: beacons detected in the left image, at keyframes.
     """
 
     pressure_z_m: float | None = None
@@ -170,9 +170,10 @@ class Displacement(NamedTuple):
 
     Args:
         since: number of that node.
-        displacement_m: (3,) measured; the scale error s, constant over the survey, makes it 1 + s times the true
-            displacement.
-        cov: (3, 3) covariance by the white noise of the DVL and the attitude error since the node; without scale error.
+        displacement_m: (3,) measured displacement [m]: 1 + s times the true one, with the scale error s, which is
+            constant over the survey.
+        cov: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node,
+            without the scale error.
     """
 
     since: int
@@ -188,7 +189,7 @@ class Frame:
         index: number of the frame, from 0.
         time_s: time of the exposure [s].
         left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
-        readings: of the navigation sensors.
+        readings: readings of the navigation sensors.
         keyframe: whether the frame becomes a keyframe; None leaves the choice to the estimator.
     """
 
@@ -206,7 +207,7 @@ class Estimate(NamedTuple):
     Args:
         time_s: time of the frame.
         world_from_camera: (4, 4) pose of the left camera, online.
-        f2f_from_start: (4, 4) pose of the left camera by frame-to-frame motion alone.
+        f2f_from_start: (4, 4) pose of the left camera from frame-to-frame motion alone.
         camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
         sigma_m: standard deviation of the online position, the root of the summed variances of x, y and z [m].
         status: "ok", or the reason why vision failed at this frame.
@@ -225,8 +226,8 @@ class Trajectory:
     """Poses of the left camera over time.
 
     Args:
-        times_s: (n,) [s].
-        world_from_camera: (n, 4, 4).
+        times_s: (n,) times [s].
+        world_from_camera: (n, 4, 4) poses.
     """
 
     times_s: Array
@@ -293,9 +294,9 @@ class SurveyResult:
     """Result of the estimators over a whole survey.
 
     Args:
-        f2f, online, final: trajectories by frame-to-frame motion alone, as estimated online, after the last alignment.
+        f2f, online, final: trajectories from frame-to-frame motion alone, estimated online, after the last alignment.
         keyframe_rows: (n_keyframes,) rows of the trajectories that are keyframes.
-        track_of_keyframe: (n_keyframes,) number of the track of each, from 1.
+        track_of_keyframe: (n_keyframes,) track number of each keyframe, from 1.
         node_cov: (n_keyframes, 6, 6) marginal covariance of each final pose [rotation, translation] in camera axes.
         keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
         links: measured motions of the network.
@@ -372,7 +373,7 @@ class Truth:
         holding: (n_frames,) bool, true during station keeping.
         track: (n_frames,) number of the track, from 1.
         height_m: (rows, cols) float32, true height at the cell centres of the survey's grid.
-        seen: (rows, cols) bool, cells that both cameras saw in at least one keyframe.
+        seen: (rows, cols) bool, cells that both cameras observed in at least one keyframe.
     """
 
     trajectory: Trajectory

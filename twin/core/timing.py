@@ -16,7 +16,7 @@ STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "networ
 
 
 class Stopwatch:
-    """Collects the durations of named stages: `with watch("f2f"): ...`."""
+    """Stopwatch that collects the durations of named stages: `with watch("f2f"): ...`."""
 
     def __init__(self) -> None:
         self._durations_s: dict[str, list[float]] = defaultdict(list)

@@ -23,12 +23,12 @@ from twin.estimate.vision.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
 
-_OUTLIER_CHI2 = 40.0  # of six degrees of freedom: exceeded by one inlier in 2 million
-_MIN_SHARE_OF_WORST = 0.01  # links with a chi2 below this share of the largest one are not removed in the same round
+_OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; exceeded by one inlier in 2 million
+_MIN_SHARE_OF_WORST = 0.01  # links with a chi2 below this fraction of the largest are not removed in the same round
 _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
-_ROUND_ITERATIONS = 10  # per round: with gross outliers in the graph, the Huber weights converge slowly
-_HUBER = 3.0  # standard deviations
+_ROUND_ITERATIONS = 10  # iterations per round; the Huber weights converge slowly while the graph has gross outliers
+_HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
 class AlignmentResult(NamedTuple):
@@ -53,17 +53,17 @@ def align(
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
 ) -> AlignmentResult:
-    """Aligns a window of nodes.
+    """Computes the maximum-likelihood poses of a window of nodes.
 
     Args:
         nodes: nodes of the window; their poses are the initial values.
         links: motions between nodes of the window.
-        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node, by number.
+        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node (rad, m), by node number.
         rig, noise: nominal calibration.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
-        LinAlgError: links and readings do not constrain every node.
+        LinAlgError: the links and the sensor readings do not constrain every node.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     graph = _factor_graph(nodes, links, anchors, rig, noise)
@@ -86,7 +86,7 @@ def align(
 
 
 class _Window(NamedTuple):
-    """Links of a window of nodes, and its factor graph, whose first binary factors are these links."""
+    """Window of nodes: its links and its factor graph, whose first binary factors are these links."""
 
     links: Links
     index_of: dict[int, int]
@@ -99,14 +99,14 @@ class _Window(NamedTuple):
     def outliers(self, chi2: Array) -> Mask:
         """Returns a mask (n,) of the links to remove, given the chi2 (n,) of all links.
 
-        A large chi2 next to a much larger one may be caused by the latter; such links stay until the next round. Links
-        between consecutive keyframes are never removed.
+        If chi2 of a link is large but far below the largest, the worst link may be its cause; such a link stays until
+        the next round. Links between consecutive keyframes are never removed.
         """
         chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
 
     def without(self, outliers: Mask) -> _Window:
-        """Returns the window without these links."""
+        """Returns the window without the links marked in the mask `outliers` (n,)."""
         inliers = self.links.select(~outliers)
         binary = [adjustment.motion_factors(inliers, self.index_of, _HUBER), *self.graph.binary[1:]]
         return _Window(inliers, self.index_of, self.graph._replace(binary=binary))
@@ -132,7 +132,7 @@ def _factor_graph(
 
 
 def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the nodes with these numbers, zeros for others; None: of all."""
+    """Returns the marginal covariances (n, 6, 6) of the nodes with these numbers (all if None), zeros for others."""
     if numbers is None:
         return solution.marginals_in_place()
     covs = np.zeros((len(index_of), 6, 6))

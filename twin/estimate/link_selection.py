@@ -15,12 +15,12 @@ from twin.core.records import StereoRig
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
-_SAME_SWATH = 2  # the paper's two previous keyframes on the same swath
-_NEAREST_M = 1e-3  # least depth of a visible point
+_SAME_SWATH = 2  # number of previous nodes on the same swath that are linked, as in the paper
+_NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
 class _View(NamedTuple):
-    """Intrinsics [px], image size [px], and the distance of a point from the border at which it counts as visible."""
+    """Camera intrinsics, image size, and the smallest distance of a visible point from the image border, all in px."""
 
     fx: float
     fy: float
@@ -32,7 +32,7 @@ class _View(NamedTuple):
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
-    """Returns the overlaps (n,) of a node with the left images at poses (n, 4, 4), 0 to 1.
+    """Returns the overlap (n,) of a node with the left image at each of the poses (n, 4, 4), 0 to 1.
 
     The overlap is the fraction of the node's matched points that project into the other image: it is predicted from
     poses and depth and does not assume a flat floor.
@@ -57,8 +57,8 @@ def choose_links(
     """Selects the earlier nodes that a new node is linked to.
 
     These are the two previous nodes, the farthest node of the same swath, and nodes of other swaths in the order of
-    their overlap. The farthest node of a swath gives the longest base; links to other swaths connect the legs, and the
-    oldest of them closes loops.
+    their overlap. The farthest node of a swath gives the longest baseline; links to other swaths connect the legs, and
+    the oldest of these nodes closes loops.
 
     Args:
         node: the new node.
@@ -89,18 +89,18 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
 
     All n links use the same stereo points of the node, whose noise dominates their error. Treated as independent, they
     would count one stereo observation n times, and the positions would be overconfident by a factor of about 5 in
-    variance. The covariance of each is multiplied by n.
+    variance. The covariance of each link is multiplied by n.
     """
     return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the consecutive nodes back from the newest one: the node's own swath."""
+    """Returns the unbroken run of linked nodes back from node `newest`: the rest of the swath of the new node."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """Returns up to `count` nodes of other swaths by overlap; neighbours of a chosen node come last."""
+    """Returns up to `count` nodes of other swaths, the largest overlap first; neighbours of a chosen node come last."""
     chosen: list[int] = []
     for k in others:
         if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
@@ -115,7 +115,7 @@ def _reach_m(points: Array, rig: StereoRig) -> float:
 
 @njit(cache=True, nogil=True)
 def _overlaps(world, position, poses, reach, view):
-    """Compiled kernel of `overlaps`: points (m, 3) in the world, position (3,) of the node's camera."""
+    """Compiled kernel of `overlaps`; `world` (m, 3) are points in the world, `position` (3,) is the node's camera."""
     shares = np.zeros(len(poses))
     for k in range(len(poses)):
         pose, count = poses[k], 0

@@ -26,15 +26,15 @@ from twin.estimate.vision_interface import Vision
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
 _FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are fixed
-_START_NODES = 4  # the reference position stays in the window: loops return to it
-_MOST_PENDING = 8  # nodes whose links are still being measured
+_START_NODES = 4  # first nodes, which stay in the window because loops return to the reference position
+_MOST_PENDING = 8  # largest number of nodes whose links are still being measured
 
 
 class LinkQueue:
     """Link measurements in progress, in the order of their nodes.
 
     Args:
-        background: measure in a thread of its own, worthwhile where images are processed; otherwise when collected.
+        background: True measures in a separate thread, which is faster with images; False measures in `collect`.
     """
 
     def __init__(self, background: bool):
@@ -42,7 +42,7 @@ class LinkQueue:
         self._pending: deque[Callable[[], list[Link]]] = deque()
 
     def submit(self, measure: Callable[[], list[Link]]) -> None:
-        """Adds a measurement."""
+        """Adds the measurement of the links of one node; `measure` returns these links."""
         self._pending.append(self._executor.submit(measure).result if self._executor else measure)
 
     def collect(self, all_but: int = 0) -> Iterator[list[Link]]:
@@ -72,7 +72,7 @@ class AlignmentHistory:
     """Record of the global alignments so far.
 
     Attributes:
-        alignments: cost and size of each.
+        alignments: cost and size of each alignment.
         dropped: links rejected as outliers.
         before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
     """
@@ -90,7 +90,7 @@ class KeyframeNetwork:
         vision: measures the links.
         rig, noise: believed calibration, and believed noise of the navigation sensors.
         settings: settings of the estimators.
-        stopwatch: context manager per stage name.
+        stopwatch: returns the context manager that times the stage of a given name.
     """
 
     def __init__(
@@ -147,8 +147,8 @@ class KeyframeNetwork:
 
         Args:
             chain: measured motion from the last node.
-            bridge: motion from the last node by F2F, where the measurement failed.
-            displacement: displacement since the last node by the DVL.
+            bridge: F2F motion from the last node; used where `chain` could not be measured.
+            displacement: displacement since the last node, measured by the DVL.
         """
         s = self.settings
         with self.stopwatch("network"):
@@ -168,7 +168,7 @@ class KeyframeNetwork:
         self._node_poses[len(self.nodes) - 1] = node.world_from_camera
 
     def align_window(self, track: int) -> Array | None:
-        """Aligns the window of tracks that ends with this track, and rebuilds the mosaic from the track.
+        """Aligns the window of tracks that ends with this track, and rebuilds the mosaic from this track.
 
         Returns:
             (6, 6) marginal covariance of the last node in its own axes, or None where nothing was aligned.
@@ -204,7 +204,7 @@ class KeyframeNetwork:
         return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
 
     def truncate(self, n_frames: int) -> None:
-        """Drops a keyframe whose frame was interrupted before it was recorded."""
+        """Drops the keyframe of a frame that was interrupted, so that only the first `n_frames` frames are recorded."""
         self._collect_links()
         self.keyframes = [k for k in self.keyframes if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]

@@ -1,4 +1,4 @@
-"""The method in the paper's order: F2F at every frame; stereo, F2M, network at keyframes; GA at the end of a track."""
+"""Navigation pipeline of the paper: F2F at every frame; stereo, F2M, links at keyframes; GA at the end of a track."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from twin.estimate.vision_interface import Vision
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
 _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # resampling error of the mosaic [rad, m]
-_SAME_INTERVAL = 1e-6  # relative; timestamps are rounded
+_SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
 
 
 class MotionSinceNode(NamedTuple):
     """Motion since the last node of the network.
 
     Args:
-        motion: (4, 4) pose of the camera now in the camera at the node.
+        motion: (4, 4) pose of the present camera in the camera of the node.
         cov: (6, 6) its covariance [rotation, translation] (rad, m).
         cov_at_node: (6, 6) covariance of the online pose at the node.
     """
@@ -56,12 +56,12 @@ class Navigator:
         rig: believed calibration.
         settings: settings of the estimators.
         start: (4, 4) world_from_camera of the first frame, the reference position; by default the camera is at the
-            origin with its optical axis along -z of the world. Frames that bring readings of height or attitude need a
-            world whose z axis points up.
+            origin with its optical axis along -z of the world. Readings of height or attitude require a world whose
+            z axis points up.
         readings_noise: believed noise of the navigation sensors whose readings come with the frames.
         vision: visual measurements; by default from the images of the frames.
         folder: where images of keyframes and the mosaic are kept while the survey runs; by default a temporary folder.
-        stopwatch: context manager per stage name.
+        stopwatch: returns the context manager that times the stage of a given name.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Navigator:
         """Processes one frame.
 
         A frame with `keyframe` True becomes a keyframe, one with False does not; None leaves the choice to the
-        estimator: a stereo pair becomes a keyframe where its overlap with the last one falls below
+        estimator: a stereo pair becomes a keyframe where its overlap with the last keyframe is below
         `settings.keyframe_overlap`, or where tracking failed.
 
         Args:
@@ -121,7 +121,7 @@ class Navigator:
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
 
     def align_track(self, track: int) -> None:
-        """Global alignment over the window of tracks that ends with this track; moves the online pose along."""
+        """Aligns the window of tracks that ends with this track, and moves the online pose with its last keyframe."""
         node_cov = self.network.align_window(track)
         if node_cov is not None:
             self._follow_last_keyframe(node_cov)
@@ -163,11 +163,11 @@ class Navigator:
     ) -> ElevationMap | None:
         """Builds the elevation map along the final trajectory.
 
-        Its heights are along z of the world if the first keyframe looks down within 45 degrees, otherwise along its
-        optical axis (`ElevationMap.map_from_world`).
+        Heights are along z of the world if the optical axis of the first keyframe is within 45 degrees of straight
+        down, otherwise along this axis (`ElevationMap.map_from_world`).
 
         Args:
-            grid: cells of the map; by default all that the keyframes show.
+            grid: grid of the map; by default it covers all that the keyframes show.
             progress: called with the fraction done.
 
         Returns:
@@ -195,7 +195,7 @@ class Navigator:
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the models of the sensors with a reading at every frame, for an interval between frames [s]."""
+        """Returns the models of the sensors that are read at every frame, for a given interval between frames [s]."""
         return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:
@@ -224,7 +224,7 @@ class Navigator:
         return self.network.overlap_with_last(self.filter.world_from_camera) < self.settings.keyframe_overlap
 
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
-        """Processes a keyframe: stereo, chain, F2M, mosaic, network; F2F tracking restarts from it."""
+        """Processes a keyframe: stereo, motion since the last node, F2M, mosaic, network; restarts F2F tracking."""
         row = len(self.log)
         points = self.vision.observe_stereo(frame, row)
         if points is None:
@@ -237,7 +237,7 @@ class Navigator:
         self.network.add(keyframe)
         is_node = self.network.is_node(keyframe)
         chain = self._follow_chain(keyframe) if is_node else None
-        self.filter.fuse_position_fixes(frame.readings)  # after the chain, whose error they correct
+        self.filter.fuse_position_fixes(frame.readings)  # after the motion update, whose error the fixes correct
         with self.stopwatch("f2m"):
             self._register_with_mosaic(keyframe, chain)
             keyframe.world_from_camera = self.filter.world_from_camera
@@ -250,8 +250,8 @@ class Navigator:
     def _follow_chain(self, node: Keyframe) -> Link | None:
         """Measures the motion since the last node, and replaces the F2F motion in the online pose by it.
 
-        Two stereo pairs determine the motion more accurately than the frames between them (the paper's better start
-        values for GA, section IV-5). Corrections by navigation sensors since the last node are kept.
+        Two stereo pairs determine the motion more accurately than the frames between them, and give GA better initial
+        values (section IV-5 of the paper). Corrections by navigation sensors since the last node are kept.
         """
         link = self.network.link_to_last_node(node)
         if link is None:
@@ -267,7 +267,7 @@ class Navigator:
         """Corrects the online pose by registration with the mosaic (F2M).
 
         The mosaic carries the pose error of the keyframe that was added to it, so the correction is weighted by the
-        covariance of the motion since then only.
+        covariance of the motion since that keyframe only.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
@@ -285,7 +285,7 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Links a new node to earlier nodes; to the last node by F2F motion where the measurement failed."""
+        """Links a new node to earlier nodes; to the last node by the F2F motion if `chain` is None."""
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
@@ -294,7 +294,7 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, node_cov: Array) -> None:
-        """Moves the online pose with the last keyframe after an alignment; `node_cov` (6, 6) is that of its node."""
+        """Moves the online pose with the last keyframe after an alignment; `node_cov` (6, 6) is the node covariance."""
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))

@@ -7,7 +7,7 @@ from twin.core.growing_array import GrowingArray
 
 
 class PoseLog:
-    """Times and estimated poses of all frames; memory grows by 264 bytes a frame."""
+    """Times and estimated poses of all frames; memory grows by 264 bytes per frame."""
 
     def __init__(self) -> None:
         self._times_s, self._f2f, self._online = GrowingArray(), GrowingArray(4, 4), GrowingArray(4, 4)
@@ -22,7 +22,7 @@ class PoseLog:
 
     @property
     def f2f(self) -> Array:
-        """(n, 4, 4) world_from_camera by frame-to-frame motion alone."""
+        """(n, 4, 4) world_from_camera from frame-to-frame motion alone."""
         return self._f2f.array
 
     @property

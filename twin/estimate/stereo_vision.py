@@ -25,8 +25,8 @@ from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
-_MIN_POINTS = 12  # of a keyframe
-_SAME_INTERVAL = 1e-6  # relative; timestamps are rounded
+_MIN_POINTS = 12  # smallest number of matched points of a keyframe
+_SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
 
 
 class StereoVision:
@@ -39,10 +39,10 @@ class StereoVision:
         settings: settings of the estimators.
         folder: where images of keyframes and tiles of the mosaic are kept.
         cell_m: cell of the mosaic at full image size [m]; by default the ground sample distance of the first keyframe.
-        stopwatch: context manager per stage name.
+        stopwatch: returns the context manager that times the stage of a given name.
     """
 
-    runs_in_background = True  # matching takes long enough for a thread of its own
+    runs_in_background = True  # matching takes long enough to justify a separate thread
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class StereoVision:
         self.matcher.close()
 
     def _configure(self, binning: int) -> None:
-        """Creates the tools for images of this scale."""
+        """Creates the image spool, the tracker and the matcher for images with this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
@@ -109,7 +109,7 @@ class StereoVision:
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Chooses the image scale by the first stereo pair, before anything is stored."""
+        """Chooses the image scale from the first stereo pair, before anything is stored."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
@@ -177,7 +177,7 @@ class StereoVision:
         return motions
 
     def discard(self, numbers: range) -> None:
-        """Does nothing: images are on disk."""
+        """Does nothing, because the images are stored on disk."""
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
@@ -196,9 +196,9 @@ class StereoVision:
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
-    """Returns half the side of the mosaic window [m]: 0.6 times the view at the 90th percentile of depth.
+    """Returns half the side of the mosaic window [m]: 0.6 times the width of the view at the 90th percentile of depth.
 
-    The largest depth is no measure: one mismatch of 0.5 px of disparity would demand 20 GB of mosaic.
+    The largest depth is not robust: one mismatch with a disparity of 0.5 px would require a mosaic of 20 GB.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 

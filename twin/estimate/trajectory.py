@@ -16,7 +16,7 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
     The misclosure between the frame-to-frame motion and the next keyframe is distributed linearly over the frames.
 
     Args:
-        f2f: (n, 4, 4) poses by frame-to-frame motion alone.
+        f2f: (n, 4, 4) poses from frame-to-frame motion alone.
         rows: (m,) indices of the frames that are keyframes, ascending.
         keyframe_poses: (m, 4, 4) their aligned poses.
 
@@ -42,9 +42,9 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
 
 @njit(cache=True, nogil=True)
 def _distribute(world_from_start, f2f, misclosure, out):
-    """Fills `out` (n, 4, 4) with the poses f2f moved by `world_from_start`, each with its share of the misclosure (6,).
+    """Fills `out` (n, 4, 4) with `f2f` moved by `world_from_start`, each pose with its fraction of the misclosure (6,).
 
-    The share of pose k is k / n: the frame after the last one would have the whole misclosure.
+    The fraction of pose k is k / n, so the frame after the last one would have the whole misclosure.
     """
     step = 1 / len(f2f)
     for k in range(len(f2f)):

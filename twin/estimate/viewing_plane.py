@@ -13,8 +13,8 @@ _MAX_TILT_RAD = np.deg2rad(45.0)  # up to this angle from straight down, heights
 def viewing_plane(world_from_camera: Array) -> Array:
     """Returns plane_from_world (4, 4): axes in which a camera looks down on the plane z = 0.
 
-    The identity for a camera (4, 4) that looks down within 45 degrees; otherwise the smallest rotation about the
-    origin that turns its optical axis to -z.
+    This is the identity if the optical axis of the camera (4, 4) is within 45 degrees of straight down; otherwise it
+    is the smallest rotation about the origin that turns the optical axis to -z.
     """
     axis = world_from_camera[:3, 2]
     angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))

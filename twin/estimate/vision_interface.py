@@ -22,7 +22,7 @@ class Vision(Protocol):
 
     Attributes:
         stereo_observations: image quality of every stereo pair so far.
-        runs_in_background: whether `measure_motions` takes long enough for a thread of its own.
+        runs_in_background: whether `measure_motions` takes long enough to justify a separate thread.
     """
 
     runs_in_background: bool
@@ -67,7 +67,7 @@ class Vision(Protocol):
         ...
 
     def discard(self, numbers: range) -> None:
-        """Releases the memory of keyframes that no further motion will be measured from."""
+        """Releases the memory of the keyframes with these numbers, which no further link will use."""
         ...
 
     def build_map(

@@ -15,7 +15,7 @@ from twin.core.records import ElevationMap, Image, MapGrid
 
 Layer = NDArray[np.float32]
 
-#: Metres east and north of the survey's own origin.
+#: Local coordinate system: metres east and north of the origin of the survey.
 LOCAL_METRES = CRS.from_wkt(
     'LOCAL_CS["local metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )

@@ -18,7 +18,7 @@ MAX_VERTICES = 400_000
 
 
 def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> None:
-    """Writes the mapped cells as a surface in the colours of the orthomosaic; a map without cells as an empty scene."""
+    """Writes the mapped cells as a surface in the orthomosaic's colours; a map without cells gives an empty scene."""
     mesh = map_mesh(elevation_map, max_vertices)
     scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
     path.write_bytes(export_glb(scene))

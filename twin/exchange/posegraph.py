@@ -1,6 +1,6 @@
-"""Pose graph files: writes the keyframe network as g2o, reads g2o and TORO files as links.
+"""Pose graph files: writing the keyframe network as g2o, reading g2o and TORO files as links.
 
-Rotational information is taken per radian squared of the rotation vector, as GTSAM reads g2o files. g2o itself
+The information of a rotation refers to the rotation vector [1/rad^2], as in GTSAM's reader of g2o files. g2o itself
 defines it for the vector part of the quaternion (half the angle), which gives four times the value.
 """
 
@@ -119,7 +119,7 @@ def _pose_of_euler_angles(values: Array) -> tuple[Array, Array]:
     return geometry.pose(geometry.rotation_from_rpy(*values[3:]), values[:3]), np.linalg.inv(rates)
 
 
-#: Number of values of the pose of each tag, and the function that parses them.
+#: Number of values of the pose in a line, and the function that parses them, by tag.
 _POSE_FORMATS = {
     "VERTEX_SE3:QUAT": (7, _pose_of_quaternion),
     "EDGE_SE3:QUAT": (7, _pose_of_quaternion),
@@ -134,6 +134,6 @@ def _pose_texts(poses: Array) -> list[str]:
 
 
 def _row_texts(rows: Array, number_format: str) -> list[str]:
-    """Returns each row of numbers (n, k) as text, separated by blanks."""
+    """Returns each row of numbers (n, k) as text, separated by spaces."""
     line = " ".join([number_format] * rows.shape[1]) + "\n"
     return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()

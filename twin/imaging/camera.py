@@ -1,4 +1,4 @@
-"""Stereo camera of the simulation: renders, lights and exposes the images of a pose."""
+"""Stereo camera of the simulation: renders, illuminates and exposes the images at a pose."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ class StereoCapture(NamedTuple):
 
 
 class DecomposedImage(NamedTuple):
-    """The left image with the quantities that it is computed from.
+    """Left image with the quantities from which it is computed.
 
     Args:
-        albedo: (H, W, 3) uint8.
-        depth: (H, W) along the optical axis [m].
-        components: radiance by origin.
+        albedo: (H, W, 3) uint8, 255 = white.
+        depth: (H, W) depth along the optical axis [m].
+        components: radiance, separated by origin.
         setting: exposure, metered on this image.
-        noise_free: the image without noise.
-        raw: digital numbers of a physical sensor with the noise of the next capture, (H, W) behind a Bayer filter, else
-            (H, W, 3); None for the plain sensor.
+        noise_free: (H, W, 3) image without noise.
+        raw: digital numbers of the physical sensor with the noise of the next capture: (H, W) with a Bayer filter,
+            otherwise (H, W, 3); None for the plain sensor.
     """
 
     albedo: Image
@@ -61,20 +61,20 @@ class DecomposedImage(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Signal per radiance on the axis [1 / (cd/m2)]; a signal of 1 saturates."""
+        """Signal per radiance on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
         return self.setting.gain
 
 
 class StereoCamera:
-    """Two cameras that share one auto-exposure; their image noise is independent.
+    """Stereo camera whose two cameras share one auto-exposure; their image noise is independent.
 
     Args:
-        renderer: renders albedo and depth of the floor.
-        image_formation: computes the radiance in the water.
+        renderer: renderer of albedo and depth of the floor.
+        image_formation: model of the radiance that reaches the cameras through the water.
         scenario: sensor settings.
         left_rng, right_rng: random streams of the image noise.
-        stopwatch: measures the time of rendering and optics.
-        true_cameras: geometry of the true cameras; None for that of the scenario.
+        stopwatch: timer of the stages rendering and optics.
+        true_cameras: geometry of the true cameras; None = the geometry that the scenario defines.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class StereoCamera:
     def _expose(
         self, pose: StampedPose, camera: int, twist_body: Array, setting: ExposureSetting | None
     ) -> tuple[Image, Depth, ExposureSetting]:
-        """Returns image, true depth and exposure of a camera; the exposure is metered here where `setting` is None."""
+        """Returns image, true depth and exposure of a camera; meters the exposure if `setting` is None."""
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
         with self._stopwatch("render"):
             albedo, depth = self._renderer.render(world_from_camera)

@@ -1,9 +1,9 @@
 """Caustics: bright moving lines on the floor where the waves of the surface focus the sunlight.
 
-The surface is a sum of waves that are periodic in a square tile. A ray from the zenith meets the surface where its
-slope is s, is refracted by (1 - 1/n) s for small slopes, and reaches the floor at a horizontal distance of
-(1 - 1/n) s D. Every ray keeps its light and lands in the tile, so that the mean of the pattern is one. The pattern is
-blurred by the angular size of the sun and by scattering in the water (small-angle theory of Wells, as in
+The surface is a sum of waves that are periodic in a square tile. A vertical ray that meets the surface at a small slope
+s is refracted by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a floor at depth D with a
+horizontal displacement of (1 - 1/n) s D. No ray leaves the periodic tile, so that the mean of the pattern is 1. The
+pattern is blurred by the angular size of the sun and by scattering in the water (small-angle theory of Wells, as in
 `forward_scatter`), so that it fades with depth.
 """
 
@@ -20,21 +20,21 @@ from twin.imaging.water import Medium
 
 Array = NDArray[np.float64]
 
-TILE_M, CELLS = 4.0, 128  # side of the tile [m] and [cells]; the latter is a power of two
-RAYS = 2  # per side of a cell
+TILE_M, CELLS = 4.0, 128  # side of the tile [m]; number of cells per side, a power of two
+RAYS = 2  # number of rays per side of a cell
 WAVELENGTHS_M = (0.3, 3.0)
-SLOPE_RMS = 0.08  # of a surface under a light breeze
+SLOPE_RMS = 0.08  # RMS slope of a surface under a light breeze
 WATER_INDEX, GRAVITY_MPS2 = 1.339, 9.81
 SUN_RAD = 0.0047 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
-STREAM = 1 << 16  # key of the random stream of the waves
+STREAM = 1 << 16  # key of the random stream for the waves
 
 
 class Caustics:
     """Caustics of one survey, on a horizontal plane at the depth of the reference plane.
 
     Args:
-        illumination: water, depth of the reference plane, and the share of the daylight that is focused; the rest is
-            diffuse light of the sky and uniform.
+        illumination: water, depth of the reference plane, and the fraction of the daylight that is focused; the rest is
+            diffuse light from the sky and uniform.
         seed: seed of the scenario.
     """
 
@@ -46,11 +46,11 @@ class Caustics:
         kx, ky = np.meshgrid(per_m, per_m)
         k = np.hypot(kx, ky)
         in_band = (k >= 2 * np.pi / WAVELENGTHS_M[1]) & (k <= 2 * np.pi / WAVELENGTHS_M[0])
-        # equal slope variance in each octave; most of it downwind (east), none upwind
+        # slope variance is equal in each octave; most waves run downwind (east), none upwind
         weight = np.where(in_band & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
         height = np.sqrt(weight) * (rng.normal(size=k.shape) + 1j * rng.normal(size=k.shape))
-        height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # the mean square of a wave is 1/2
-        # columns beyond the shortest wave are zero
+        height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # the mean square of a sine is 1/2
+        # columns with waves below the shortest wavelength are zero and not stored
         columns = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))
         self._omega = np.sqrt(GRAVITY_MPS2 * k[:, columns])
         # 0.5: the spectrum of a real surface is Hermitian, and only one half of it is stored
@@ -61,16 +61,16 @@ class Caustics:
         self._cached: tuple[float, NDArray[np.float32]] | None = None
 
     def pattern(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the illuminance (CELLS, CELLS) relative to its mean of 1; row = north, column = east of the origin.
+        """Returns the illuminance (CELLS, CELLS) relative to its mean of 1; rows run north, columns east.
 
-        The last pattern is kept, so that both cameras share it.
+        The last pattern is cached, because both cameras use it.
         """
         if self._cached is None or self._cached[0] != time_s:
             self._cached = time_s, self._compute(time_s)
         return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Returns the slopes (CELLS, CELLS) of the surface to the east and to the north."""
+        """Returns the slopes (CELLS, CELLS) of the surface along east and along north."""
         phase = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # deep-water dispersion
         size = CELLS, CELLS
         east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
@@ -84,10 +84,15 @@ class Caustics:
 
 
 def _blur(k: Array, depth_m: float, water: Medium) -> Array:
-    """Returns the modulation transfer at wave numbers k [1/m] by the solar disc and by scattering of green light.
+    """Returns the modulation transfer function of the solar disc and of the scattering of green light.
 
-    A share exp(-t) of the light, t the optical thickness of forward scattering, is not scattered; the rest is scattered
-    n = t / (1 - exp(-t)) times on average.
+    With t the optical thickness of forward scattering, the fraction exp(-t) of the light is not scattered; the rest is
+    scattered n = t / (1 - exp(-t)) times on average.
+
+    Args:
+        k: wave numbers [rad/m].
+        depth_m: depth below the surface.
+        water: optical properties of the water.
     """
     lobe = forward_scattering(water.mean_cosine)
     thickness = lobe.share * float(water.scattering_per_m[1]) * depth_m
@@ -99,7 +104,7 @@ def _blur(k: Array, depth_m: float, water: Medium) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Adds to `light` (n, n) evenly spaced rays through the surface, each shared bilinearly among four cells."""
+    """Traces evenly spaced rays through the surface; adds each to four cells of `light` (n, n), weighted bilinearly."""
     n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
     for i in range(n):
         i1 = (i + 1) & (n - 1)

@@ -1,16 +1,17 @@
 """Forward scatter: light from the floor that the water scatters by small angles blurs the image, more with range.
 
-The share of the scattering b with an angle below a limit, b_f, keeps the light in the image. The radiance L of a floor
-at range r then arrives as L exp(-(c - b_f) r): exp(-b_f r) of it is the direct signal, L exp(-c r), and 1 - exp(-b_f r)
-of it is blurred. This is the form of McGlamery (1979) and Jaffe (1990), direct + (exp(-G r) - exp(-c r)) blurred, with
-G = c - b_f, which is a + 0.26 b here.
+Scattering by angles below a limit, with coefficient b_f < b, does not remove light from the image. The radiance L of a
+floor at range r then arrives as L exp(-(c - b_f) r): the fraction exp(-b_f r) of this is the direct signal,
+L exp(-c r), and the fraction 1 - exp(-b_f r) is blurred. This is the form of McGlamery (1979) and Jaffe (1990),
+direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f, which is a + 0.26 b here.
 
-The width follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly distributed position
-along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance s^2 / 3. The number of
-scatterings is Poisson distributed with mean b_f r; its mean over the scattered light is n = b_f r / (1 - exp(-b_f r)).
-The point spread function is a Gaussian of variance n s^2 / 3. The share of b that `water.kept_share` does not count as
-lost is subtracted from b_f, so that it is not counted twice. No light is lost at the image borders, which reflect, as
-if the floor continued. On the path from the lamps to the floor all scattered light counts as lost.
+The width of the blur follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly
+distributed position along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance
+s^2 / 3. The number of scatterings is Poisson distributed with mean b_f r; its mean over the scattered light is n =
+b_f r / (1 - exp(-b_f r)). The point spread function is a Gaussian of variance n s^2 / 3. The fraction
+`water.kept_share` of b does not count as lost in c; it is subtracted from b_f, so that it is not counted twice. The
+image is mirrored at its borders, so that no light is lost there. On the path from the lamps to the floor all scattered
+light counts as lost.
 """
 
 from __future__ import annotations
@@ -32,27 +33,32 @@ from twin.imaging.water import SEA_WATER_MEAN_COSINE, Medium, phase_function
 Array = NDArray[np.float64]
 
 FORWARD_DEG = 15.0  # light scattered by a larger angle is lost from the image
-LEVELS = 4  # of the variance: 1, 2, 4, 8 times the smallest; light in between is shared by two levels
+LEVELS = 4  # of the blur variance: 1, 2, 4, 8 times the smallest; light in between is split between two levels
 STEP_M = 0.02  # range step of the table of levels
 MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
 
 
 class ForwardScattering(NamedTuple):
-    """Forward part of the scattering: its share of b, and the variance of its angle along one axis [rad2]."""
+    """Forward part of the scattering: its fraction of b, and the variance of its angle along one axis [rad2]."""
 
     share: float
     variance_rad2: float
 
 
 def forward_scattering(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> ForwardScattering:
-    """Returns the scattering by less than `FORWARD_DEG`, integrated numerically over the phase function."""
+    """Returns the scattering by angles below `FORWARD_DEG`, from numerical integration of the phase function."""
     angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
     density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
     return ForwardScattering(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
 
 
 class ForwardScatter:
-    """Computes the forward-scattered radiance of the floor from its direct signal."""
+    """Model of the forward-scattered radiance of the floor, computed from its direct signal.
+
+    Args:
+        rig: the rendered cameras.
+        water: optical properties of the water.
+    """
 
     def __init__(self, rig: StereoRig, water: Medium):
         lobe = forward_scattering(water.mean_cosine)
@@ -71,7 +77,7 @@ class ForwardScatter:
 
         Args:
             direct: (H, W, 3) direct signal [cd/m2].
-            depth: (H, W) along the optical axis [m].
+            depth: (H, W) depth along the optical axis [m].
         """
         return self._blur(direct, depth).copy()
 
@@ -82,12 +88,12 @@ class ForwardScatter:
         in_row_bands(lambda first, end: _add(*parts, first, end), len(light))
 
     def _blur(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Same as `spread`, in an array that the next call overwrites: allocation takes as long as the computation."""
+        """Same as `spread`, but the next call overwrites the array: allocation takes as long as the computation."""
         size, (height, width) = self._bin_px, depth.shape
         bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
         scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
         in_row_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
-        # binning and bilinear interpolation between bins add a variance of their own, which is subtracted here
+        # binning and bilinear interpolation between bins add variance, which is subtracted here
         sigma = np.sqrt(np.maximum(self._variance_px2 / size**2 - (0.25 - 1 / (4 * size**2)), 1e-3))
         pairs = zip(bins, sigma, strict=True)
         blurred = np.zeros_like(bins[0])
@@ -99,29 +105,29 @@ class ForwardScatter:
 
 
 def _level_of(ratio: Array) -> Array:
-    """Returns fractional levels for variances of `ratio` times the smallest; each level doubles, linear in between."""
+    """Returns fractional levels for variances of `ratio` times the smallest: 1 per factor of two, linear in between."""
     below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
     return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 
 
 def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
-    """Returns the side of the bins for the blur [px]: the largest that divides the image and is below 0.8 sigma."""
+    """Returns the bin side [px]: the largest of 8, 4, 2 that divides the image and is below 0.8 sigma, or 1."""
     sides = [n for n in (8, 4, 2) if width_px % n == height_px % n == 0 and n < 0.8 * sigma_px]
     return sides[0] if sides else 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
 def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, end):
-    """Adds the forward-scattered light of each pixel to its bin, shared between the two levels of its range.
+    """Adds the forward-scattered light of each pixel to its bin, split between two levels of the blur variance.
 
-    Fills rows `first` to `end` of the bins. Light is computed for each pixel, its level for the mean range of a bin.
+    Fills rows `first` to `end` of the bins. The light is computed per pixel, the level for the mean range of each bin.
     """
     levels, _, cols, _ = bins.shape
     width, last = depth.shape[1], level.shape[0] - 1
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     red, green, blue = np.float32(LOG2_E) * scattered_per_m
     most = np.float32(LOG2_E * MAX_LOG_GAIN)
-    # rows: light of each band, range, number of pixels with a floor
+    # rows: forward-scattered light in R, G, B; sum of ranges; number of pixels that show the floor
     of_columns, of_bins = np.empty((5, width), np.float32), np.empty((5, cols), np.float32)
     for row in range(first, end):
         of_columns[:] = zero

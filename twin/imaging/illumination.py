@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Daylight(NamedTuple):
-    """Daylight from the zenith for R, G, B.
+    """Daylight from the zenith in the bands R, G, B.
 
     Args:
         surface_lx: (3,) illuminance just below the water surface; without a surface, that on the floor.
@@ -23,7 +23,7 @@ class Daylight(NamedTuple):
         attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
         camera_depth_m: depth of the planned altitude below the surface; 0 where there is no surface.
-        focused_share: share of the daylight that the surface waves focus into caustics.
+        focused_share: fraction of the daylight that the surface waves focus into caustics.
     """
 
     surface_lx: Array
@@ -61,7 +61,7 @@ def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
     surface_lx = np.full(3, sun.illuminance_lx)
     if not sun.depth_m:
         if sun.caustics:
-            raise TwinError("sun.caustics", f"{sun.caustics:g}: there is no surface", "0, or with sun.depth_m")
+            raise TwinError("sun.caustics", f"{sun.caustics:g}: there is no surface", "0, or set sun.depth_m")
         return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0)
     if altitude_m >= sun.depth_m:
         raise TwinError(

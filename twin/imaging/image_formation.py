@@ -1,4 +1,4 @@
-"""Image formation: all radiance that reaches a camera, with shadows, forward scatter and marine snow where enabled."""
+"""Image formation: total radiance that reaches a camera, with shadows, forward scatter and marine snow if enabled."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class StampedPose(NamedTuple):
 
 
 class RadianceComponents(NamedTuple):
-    """Radiance that reaches a camera by origin, each (H, W, 3) float32.
+    """Radiance that reaches a camera, separated by origin; each array is (H, W, 3) float32.
 
     Args:
-        floor_lx: illuminance of the floor by lamps and daylight; NaN where no measurable light returns from it.
+        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where no measurable light returns from there.
         direct: radiance of the floor that was not scattered on its path to the camera [cd/m2].
         forward: radiance of the floor that was scattered forward [cd/m2]; None where forward scatter is disabled.
         backscatter: radiance of lamps and daylight that the water scatters to the camera [cd/m2].
-        snow: change of radiance by marine snow [cd/m2]; None where there is none.
+        snow: change of radiance due to marine snow [cd/m2]; None where marine snow is disabled.
         total: total radiance [cd/m2].
     """
 
@@ -47,14 +47,14 @@ class RadianceComponents(NamedTuple):
 
 
 class ImageFormation:
-    """Computes the radiance [cd/m2] for R, G, B that reaches each camera (0 left, 1 right) from albedo and depth.
+    """Model of the radiance [cd/m2] in R, G, B that reaches each camera (0 left, 1 right), given albedo and depth.
 
     Args:
         scenario: lamps, marine snow, current and enabled effects.
         illumination: water and daylight of the scenario.
         floor: heights of the floor that casts shadows.
         snow_rng: random stream of the particle positions.
-        rig: the rendered cameras, where they are not the believed rig.
+        rig: the rendered cameras; None = the believed rig.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class ImageFormation:
 
         Args:
             albedo: (H, W, 3) uint8, 255 = white.
-            depth: (H, W) along the optical axis [m]; inf where there is no floor.
+            depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
             pose: pose of the left camera and time.
         """
@@ -99,7 +99,7 @@ class ImageFormation:
         return light
 
     def components(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> RadianceComponents:
-        """Returns the radiance of `radiance`, separated by origin; arguments as there."""
+        """Returns the radiance separated by origin; the arguments are those of `radiance`."""
         lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
         direct, backscatter = self._optics.split(albedo, depth, camera, lit, surface)
         forward = None if self._forward is None else self._forward.spread(direct, depth)

@@ -16,7 +16,7 @@ from twin.scenario.model import LampConfig
 
 Array = NDArray[np.float64]
 
-#: Measured beam of an LED lamp: share of the intensity on the axis by angle from it [deg] (Song et al. 2021).
+#: Measured beam of an LED lamp: intensity relative to the axis, by angle from the axis [deg] (Song et al. 2021).
 LED_BEAM = (
     (0.0, 1.0), (10.0, 0.96), (20.0, 0.87), (30.0, 0.75), (35.0, 0.63), (40.0, 0.5), (45.0, 0.28), (50.0, 0.2),
     (60.0, 0.12), (90.0, 0.0),
@@ -24,7 +24,7 @@ LED_BEAM = (
 
 WHITE_K = 6500.0  # temperature of the black body that counts as white
 WAVELENGTHS_M = np.array([650e-9, 550e-9, 450e-9])  # centres of the bands R, G, B
-LUMINANCE_SHARES = np.array([0.2126, 0.7152, 0.0722])  # of R, G, B in white (ITU-R BT.709)
+LUMINANCE_SHARES = np.array([0.2126, 0.7152, 0.0722])  # fractions of R, G, B in the luminance of white (ITU-R BT.709)
 _HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
 
 
@@ -32,11 +32,11 @@ class LightSources(NamedTuple):
     """Lamps in the axes of one camera, and daylight along its optical axis.
 
     Args:
-        position_m: (n, 3) positions of the lamps.
+        position_m: (n, 3) positions of the lamps [m].
         axis: (n, 3) unit vectors of their beams.
         intensity_cd: (n,) luminous intensity on the axis.
         colour: (n, 3) factors of the intensity for R, G, B.
-        beam: n tables (m, 2) of angle from the axis [deg] and share of the intensity on the axis.
+        beam: n tables (m, 2) of angle from the axis [deg] and intensity relative to that on the axis.
         daylight: daylight in the water.
     """
 
@@ -70,7 +70,7 @@ def light_sources_in_camera(
 
 
 def _beam_axis(lamp: LampConfig) -> Array:
-    """Returns the unit vector of a lamp's beam in the body: straight down, then tilted to the bow, panned to port."""
+    """Returns the unit vector of a lamp's beam in the body: straight down, tilted towards the bow, panned to port."""
     tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
     return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
 
@@ -84,17 +84,17 @@ def _beam(number: int, lamp: LampConfig) -> Array:
 
 
 def beam_share(cos_angle: Array, table: Array) -> Array:
-    """Returns the intensity of a lamp as a share of that on its axis; 0 beyond the last angle of the table.
+    """Returns the intensity of a lamp relative to that on its axis; 0 beyond the last angle of the table.
 
     Args:
         cos_angle: cosine of the angle from the beam axis, of any shape.
-        table: (m, 2) angle [deg] and share, interpolated linearly.
+        table: (m, 2) angle [deg] and relative intensity, interpolated linearly.
     """
     return np.interp(np.rad2deg(np.arccos(np.clip(cos_angle, 0.0, 1.0))), *table.T, right=0.0)
 
 
 def colour(temperature_k: float) -> Array:
-    """Returns factors (3,) of a black body's light for R, G, B relative to 6500 K, at equal luminance.
+    """Returns the intensity factors (3,) of a black body for R, G, B, relative to one at 6500 K with equal luminance.
 
     Planck (1901): radiance at wavelength l is proportional to 1 / (exp(h c / (l k T)) - 1).
     """

@@ -1,6 +1,7 @@
 """Lens distortion by Brown and Conrady, in the form and order of OpenCV (Brown 1971, Close-range calibration).
 
-A ray in front of the lens has the tangents x, y; with r^2 = x^2 + y^2 its image lies at
+A ray in front of the lens has the tangents x = X / Z, y = Y / Z. With r^2 = x^2 + y^2, its distorted image coordinates,
+in units of the focal length, are
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -17,7 +18,7 @@ from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
-STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; in tangents, a millionth of a pixel is 1e-9
+STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; the tolerance is a tangent; 1e-9 is a millionth of a pixel
 
 
 class Distortion(NamedTuple):
@@ -41,7 +42,7 @@ def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Dist
 
 
 def distort(tangents: Array, lens: Distortion) -> Array:
-    """Returns the distorted image coordinates (..., 2) of rays with tangents (..., 2), by the formula of the module."""
+    """Returns the distorted image coordinates (..., 2) of rays with tangents (..., 2), by the Brown-Conrady model."""
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
@@ -55,7 +56,7 @@ def distort(tangents: Array, lens: Distortion) -> Array:
 
 
 def undistort(distorted: Array, lens: Distortion) -> Array:
-    """Returns the tangents (..., 2) of the rays seen at distorted coordinates (..., 2); NaN where the lens folds.
+    """Returns the tangents (..., 2) of the rays imaged at distorted coordinates (..., 2); NaN where none exists.
 
     Inverse of `distort` by Newton's method.
     """
@@ -72,14 +73,15 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
 def fold(lens: Distortion) -> float:
     """Returns the tangent of the angle from the axis at which the radial distortion stops increasing; inf if never."""
-    # In 1 / r^2, a coefficient of zero is no division: the slope of r (1 + k1 r^2 + ...) times 1 / r^6.
+    # The derivative of r (1 + k1 r^2 + ...), divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1,
+    # so that coefficients of zero cause no division by zero.
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(real.max())) if real.size else np.inf
 
 
 def solve(jacobian: Array, residual: Array) -> Array:
-    """Returns jacobian^-1 residual for (..., 2, 2) and (..., 2), a Newton step; not finite where it is singular."""
+    """Returns the Newton step jacobian^-1 residual (..., 2); not finite where the Jacobian (..., 2, 2) is singular."""
     (a, b), (c, d) = (jacobian[..., 0, 0], jacobian[..., 0, 1]), (jacobian[..., 1, 0], jacobian[..., 1, 1])
     with np.errstate(all="ignore"):
         x, y = d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]
@@ -87,7 +89,7 @@ def solve(jacobian: Array, residual: Array) -> Array:
 
 
 def _jacobian(tangents: Array, lens: Distortion) -> Array:
-    """Returns the Jacobian (..., 2, 2) of `distort`."""
+    """Returns the Jacobian (..., 2, 2) of `distort` with respect to the tangents."""
     x, y = tangents[..., 0], tangents[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))

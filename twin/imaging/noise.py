@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-NORMAL_BITS = 12  # random bits that index the table of normal numbers: small enough for the first-level cache
+NORMAL_BITS = 12  # random bits that index the table of normal numbers, which fits into the first-level cache
 NORMAL_MASK = (1 << NORMAL_BITS) - 1
 
 
@@ -21,13 +21,13 @@ def normal_numbers() -> NDArray[np.float32]:
 
 
 def seed_of(rng: np.random.Generator) -> np.uint64:
-    """Draws the seed from which the random numbers of one image follow."""
+    """Draws the seed of the random numbers of one image."""
     return rng.integers(1 << 64, dtype=np.uint64)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def random_bits(seed, index):
-    """Returns 64 random bits for an index in a stream: SplitMix64 (Steele, Lea & Flood 2014), in any order."""
+    """Returns the 64 random bits at an index of a stream, in any order (SplitMix64; Steele, Lea & Flood 2014)."""
     z = seed + index * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

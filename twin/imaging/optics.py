@@ -6,8 +6,8 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera th
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_sun) * exp(-c r)  +  B(r)
     B(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds, summed over lamps and the sun
 
-with d_i the distance to lamp i, psi_i the scattering angle and c the effective attenuation (`water.Medium`). There are
-no free factors. Shadows, caustics and forward scatter have modules of their own. Multiple scattering within the
+with d_i the distance to lamp i, psi_i the scattering angle and c the effective attenuation (`water.Medium`). The model
+has no free factors. Shadows, caustics and forward scatter are computed in other modules. Multiple scattering within the
 backscatter is neglected.
 """
 
@@ -34,9 +34,9 @@ Depth = NDArray[np.float32]
 Lit = NDArray[np.uint8]
 
 LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
-LEAST_TRANSMISSION = 1e-25  # below this, single precision does not resolve the floor's light
+LEAST_TRANSMISSION = 1e-25  # below this, single precision does not resolve the light of the floor
 BACKSCATTER_GRID, BACKSCATTER_RANGES, BACKSCATTER_SUBSTEPS = (16, 20), 48, 8
-BEAM_STEPS = 2048  # of sqrt(1 - cos(angle)), from 0 to 1: nearly even in the angle
+BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)), from 0 to 1: nearly even in the angle
 
 
 class WaterSurface(NamedTuple):
@@ -45,7 +45,8 @@ class WaterSurface(NamedTuple):
     Args:
         caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
             first ones. None where daylight is uniform.
-        from_camera: (3, 4) maps a point in the camera to column and row in `caustics` and depth below the surface [m].
+        from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics` and depth below the
+            surface [m].
     """
 
     caustics: NDArray[np.float32] | None
@@ -56,9 +57,9 @@ class _Tables(NamedTuple):
     """Lookup tables of the kernel for one camera.
 
     Args:
-        beams: (lamps, n) share of the intensity on the axis over even steps of sqrt(1 - cos(angle)) in [0, 1].
-        transmission: (3, n) exp(-c s) over even steps of path length.
-        backscatter: (rows, cols, 3, ranges) radiance over a coarse grid of pixels and even steps of r / (r + scale).
+        beams: (lamps, n) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)) in [0, 1].
+        transmission: (3, n) exp(-c s) at even steps of the path length s.
+        backscatter: (rows, cols, 3, ranges) radiance on a coarse grid of pixels and at even steps of r / (r + scale).
     """
 
     beams: NDArray[np.float32]
@@ -67,7 +68,7 @@ class _Tables(NamedTuple):
 
 
 class Optics:
-    """Computes the radiance [cd/m2] for R, G, B that reaches each camera (0 left, 1 right) from albedo and depth.
+    """Model of direct signal and backscatter [cd/m2] for R, G, B at each camera (0 left, 1 right).
 
     Args:
         rig: the rendered cameras.
@@ -75,14 +76,14 @@ class Optics:
         lamps: lamps on the body.
 
     Attributes:
-        light_sources: lamps and daylight in the left and in the right camera.
+        light_sources: lamps and daylight in the axes of the left and of the right camera.
     """
 
     def __init__(self, rig: StereoRig, illumination: Illumination, lamps: Sequence[LampConfig]):
         self._rig, self._medium = rig, illumination.water
         daylight = illumination.daylight
         self.light_sources = [light_sources_in_camera(rig, lamps, daylight, camera) for camera in (0, 1)]
-        # on demand, as some callers need one camera only
+        # computed on demand, as some callers need one camera only
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.light_sources[camera]))
         self._surface_lx = daylight.surface_lx
         self._loss_per_m = np.array([daylight.attenuation_per_m, self._medium.attenuation_per_m], np.float32)
@@ -96,10 +97,10 @@ class Optics:
 
         Args:
             albedo: (H, W, 3) uint8, 255 = white.
-            depth: (H, W) float32 along the optical axis [m]; inf where there is no floor, which shows backscatter only.
+            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor but only backscatter.
             camera: 0 left, 1 right.
-            lit: (lamps, H, W) uint8, 0 where the floor is in the shadow of a lamp; None without shadows.
-            surface: the water surface; None for a calm one and a camera that looks straight down from the planned
+            lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; None = no shadows.
+            surface: the water surface; None = a calm surface, and a camera that points straight down at the planned
                 altitude.
         """
         out = np.empty(albedo.shape, np.float32)
@@ -115,11 +116,11 @@ class Optics:
         surface: WaterSurface | None = None,
         direct: Radiance | None = None,
     ) -> tuple[Radiance, Radiance]:
-        """Returns the radiance of `radiance` in two parts, direct signal and backscatter.
+        """Returns the direct signal and the backscatter, each (H, W, 3) float32 [cd/m2]; `radiance` returns their sum.
 
         Args:
-            albedo, depth, camera, lit, surface: as for `radiance`.
-            direct: (H, W, 3) float32 array for the direct signal; a new one where None.
+            albedo, depth, camera, lit, surface: see `radiance`.
+            direct: (H, W, 3) float32 array to fill with the direct signal; None = a new array.
         """
         direct = np.empty(albedo.shape, np.float32) if direct is None else direct
         backscatter = np.empty(albedo.shape, np.float32)
@@ -129,9 +130,9 @@ class Optics:
     def floor_lx(
         self, depth: Depth, camera: int, lit: Lit | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where no measurable light returns from it.
+        """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where no measurable light returns from the floor.
 
-        Computed from the direct signal of a white floor, divided by the transmission to the camera.
+        It is computed from the direct signal of a white floor, divided by the transmission to the camera.
         """
         white, _ = self.split(np.full((*depth.shape, 3), 255, np.uint8), depth, camera, lit, surface)
         back = np.exp(-self._medium.attenuation_per_m * range_of(depth, self._rig)[..., None])
@@ -165,7 +166,7 @@ def range_of(depth: Depth, rig: StereoRig) -> Array:
 
 
 def backscatter_per_m(sources: LightSources, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter added per metre of range: the integrand of B in the formula of the module.
+    """Returns the backscatter added per metre of range: the integrand of B in the module docstring.
 
     Args:
         sources: lamps and daylight in the axes of the camera.
@@ -202,12 +203,12 @@ def _tables(rig: StereoRig, water: Medium, sources: LightSources) -> _Tables:
 
 
 def _transmission(per_m: Array) -> NDArray[np.float32]:
-    """Returns the transmission (3, n) over even steps of path length."""
+    """Returns the transmission (3, n) at even steps of path length."""
     return np.exp(-per_m[:, None] * np.arange(0.0, PATH_MAX_M, PATH_STEP_M)).astype(np.float32)
 
 
 def _backscatter_table(rig: StereoRig, water: Medium, sources: LightSources) -> Array:
-    """Returns the backscatter (rows, cols, ranges, 3) over a coarse grid of pixels and range; empty in clear water."""
+    """Returns the backscatter (rows, cols, ranges, 3) on a coarse grid of pixels and ranges; empty in clear water."""
     if not water.scattering_per_m.any():
         return np.zeros((0, 0, 0, 3))
     rows, cols = BACKSCATTER_GRID

@@ -17,7 +17,7 @@ from twin.imaging.sensor import Array, AutoExposure, Depth, ExposureSetting, Pla
 from twin.imaging.shutter import apply_rolling_shutter, blur_by_motion
 from twin.scenario.model import Scenario, SensorConfig
 
-BLACK_SHARE = 1 / 64  # black level as a share of the scale, so that dark noise is not clipped at zero
+BLACK_SHARE = 1 / 64  # black level as a fraction of full scale, so that dark noise is not clipped at zero
 
 
 class Sensor(Protocol):
@@ -31,11 +31,11 @@ class Sensor(Protocol):
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns the sensor of a scenario, before its first frame.
+    """Returns the sensor of a scenario in its initial state.
 
     Args:
-        scenario: with [sensor] for the physical sensor.
-        raw_rig: size and focal length of the raw images, where they are not the frames.
+        scenario: survey scenario; its section [sensor] selects the physical sensor.
+        raw_rig: rig with the size and focal length of the raw images; None = those of the frames.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
@@ -56,7 +56,7 @@ class PhotoSensor:
         self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
         self._white = self._electrons_per_cd_s.max() / self._electrons_per_cd_s
         self._tones = self._tone_table()
-        # at 1 cd/m2 and gain 1, in the most sensitive band; white balance raises the others
+        # signal at 1 cd/m2 and gain 1 in the most sensitive band; white balance amplifies the other bands
         self._signal_per_s = float(self._electrons_per_cd_s.max()) / sensor.full_well_e
         self._shortest_s, self._longest_s = sensor.exposure_min_ms / 1000, sensor.exposure_max_ms / 1000
         self._most_gain = 10 ** (sensor.gain_max_db / 20)
@@ -65,7 +65,7 @@ class PhotoSensor:
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns the exposure of a frame, metered on the frames before it."""
+        """Returns the exposure of a frame, metered on the previous frames; `light` affects the next frames."""
         gain = self._exposure.gain_for(float(_weighted_mean(light, self._vignetting).max()))
         product_s = gain / self._signal_per_s
         exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
@@ -76,7 +76,7 @@ class PhotoSensor:
 
         Args:
             light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
-            depth: (H, W) of the same image [m].
+            depth: (H, W) depth in the same image [m].
             twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
             setting: exposure of this frame.
         """
@@ -91,11 +91,11 @@ class PhotoSensor:
         return blur_by_motion(light, depth, self._focal_px, twist, setting.exposure_s)
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns an 8-bit image (H, W, 3), without noise where `rng` is None."""
+        """Returns the 8-bit image (H, W, 3) of a radiance, without noise where `rng` is None."""
         return self.develop(self.raw(light, setting, rng))
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
-        """Returns raw digital numbers: (H, W) behind a Bayer filter, else (H, W, 3)."""
+        """Returns raw digital numbers: (H, W) with a Bayer filter, otherwise (H, W, 3)."""
         return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
 
     def develop(self, raw: Raw) -> Image:
@@ -119,7 +119,7 @@ class PhotoSensor:
         )  # fmt: skip
 
     def _tone_table(self) -> NDArray[np.uint8]:
-        """Returns the tone (3, 2^bits) of every digital number of each band."""
+        """Returns the 8-bit value (3, 2^bits) of every digital number in each band."""
         signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
         return np.clip(255 * self._white[:, None] * signal + 0.5, 0, 255).astype(np.uint8)
 
@@ -141,7 +141,7 @@ def _weighted_mean(light, weights):
 
 @njit(cache=True, nogil=True)
 def _tone(raw, tones, out, first, end):
-    """Fills rows `first` to `end` of `out` with the 8-bit values of `raw` (H, W, 1 or 3), by the tone table."""
+    """Fills rows `first` to `end` of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
     _, width, bands = raw.shape
     for v in range(first, end):
         for u in range(width):

@@ -1,15 +1,15 @@
-"""Radiometry of the lens and the pixel: from luminance to vignetting, photons and electrons.
+"""Radiometry of lens and pixel: photons, electrons and vignetting for a given luminance.
 
 Light has three bands. Each band is given as the luminance [cd/m2] of the white light that it is a part of: a white
-floor under 1000 lx has 1000 / pi in every band. White is equal-energy light (CIE illuminant E); a band is the 100 nm
-around the wavelength for which the water properties are given. One lux then yields, per second and square metre of a
+floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE illuminant E); a band is the 100
+nm around the wavelength for which the water properties are given. One lux then yields, per second and square metre of a
 band,
 
     photons = width lambda / (h c Km Y),    Y = integral of V(lambda) dlambda
 
 with Km = 683 lm/W, the luminous efficacy at 555 nm, and V the photopic luminous efficiency function (CIE 1924;
-Y = 106.857 nm). The efficacy at the wavelength of each band would be wrong here: it describes three lasers, under which
-a white floor is violet.
+Y = 106.857 nm). It would be wrong to use the efficacy at the wavelength of each band: that describes the light of
+three lasers, under which a white floor looks violet.
 
 On the axis of a lens of f-number N, focused at infinity, the illuminance of the sensor is
 
@@ -38,7 +38,7 @@ BAND_WIDTH_NM = 100.0
 
 
 def photons_per_lux() -> Array:
-    """Returns the photons of white light of one lux per square metre and second, for R, G, B (3,) [1/(lx m2 s)]."""
+    """Returns the photons per square metre and second of white light at 1 lx, for R, G, B (3,) [1/(lx m2 s)]."""
     watts_per_m2 = BAND_WIDTH_NM / (LUMENS_PER_WATT * LUMINOUS_EFFICIENCY_NM)
     return watts_per_m2 * np.array(BAND_NM) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
 

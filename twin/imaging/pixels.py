@@ -48,14 +48,14 @@ def read_out(
     bayer: bool,
     rng: np.random.Generator | None,
 ) -> Raw:
-    """Returns raw digital numbers: (H, W) behind a Bayer filter (R G / G B from the top left), else (H, W, 3).
+    """Returns raw digital numbers: (H, W) with a Bayer filter (R G / G B from the top left), else (H, W, 3).
 
     Args:
         light: (H, W, 3) radiance [cd/m2].
         vignetting: (H, W) illuminance relative to the axis.
         response: response of the pixels.
         bayer: whether each pixel has one colour band only.
-        rng: random stream, one number is drawn per image; None for an image without noise.
+        rng: random stream, of which one number is drawn per image; None = no noise.
     """
     height, width = vignetting.shape
     out = np.empty((height, width, 1 if bayer else 3), np.uint16)
@@ -98,10 +98,10 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 
 @njit(cache=True, nogil=True)
 def _normal_to_poisson(expected, shot):
-    """Replaces normal numbers z in `shot` by whole electrons with the mean m, variance and skewness of Poisson's law.
+    """Replaces normal numbers z in `shot` by whole electrons with Poisson mean m, variance and skewness.
 
-    They are m + s z + (z^2 - 1) / 6, the first terms of the Cornish-Fisher expansion (1938), with s^2 = m - 1/18 - 1/12
-    to compensate the variance of the quadratic term and of the rounding.
+    The numbers are m + s z + (z^2 - 1) / 6, the first terms of the Cornish-Fisher expansion (1938), with
+    s^2 = m - 1/18 - 1/12 to compensate the variance of the quadratic term and of the rounding.
     """
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):

@@ -1,12 +1,12 @@
 """Ports of a camera housing: refraction of rays at the inner and outer face of the glass (Snell's law).
 
 All quantities are in the axes of the camera with the entrance pupil of the lens as origin; the housing is filled with
-air of refractive index 1. Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics):
-for a ray at a small angle that leaves the outer face at height h under the angle w, both proportional, the pinhole lies
-h / w in front of that face, and its focal length is that of the lens times the ratio of the angles in air and in water.
-For a flat pane at distance d, of thickness t and index g, in water of index n, this is n times the focal length,
-d (n - 1) + t (n / g - 1) behind the pupil (Treibitz et al. 2012, doi 10.1109/TPAMI.2011.105, give the errors of this
-approximation off the axis).
+air of refractive index 1. Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a
+ray at a small angle leaves the outer face at height h and angle w, both proportional to its angle in air. The pinhole
+lies at a distance h / w from that face, on the side of the camera, and its focal length is that of the lens times the
+ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g, in water of index n,
+this is n times the focal length, d (n - 1) + t (n / g - 1) behind the pupil (Treibitz et al. 2012, doi
+10.1109/TPAMI.2011.105, give the errors of this approximation off the axis).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
-STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # of Newton's method in `air_tangents`; all in tangents
+STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # of Newton's method in `air_tangents`; step and tolerance are tangents
 SMALL_RAD = 1e-4  # paraxial angle, whose cube is negligible
 
 
@@ -69,7 +69,7 @@ def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
 
 
 def air_tangents(port: PortConfig, points_m: Array) -> Array:
-    """Returns the tangents (..., 2) in air of the rays that reach points (..., 3) [m]; NaN where there is none.
+    """Returns the tangents (..., 2) in air of the rays that reach points (..., 3) [m]; NaN where no ray does.
 
     Inverse of `water_rays` by Newton's method, starting from the equivalent pinhole. The angle in air grows faster than
     that in water, so that convergence is monotonic for a flat pane.

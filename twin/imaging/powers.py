@@ -13,7 +13,7 @@ LEAST = -126.0  # smallest exponent, that of the smallest normal number in singl
 def two_to(t):
     """Returns 2^t for t up to 127 with a relative error of 2e-7; exactly 1 at 0.
 
-    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 by a minimax polynomial, 2^n by the bits of a float32.
+    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is a minimax polynomial, 2^n sets the bits of a float32.
     """
     one, t = np.float32(1.0), max(t, np.float32(LEAST))
     n = np.floor(t + np.float32(0.5))

@@ -20,7 +20,7 @@ NEAR_M = 0.05  #: near clipping plane
 class Renderer:
     """Renders the floor of a scene from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
 
-    Owns an OpenGL context: create one per process and thread, and `close` it.
+    Owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
 
     Args:
         scene: MuJoCo model of the scene.
@@ -116,7 +116,7 @@ def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
 
 
 def _floor_scene(model: MjModel) -> MjvScene:
-    """Returns a scene with the tiles of the floor, and without effects that change colours."""
+    """Returns a MuJoCo scene of the floor tiles without effects that change colours."""
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + 10)
     option = mujoco.MjvOption()
     option.geomgroup[:] = 0
@@ -131,7 +131,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns which tiles (n,) bool intersect the view frustum: those whose bounding box is not outside of one side.
+    """Returns a mask (n,) of the tiles in view: no side of the view frustum excludes their bounding box.
 
     Args:
         scene: MuJoCo model of the scene.
@@ -147,7 +147,7 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
 
 
 def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.float32) -> NDArray[np.float32]:
-    """Returns the depth [m] of OpenGL's reversed depth buffer (1 at near, 0 at far); inf where nothing is drawn.
+    """Returns the depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far); inf where nothing is drawn.
 
     1 / depth = z (1/near - 1/far) + 1/far.
     """

@@ -1,8 +1,8 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
 OpenCV's warps round positions to 1/32 px. Radiance is resampled with the B-spline itself as the response of a pixel,
-which suppresses detail of the rendering beyond half a cycle per pixel that would alias. Images of a sensor are
-interpolated: filtered first so that the spline passes through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
+which suppresses detail of the rendering beyond half a cycle per pixel that would alias. Sensor images are interpolated:
+a prefilter makes the spline pass through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [
 
 REACH_PX = 2  # support of the spline to each side
 POLE, MIRRORED = 3**0.5 - 2, 16  # of the spline's prefilter; POLE^16 is negligible in single precision
-INTERSECTION_STEPS = 4  # each multiplies the error by p / z times the floor's slope, p the ray's offset
+INTERSECTION_STEPS = 4  # each multiplies the error by p / z times the floor's slope; p, z: see `intersect`
 INTERSECTION_PX = 1e-3  # size of the last step; the remaining error is a few percent of it
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
     """Returns the radiance (h, w, 3) that pixels at these positions collect from radiance (H, W, 3).
 
-    Beyond its border the last row or column is repeated.
+    Beyond the image border the last row or column is repeated.
     """
     return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
 
@@ -50,13 +50,13 @@ def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
 def intersect(depth: NDArray[np.float32], positions: Positions, parallax_px_m: Positions) -> Positions:
     """Returns the image positions where rays that do not pass through the camera centre intersect the floor.
 
-    A ray at distance p [m] from the camera centre at depth zero is imaged f p / z away from its vanishing point, z the
-    depth of the floor at that position. 1 / z of a plane is linear in the image and is interpolated linearly.
+    A ray at distance p [m] from the camera centre at depth zero is imaged f p / z away from its vanishing point, with z
+    the depth of the floor at that position. 1 / z of a plane is linear in the image and is interpolated linearly.
 
     Args:
-        depth: (H, W) [m]; inf where there is no floor.
+        depth: (H, W) depth [m]; inf where there is no floor.
         positions: (h, w, 2) vanishing points of the rays.
-        parallax_px_m: (h, w, 2) f p.
+        parallax_px_m: (h, w, 2) product f p [px m].
     """
     out, near = np.empty_like(positions), np.reciprocal(depth)
     in_row_bands(lambda first, end: _intersect(near, positions, parallax_px_m, out, first, end), len(positions))
@@ -107,7 +107,7 @@ def _round(numbers, out, first, end):
 def _filter_columns(image, first, end):
     """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored ends.
 
-    With the pole p: 6 times the filter 1 / (1 - p z^-1), followed by -p / (1 - p z) (Unser et al. 1993).
+    Applies 6 times the filter 1 / (1 - p z^-1), then the filter -p / (1 - p z), with p the pole (Unser et al. 1993).
     """
     pole, rows = np.float32(POLE), image.shape[0]
     for k in range(first, end):

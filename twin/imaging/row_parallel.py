@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 THREADS = 2  # with more threads, synchronization costs more than it gains: an image takes milliseconds
-LEAST_ROWS = 32  # of a band; for fewer rows, waking a thread costs more than the work
+LEAST_ROWS = 32  # smallest band; for fewer rows, waking a thread costs more than the work
 
 
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1) -> None:
@@ -17,7 +17,7 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1)
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
         n_rows: number of rows.
-        pixels: image rows that each of these rows stands for.
+        pixels: number of image rows that each row stands for.
     Raises:
         Exception: any exception that `work` raises in any band.
     """
@@ -35,7 +35,7 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1)
 
 @cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Returns the threads in addition to the calling one; a forked process gets a pool of its own."""
+    """Returns the pool of threads that work next to the calling thread; a forked process gets a pool of its own."""
     return ThreadPoolExecutor(THREADS - 1, thread_name_prefix=f"bands-{process}")
 
 

@@ -1,6 +1,6 @@
-"""Sensor model by shares of full scale: auto-exposure, shot noise, read noise, saturation, 8 bits.
+"""Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8 bits.
 
-Used for a scenario without [sensor]: unlimited gain, and no exposure time.
+It is used for scenarios without [sensor]; its gain is unlimited and its exposure time zero.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ DARK_CD_M2 = 1e-6  # lower limit of the metered light
 class AutoExposure:
     """Auto-exposure: sets the gain that brings the mean of the brightest channel to `gray_level`, with a lag.
 
-    The brightest channel is used because water absorbs colours: with the mean of all channels the remaining one would
-    saturate. The gain of a frame follows from the frames before it, as in a real camera; the first frame is metered.
+    The brightest channel is used because water absorbs colours: if the mean of all channels were metered, the least
+    absorbed one would saturate. The gain of a frame follows from the previous frames, as in a real camera; that of the
+    first frame is metered on this frame.
 
     Args:
-        gray_level: target mean as a share of full scale.
+        gray_level: target mean as a fraction of full scale.
         frame_rate_hz: frames per second.
         lag_s: time constant; 0 = the gain follows within one frame.
         limits: smallest and largest gain [1 / (cd/m2)].
@@ -69,7 +70,7 @@ class ExposureSetting(NamedTuple):
     """Exposure of one frame.
 
     Args:
-        gain: signal per radiance on the axis [1 / (cd/m2)]; a signal of 1 saturates.
+        gain: signal per radiance on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
         exposure_s: exposure time; 0 for a sensor without motion blur.
         analogue_gain: amplification before digitization.
     """
@@ -87,7 +88,7 @@ class PlainSensor:
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns the exposure of a frame, metered on the frames before it."""
+        """Returns the exposure of a frame, metered on the previous frames; `light` affects the next frames."""
         return ExposureSetting(self._exposure.gain(light))
 
     def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
@@ -95,7 +96,7 @@ class PlainSensor:
         return light
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns an 8-bit image (H, W, 3), without noise where `rng` is None."""
+        """Returns the 8-bit image (H, W, 3) of a radiance, without noise where `rng` is None."""
         if rng is not None:
             return expose(light, setting.gain, self._imaging, rng)
         noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
@@ -108,8 +109,8 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
     Args:
         radiance: (H, W, 3) [cd/m2].
         gain: signal per radiance [1 / (cd/m2)]; a signal of 1 saturates.
-        imaging: standard deviation of read noise and shot noise as shares of full scale.
-        rng: random stream of this camera; one number is noise per image.
+        imaging: standard deviations of read noise, and of shot noise at full scale, as fractions of full scale.
+        rng: random stream of this camera; one number is drawn per image.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)

@@ -1,8 +1,8 @@
 """Compiled kernels of `optics`: one row of pixels at a time, in loops that the compiler can vectorize.
 
 A table lookup takes two loops over the row: the first computes the cell and the fraction within it (`lookup`), the
-second reads the table. The first loop is then vectorized. Rows of colours are indexed in memory order, for the same
-reason.
+second reads the table. This lets the compiler vectorize the first loop. For the same reason, rows of colours are
+indexed in memory order.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from twin.imaging.powers import LOG2_E, two_to
 
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the transmission tables
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
-RANGE_SCALE_M = 2.0  # of the backscatter table: even steps of r / (r + scale)
+RANGE_SCALE_M = 2.0  # range scale of the backscatter table, which has even steps of r / (r + scale)
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
@@ -28,13 +28,13 @@ def shade(albedo, depth, focal, lamps, beams, transmission, scatter_table, sky, 
 
     Args:
         lamps: (n, 10) position, axis, intensity, colour.
-        beams: (n, m) share of the intensity on the axis over even steps of sqrt(1 - cos(angle)), 0 to 1.
-        transmission: (3, m) over even steps of path length.
-        scatter_table: (rows, cols, 3, ranges) backscatter over a coarse pixel grid and even steps of r / (r + scale).
+        beams: (n, m) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)), 0 to 1.
+        transmission: (3, m) transmission at even steps of path length.
+        scatter_table: (rows, cols, 3, ranges) backscatter on a coarse pixel grid and at even steps of r / (r + scale).
         sky: illuminance below the surface (3,); attenuation with depth and with range from the camera (2, 3) [1/m];
             caustics (n + 1, n + 1), or None; (3, 4) map from a point in the camera to column and row in the caustics
             and depth below the surface.
-        lit: (n, H, W) 0 in the shadow of a lamp, or None.
+        lit: (n, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no shadows.
     """
     height, width = depth.shape
     rows, cols, _, ranges = scatter_table.shape
@@ -74,9 +74,10 @@ def shade(albedo, depth, focal, lamps, beams, transmission, scatter_table, sky, 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
-    """Computes the range of a row's floor and its unit normal (3, W) towards the camera, from the depth gradient.
+    """Computes range and unit normal (3, W) of the floor in a row of pixels; the normal points towards the camera.
 
-    The smaller of the slopes to both neighbours is used, so that a depth edge does not tilt the surface next to it.
+    The normal follows from the depth gradient. The smaller of the slopes to both neighbours is used, so that a depth
+    edge does not tilt the surface next to it.
     """
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
@@ -177,7 +178,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light):
-    """Adds to `light` (3, W) the daylight on a row's floor, times `share`, attenuated to the camera."""
+    """Adds to `light` (3, W) the daylight on the floor in a row of pixels, times `share`, attenuated to the camera."""
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for c in range(3):
         incident, by_depth, by_range = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]
@@ -202,7 +203,7 @@ def _interpolate_rows(table, row, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"}, error_model="numpy")
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
-    """Computes the backscatter (3, W) in front of a row's floor by bilinear interpolation.
+    """Computes the backscatter (3, W) in front of the floor in a row of pixels by bilinear interpolation.
 
     The order of operations is fixed for each band, so that images stay identical to the last bit.
     """

@@ -3,7 +3,7 @@
 A point of the floor is in shadow where the straight ray to the lamp passes below the floor. The floor is the rendered
 surface itself: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses its edges, so
 that only edge crossings are tested, and only in blocks of cells that are high enough to reach the ray. A ray that
-starts on the floor and rises more steeply than all triangles so far is still above it.
+starts on the floor and rises more steeply than all triangles passed so far is still above the floor.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from twin.imaging.row_parallel import in_row_bands
 Array = NDArray[np.float64]
 
 BLOCK_CELLS = 8  # side of the blocks whose highest point is stored
-STRIDE_PX = 4  # spacing of the pixels tested first; between four equal results no more are tested
-BIAS_M = 1e-4  # height of the floor above the ray that counts as a hit: depth is single precision
+STRIDE_PX = 4  # spacing of the pixels tested first; between four equal results no further pixels are tested
+BIAS_M = 1e-4  # smallest height of the floor above the ray that counts as a hit, as depth is single precision
 
 
 class Heights(Protocol):
@@ -51,12 +51,12 @@ class _Grid(NamedTuple):
 
 
 class Shadows:
-    """Computes which pixels each lamp illuminates.
+    """Shadow casting: determines which pixels each lamp illuminates.
 
     Args:
         floor: heights of the floor.
         rig: the rendered cameras.
-        lamp_positions_m: for each camera (0 left, 1 right), (lamps, 3) in its axes.
+        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array]):
@@ -65,10 +65,10 @@ class Shadows:
         self._rig, self._lamps = rig, lamp_positions_m
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int) -> Lit:
-        """Returns (lamps, H, W) uint8: 0 where the floor occludes the lamp, 1 elsewhere and where there is no floor.
+        """Returns a mask (lamps, H, W) uint8: 0 where the floor occludes the lamp, 1 elsewhere (also without floor).
 
         Args:
-            depth: (H, W) along the optical axis [m].
+            depth: (H, W) depth along the optical axis [m].
             world_from_camera: (4, 4) pose of this camera.
             camera: 0 left, 1 right.
         """
@@ -106,7 +106,7 @@ def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _test_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, first, end):
-    """Fills rows of `lattice` (lamps, rows, cols), 1 = lit, for every fourth pixel of the image and the last one."""
+    """Fills rows `first` to `end` of `lattice` (lamps, rows, cols), 1 = lit, at pixels `STRIDE_PX` apart."""
     for k in range(lamps.shape[0]):
         lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
@@ -159,7 +159,7 @@ def _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp,
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _grid_steps(at, along, cell, size):
-    """Returns the grid traversal of a ray at + t along, in a cell of a grid with lines `size` apart.
+    """Returns the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
 
     Returns:
         Step of the cell index; t at the next grid line, and increment of t from line to line.

@@ -6,15 +6,15 @@ A point of the floor at depth Z moves through the image of a camera with twist (
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
 
-Each pixel collects light along its own path through the image of mid-exposure: the mean over the exposure, and with a
-rolling shutter the light at its position at the time of its row. Pose and true depth of a frame are those of
-mid-exposure of the middle row.
+Each pixel collects light along its own path through the image of mid-exposure: its value is the mean over the exposure;
+with a rolling shutter, it is the light at its position at the time of its row. Pose and true depth of a frame are those
+of mid-exposure of the middle row.
 
-Limits: paths are straight and the flow is constant during the exposure (the curvature of a path is below
-f (w T)^2 / 8; vibration is not modelled). A pixel takes the depth of its neighbours on the path to be its own: depth
-edges stay sharp, and marine snow, backscatter and the lamp pattern are blurred as the floor is; the latter two move
-with the camera but are smooth over a few pixels. Light is conserved where the flow is uniform. Beyond the image border
-the last pixel is repeated.
+Limits: paths are straight and the flow is constant during the exposure (the curvature of a path is below f (w T)^2 / 8;
+vibration is not modelled). The depth of a pixel is assumed along its whole path: depth edges stay sharp, and marine
+snow, backscatter and the lamp pattern are blurred like the floor. Backscatter and lamp pattern move with the camera,
+but they are smooth over a few pixels. Light is conserved where the flow is uniform. Beyond the image border the last
+pixel is repeated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-SHORT_PX = 2.8  # longest path for the 3 x 3 kernel, which is valid for up to sqrt(8)
+SHORT_PX = 2.8  # longest path for the 3 x 3 kernel, which is valid up to sqrt(8) px
 
 
 def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
@@ -37,7 +37,7 @@ def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array,
 
     Args:
         light: (H, W, 3) radiance at mid-exposure.
-        depth: (H, W) along the optical axis [m]; points at inf move by rotation alone.
+        depth: (H, W) depth along the optical axis [m]; points at inf move by rotation alone.
         focal_px: focal length.
         twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
         exposure_s: exposure time of each row.
@@ -52,7 +52,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
     """Returns the radiance (H, W, 3) as seen by a rolling shutter.
 
     Args:
-        light, depth, focal_px, twist: as for `blur_by_motion`.
+        light, depth, focal_px, twist: see `blur_by_motion`.
         readout_s: time from the first row to the last.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
@@ -64,7 +64,9 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 
 @njit(cache=True, nogil=True, inline="always")
 def _flow(x, y, near, scale, twist):
-    """Returns the optical flow at tangents x, y for 1 / depth: [px/s] for scale f, a path [px] for f times a time."""
+    """Returns the optical flow at tangents x, y, with `near` = 1 / depth.
+
+    The unit is px/s if `scale` is the focal length f, and px if it is f times a duration."""
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
@@ -106,9 +108,9 @@ def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _blur_row(above, here, below, near, x, y, scale, twist, out):
-    """Fills a row without its ends, each (3 W,), for short paths; returns whether all paths are short.
+    """Fills a row (3 W,), except its first and last pixel, for short paths; returns whether all paths are short.
 
-    The nine samples have the moments of a uniform path: a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
+    The nine samples have the moments of a uniform path (a, b): a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
     """
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
@@ -131,8 +133,8 @@ def _blur_row(above, here, below, near, x, y, scale, twist, out):
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
     """Computes the mean radiance over a path centred on a pixel, from samples one pixel apart along its longer axis a.
 
-    All 2 m + 1 samples have equal weight except the two at the ends, whose weight makes the variance of the path that
-    of a uniform one, length^2 / 12, for every length. Interpolation across the path does not change the variance.
+    All 2 m + 1 samples have equal weight except the two at the ends, whose weight makes the variance equal to
+    that of a uniform path, length^2 / 12, for every length. Interpolation across the path does not change the variance.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]

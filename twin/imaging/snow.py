@@ -1,9 +1,9 @@
 """Marine snow: small white particles that drift with the current through the light of the lamps.
 
-They fill a periodic box around the left camera: a particle that leaves it on one side, as the vehicle moves, re-enters
-on the other. Particles are therefore the same in both cameras and from frame to frame. A particle of diameter D at
-depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, whatever its blur: one pixel by the lens and, as
-the lens is focused at infinity, f A / z by its aperture A.
+The particles fill a periodic box around the left camera: a particle that leaves it on one side, as the vehicle moves,
+re-enters on the other. Particles are therefore the same in both cameras and from frame to frame. A particle of diameter
+D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Blur spreads its light: by one pixel due to
+the lens and, as the lens is focused at infinity, by f A / z due to the aperture of diameter A.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class VisibleParticles(NamedTuple):
 
 
 class MarineSnow:
-    """Particles of one survey.
+    """Marine snow particles of one survey.
 
     Args:
         snow: density, size and albedo.
         current_mps: (3,) velocity of the particles in the world.
         rig: the rendered cameras.
         water: optical properties of the water.
-        light_sources: lamps and daylight in the left and in the right camera.
+        light_sources: lamps and daylight in the axes of the left and of the right camera.
         rng: random stream of the particle positions.
     """
 
@@ -94,7 +94,7 @@ class MarineSnow:
         _draw(light, depth, particles.pixel, particles.depth_m, particles.radiance, width_px, cover_px2)
 
     def _radiance(self, points: Array, sources: LightSources) -> Array:
-        """Returns the radiance (n, 3) of particles at (n, 3) in the camera: by lamps and daylight."""
+        """Returns the radiance (n, 3) [cd/m2] of particles at `points` (n, 3) in the camera axes."""
         range_m = np.linalg.norm(points, axis=1)[:, None]
         attenuation = self._water.attenuation_per_m
         day = sources.daylight

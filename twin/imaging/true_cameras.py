@@ -1,4 +1,4 @@
-"""True cameras: convert rendered images to the raw images of the true cameras, and those to rectified frames.
+"""True cameras: convert rendered images to the raw images of the true cameras, and raw images to rectified frames.
 
 The floor is rendered for two parallel pinhole cameras in water, with larger images than the frames where necessary.
 Each pixel of a raw image has its own ray through lens and port; its radiance is sampled where that ray intersects the
@@ -32,7 +32,7 @@ Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
 NEAREST_M = 0.3  # nearest floor that the margin covers
-MARGIN_STEP_PX = 8  # the rendered margin is a multiple of it, which keeps the divisors of the image size
+MARGIN_STEP_PX = 8  # the rendered margin is a multiple of this, so that the image size keeps its divisors
 WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
 
 
@@ -55,7 +55,7 @@ class CameraModel(NamedTuple):
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Returns origin [m] and direction (..., 3) of the rays of pixels (..., 2); NaN where there is none."""
+        """Returns origin [m] and direction (..., 3) of the rays of pixels (..., 2); NaN where a pixel has no ray."""
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
             air = air / self.pinhole.focal_ratio
@@ -64,7 +64,7 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixels (..., 2) of points (..., 3) [m]; NaN where not imaged or too far off the axis."""
+        """Returns the pixels (..., 2) of points (..., 3) [m]; NaN if a point is not imaged or too far off the axis."""
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_tangents(self.port, points_m)
         if self.port.kind == "none":
@@ -78,8 +78,8 @@ class SamplingMap(NamedTuple):
     """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled.
 
     Args:
-        positions: positions of points at infinity.
-        parallax_px_m: displacement for points at a finite depth, times that depth; None without a port.
+        positions: (h, w, 2) positions of points at infinity [px].
+        parallax_px_m: (h, w, 2) displacement for points at a finite depth, times that depth; None without a port.
     """
 
     positions: Positions
@@ -133,7 +133,7 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixels (n, 2) in a frame of points (n, 3) in the rendered camera [m]; NaN where not imaged."""
+        """Returns the pixels (n, 2) in a frame of points (n, 3) in the rendered camera [m]; NaN if not imaged."""
         rig = self.rendered_rig
         if self.sampling is None:
             return rig.project(points_m)
@@ -277,7 +277,7 @@ def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64
 
 
 def _check_port(port: PortConfig) -> None:
-    """Raises TwinError where the pupil of the lens is outside of its dome."""
+    """Raises TwinError if the entrance pupil of the lens is outside the dome."""
     if port.kind == "dome" and np.linalg.norm(port.offset_m) >= port.radius_m:
         raise TwinError(
             "port.offset_m", f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome",

@@ -41,7 +41,7 @@ class Medium(NamedTuple):
     Args:
         absorption_per_m, scattering_per_m: (3,) absorption a and scattering b [1/m].
         mean_cosine: g of the phase function.
-        kept_share: share k of the scattered light that is not counted as lost.
+        kept_share: fraction k of the scattered light that is not counted as lost.
     """
 
     absorption_per_m: Array
@@ -53,9 +53,10 @@ class Medium(NamedTuple):
     def attenuation_per_m(self) -> Array:
         """Effective attenuation (3,) [1/m]: a + (1 - k) b.
 
-        With k = 0 this is the beam attenuation c = a + b, where all scattered light counts as lost. Most of it keeps
-        almost its direction, however, so that c underestimates the light of distant floors in turbid water. With k the
-        share of scattering by small angles it is a + 0.26 b, close to G = a + 0.3 b measured for range-gated images.
+        With k = 0 this is the beam attenuation c = a + b, where all scattered light counts as lost. Most scattered
+        light hardly changes its direction, however, so that c underestimates the light of distant floors in turbid
+        water. If k is the fraction scattered by small angles, this is a + 0.26 b, close to G = a + 0.3 b measured for
+        range-gated images.
         """
         return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
@@ -71,7 +72,7 @@ def medium(water: WaterConfig) -> Medium:
 
 
 def _spectrum(water: WaterConfig) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m] of the given values, the spectrum file or the Jerlov type."""
+    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if water.spectrum_file is not None:
@@ -124,7 +125,7 @@ def _mean(nm: Array, value: Array, low: float, high: float) -> float:
 
 
 def downwelling_per_m(water: Medium) -> Array:
-    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a sun in the zenith.
+    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a sun at the zenith.
 
     Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; a fit to
     Monte Carlo simulations of multiple scattering, so that Kd lies between a and c.
@@ -138,7 +139,7 @@ def phase_function(cos_angle: Array, mean_cosine: float = SEA_WATER_MEAN_COSINE)
 
     Args:
         cos_angle: cosine of the scattering angle; 1 is straight ahead.
-        mean_cosine: g.
+        mean_cosine: mean cosine g of the scattering angle.
     """
     g = mean_cosine
     return (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cos_angle) ** 1.5)

@@ -12,8 +12,8 @@ from twin.core.records import Alignment, Array, SurveyResult, Truth
 from twin.judge.summary_statistics import finite_float, rms
 from twin.judge.trajectory import anchor, path_errors
 
-#: The far end of a track: frames whose planned position has at least this share of the track's greatest distance
-#: from the start of the survey.
+#: The far end of a track consists of the frames whose planned distance from the start of the survey is at least this
+#: fraction of the track's greatest distance.
 FAR_SHARE = 0.9
 
 
@@ -22,7 +22,7 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
 
     `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`. The alignment of the whole survey at the end has no
     such entry and no row. The n positions of an entry are those of the last n keyframes up to the end of the track
-    (all keyframes, or those of the moving window). They are anchored at the first true pose, as the trajectories are.
+    (all keyframes, or those of the moving window). They are anchored at the first true pose, like the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
     error_m = path_errors(result.final, truth.trajectory).distance_m
@@ -32,7 +32,7 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
 def _row(
     alignment: Alignment, before: Array, after: Array, result: SurveyResult, truth: Truth, error_m: Array
 ) -> dict[str, Any]:
-    """Returns the row of one alignment.
+    """Returns the row of one alignment in `tracks[]` of metrics.json.
 
     Args:
         before, after: (n, 3) keyframe positions before and after the alignment [m].
@@ -53,8 +53,9 @@ def _row(
 def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     """Returns the RMS position error at the far end of a track [m].
 
-    The far end is the last tenth of the track's distance from the start, where drift is greatest (Negahdaripour &
-    Madjidi 2003, section III). The error of a single frame would be dominated by its frame-to-frame noise.
+    The far end consists of the frames at no less than 0.9 of the track's greatest distance from the start, where drift
+    is greatest (Negahdaripour & Madjidi 2003, section III). The error of a single frame would be
+    dominated by its frame-to-frame noise.
 
     Args:
         track: number of the track, from 1.

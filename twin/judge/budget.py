@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-#: Stages of the estimators that run at a keyframe. The other stages belong to the simulator or follow the survey.
+#: Stages of the estimators that run at a keyframe. The other stages belong to the simulator or run after the survey.
 KEYFRAME_STAGES = ("stereo", "f2m", "network", "flow")
 #: Key of the row that sums `KEYFRAME_STAGES`.
 KEYFRAME_WORK = "keyframe"
@@ -42,11 +42,11 @@ class StageTime(NamedTuple):
 def stage_times(
     metrics: Mapping[str, Any], scenario: Mapping[str, Any], n_frames_per_keyframe: int | None
 ) -> list[StageTime]:
-    """Returns the time of every stage and, last, of all keyframe work.
+    """Returns the computing time of every stage and, as the last item, of all keyframe work.
 
     Args:
         metrics: contents of metrics.json.
-        scenario: contents of the scenario file; read are rig.frame_rate_hz and control.hold_s.
+        scenario: contents of the scenario file, of which rig.frame_rate_hz and control.hold_s are used.
         n_frames_per_keyframe: frames from one keyframe to the next; None if unknown.
     """
     timing = metrics.get("timing") or {}
@@ -60,7 +60,7 @@ def stage_times(
 
 
 def _stage_time(stage: str, row: Mapping[str, Any], budget_ms: float | None) -> StageTime:
-    """Returns one stage of `timing.stages` of metrics.json with its budget."""
+    """Returns the computing time of a stage from its row of `timing.stages` in metrics.json."""
     return StageTime(stage, row["count"], row["mean_ms"], row["p95_ms"], row["total_s"], budget_ms)
 
 

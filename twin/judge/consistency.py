@@ -1,4 +1,4 @@
-"""Consistency of the estimated covariances: errors normalised by their own covariance (NEES, two-sigma shares)."""
+"""Consistency of the estimated covariances: NEES, and fraction of errors within two sigma."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from twin.judge.trajectory import anchor
 def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """Returns `consistency.*` of metrics.json.
 
-    For consistent covariances and normal errors the mean NEES of the positions is 3 and the share of errors within
-    two sigma is 0.954. `within_2sigma_position` counts each camera axis of each keyframe, `within_2sigma_map` each
-    estimated cell.
+    For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
+    within two sigma is 0.954. `within_2sigma_position` counts each camera axis of each keyframe, `within_2sigma_map`
+    each estimated cell.
     """
     error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
@@ -58,7 +58,7 @@ def nees(error: Array, cov: Array) -> Array:
 
 
 def _positive_definite(cov: Array) -> np.ndarray:
-    """Returns (n,) bool: which matrices (n, d, d) are finite and positive definite."""
+    """Returns whether each of the matrices (n, d, d) is finite and positive definite, (n,) bool."""
     finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0]
     return np.asarray(smallest > 0)

@@ -1,4 +1,4 @@
-"""Errors of the measured motions between keyframes, and of the closed-form motion that each of them started from."""
+"""Errors of the measured motions between keyframes, and of their closed-form initial values."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALONG_NODES = 2
 
 
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
-    """Returns `links` of metrics.json: errors of the links along and across.
+    """Returns `links` of metrics.json: errors of the along and the across links.
 
     `bridged` is the number of links that frame-to-frame motion replaces because no points were matched. Their errors
     are not evaluated.
@@ -36,12 +36,12 @@ def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
 
 
 def linked_nodes(links: Links) -> NDArray[np.int64]:
-    """Returns the numbers of the keyframes that any link connects, in increasing order."""
+    """Returns the numbers of the keyframes that have at least one link, in increasing order."""
     return np.unique(np.concatenate([links.i, links.j]))
 
 
 def node_distance(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns (n,) number of nodes from keyframe i to keyframe j of each link: 1 for consecutive nodes."""
+    """Returns the number of nodes (n,) from keyframe i to keyframe j of each link: 1 for consecutive nodes."""
     return np.searchsorted(nodes, links.j) - np.searchsorted(nodes, links.i)
 
 
@@ -69,7 +69,7 @@ def _motion_errors(true_i, true_j, estimates):
 
 
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
-    """Returns count, RMS errors and mean NEES of links, and the RMS errors of their closed forms where they have one.
+    """Returns count, RMS errors and mean NEES of links, and the RMS errors of those closed-form motions that exist.
 
     The mean NEES is 6 for consistent covariances.
     """

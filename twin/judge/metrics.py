@@ -28,7 +28,7 @@ _IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason", "wa
 
 @dataclass(frozen=True)
 class EvaluationInput:
-    """A survey and its truth, as `evaluate` takes them.
+    """Input of `evaluate`: a survey and its truth.
 
     Args:
         result: output of the estimators.
@@ -105,7 +105,7 @@ def check_require(names: Mapping[str, float]) -> None:
 
 
 def empty_metrics() -> dict[str, Any]:
-    """Returns the metrics of a survey without frames: every key, every value None or 0."""
+    """Returns the metrics of a survey without frames: all keys, with values None or 0."""
     none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     no_keyframes = np.zeros(0, dtype=np.int64)
     result = SurveyResult(none, none, none, no_keyframes, no_keyframes, np.zeros((0, 6, 6)))

@@ -26,7 +26,7 @@ class Footprints(NamedTuple):
         centre_m: (n, 2) position of the camera [m].
         heading, travel: (n, 2) horizontal unit vectors of the vehicle's heading and of the planned motion.
         width_m, length_m: (n,) size across and along the heading [m].
-        swath: (n,) number of the leg or loop, -1 outside any.
+        swath: (n,) number of the leg or loop; -1 for keyframes between legs.
     """
 
     centre_m: Array
@@ -42,8 +42,9 @@ def overlap_metrics(
 ) -> dict[str, float | None]:
     """Returns `overlap.*` of metrics.json.
 
-    Along: shared area of consecutive keyframes of one swath (leg or loop). Across: sidelap, the area that a keyframe
-    shares with the nearest keyframe of the next swath after removing their offset along the direction of travel.
+    The overlap along a swath (leg or loop) is the area that consecutive keyframes share. The overlap across (sidelap)
+    is the area that a keyframe shares with the nearest keyframe of the next swath after their offset along the
+    direction of travel is removed. Both are fractions of the footprint area.
 
     Args:
         grid: cells of `truth.height_m`; without it the mean height of the whole floor is used.
@@ -92,7 +93,7 @@ def mean_depth(
 
 
 def _window(height_m: NDArray[np.float32], grid: MapGrid, position: Array, half_m: float) -> NDArray[np.float32]:
-    """Returns the cells of a square with half side `half_m` around a position, clipped to the grid."""
+    """Returns the heights in a square with half side `half_m` around a position, clipped to the grid."""
     col, row = (position[0] - grid.west_m) / grid.cell_m, (grid.north_m - position[1]) / grid.cell_m
     half = half_m / grid.cell_m
     rows, cols = (
@@ -124,7 +125,7 @@ def across_overlap(prints: Footprints) -> Array:
 
 
 def _nearest_in_next(prints: Footprints, swath: int) -> NDArray[np.int64]:
-    """Returns (2, m): the keyframes of a swath and, for each, the nearest keyframe of the next swath."""
+    """Returns the numbers (2, m) of the keyframes of a swath and of the keyframes of the next swath nearest to them."""
     here, there = np.flatnonzero(prints.swath == swath), np.flatnonzero(prints.swath == swath + 1)
     if len(here) == 0 or len(there) == 0:
         return np.zeros((2, 0), dtype=np.int64)
@@ -133,10 +134,10 @@ def _nearest_in_next(prints: Footprints, swath: int) -> NDArray[np.int64]:
 
 
 def _shared_area(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64], offset: Array) -> Array:
-    """Returns the overlap (m,), as a fraction of the area, of pairs of footprints, both of their mean size.
+    """Returns the overlap (m,), as a fraction of the area, of pairs of footprints, each pair at its mean size.
 
     Args:
-        first, second: (m,) numbers of the keyframes. Both footprints are oriented as the first.
+        first, second: (m,) numbers of the keyframes. Both footprints are oriented like the first.
         offset: (m, 2) offset of the second footprint from the first [m].
     """
     heading = prints.heading[first]

@@ -25,7 +25,7 @@ def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) 
     A metric without a value does not pass.
 
     Raises:
-        TwinError: a name is not a number of metrics.json.
+        TwinError: a name does not refer to a number in metrics.json.
     """
     check_metric_names(limits, metrics)
     return {name: _verdict(name, _value(metrics, name), limit) for name, limit in limits.items()}
@@ -35,7 +35,7 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
     """Checks that every name is the dotted path of a number in `metrics`.
 
     Raises:
-        TwinError: a name is not; the message suggests similar names.
+        TwinError: a name is not such a path; the message suggests similar names.
     """
     known = list(number_paths(metrics))
     for name in names:
@@ -47,7 +47,7 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
 
 
 def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    """Yields the dotted path of every number, or missing number, in the sections of `metrics`."""
+    """Yields the dotted path of every number and every None in the sections of `metrics`."""
     for key, value in metrics.items():
         if isinstance(value, Mapping):
             yield from number_paths(value, f"{prefix}{key}.")

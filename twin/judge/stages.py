@@ -25,7 +25,7 @@ class StageError(NamedTuple):
     Args:
         stage: one of `STAGES`.
         rmse_m: RMS position error [m].
-        gain: error of the preceding stage / error of this stage; None if there is no preceding stage or no error.
+        gain: error of the preceding stage / error of this stage; None if there is no preceding stage or either is 0.
     """
 
     stage: str
@@ -62,7 +62,7 @@ def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
 
 
 def stage_errors(metrics: Mapping[str, Any]) -> list[StageError]:
-    """Returns the positioning stages of metrics.json that have an error, each with its gain over the one before."""
+    """Returns the positioning stages of metrics.json that have an error, each with its gain over the preceding one."""
     rows: list[StageError] = []
     for stage in STAGES:
         rmse_m = ((metrics.get("stages") or {}).get(stage) or {}).get("ate_rmse_m")
@@ -73,7 +73,7 @@ def stage_errors(metrics: Mapping[str, Any]) -> list[StageError]:
 
 
 def _errors(path: Trajectory, true: Trajectory) -> dict[str, float | None]:
-    """Returns RMS and largest position error [m]; None for a path that does not have every pose."""
+    """Returns RMS and largest position error [m]; both are None if the path lacks poses."""
     complete = len(path.world_from_camera) == len(true)
     distance_m = path_errors(path, true).distance_m if complete else np.zeros(0)
     return {"ate_rmse_m": rms(distance_m), "ate_max_m": finite_float(distance_m.max()) if len(distance_m) else None}

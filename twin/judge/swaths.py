@@ -30,12 +30,12 @@ def travel_direction(reference: Array) -> Array:
 
 
 def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
-    """Returns (n,) number of the leg or loop of each frame, from 0; -1 for frames between legs."""
+    """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs."""
     return truth.track - 1 if pattern == "loops" else leg_numbers(truth.reference)
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
-    """Returns (n,) number of the leg of each frame, from 0; -1 on the short segments between legs.
+    """Returns the number (n,) of the leg of each frame, from 0; -1 on the short segments between legs.
 
     The axis of the legs is the principal axis of the steps between the reference positions (n, 3). A leg ends at a
     turn or at a short segment.

@@ -12,7 +12,7 @@ from twin.judge.summary_statistics import finite_float, rms
 
 
 class PathErrors(NamedTuple):
-    """Estimate minus truth at each of n frames.
+    """Errors of an estimated trajectory at n frames, estimate minus truth.
 
     Args:
         travelled_m: (n,) length of the true path since the first frame [m].
@@ -54,7 +54,7 @@ def cumulative_length(positions: Array) -> Array:
 
 
 def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:
-    """Returns `trajectory.*` of metrics.json; the drift is the end error over the length of the true path [%]."""
+    """Returns `trajectory.*` of metrics.json; the drift is the end error in percent of the true path."""
     distance = errors.distance_m
     end, path = (float(distance[-1]), float(errors.travelled_m[-1])) if len(distance) else (None, None)
     x, y, z = errors.position_m.T

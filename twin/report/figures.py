@@ -1,4 +1,4 @@
-"""Figures of the survey report. Each function returns None if the run lacks the data."""
+"""Figures of the survey report. Each figure function returns None if the run lacks the data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from twin.report.wording import PROCESSING_STAGES, improvement, length
 WIDTH_IN = 9.6
 #: Longest side of a map in a figure [cells]; finer maps are subsampled.
 MAP_CELLS = 500
-#: The true path is a broad band below the estimates: it is visible next to them where they are wrong.
+#: The true path is a broad band below the estimates, so that it remains visible where they coincide with it.
 PATH_STYLES: dict[str, dict[str, Any]] = {
     "reference": {"linestyle": "--", "linewidth": 1.0},
     "truth": {"linewidth": 5.0, "alpha": 0.35},
@@ -96,7 +96,7 @@ def _limit_to_paths(axes: Axes, run: Run) -> None:
 
 
 def path_error_curves(run: Run) -> Figure | None:
-    """Returns position, height and heading error of each estimate over the length of the true path."""
+    """Returns curves of the position, height and heading error of each estimate over the length of the true path."""
     names = [name for name in ESTIMATES if name in run.trajectories]
     if "truth" not in run.trajectories or not names:
         return None
@@ -125,7 +125,7 @@ def _log_scale(axes: Axes) -> None:
 
 
 def stage_bars(run: Run) -> Figure | None:
-    """Returns the keyframe error after each positioning stage, with the improvement over the stage before."""
+    """Returns bars of the keyframe error after each positioning stage, with the gain over the preceding stage."""
     rows = stage_rows(run.metrics or {}, run.scenario)
     errors_m = [row.rmse_m for row in rows if row.rmse_m]
     if not errors_m:
@@ -146,7 +146,7 @@ def stage_bars(run: Run) -> Figure | None:
 
 
 def track_bars(run: Run) -> Figure | None:
-    """Returns the keyframe error before and after each global alignment."""
+    """Returns bars of the keyframe error before and after each global alignment."""
     tracks = (run.metrics or {}).get("tracks") or []
     if not tracks:
         return None
@@ -164,7 +164,7 @@ def track_bars(run: Run) -> Figure | None:
 
 
 def stereo_quality_curves(run: Run) -> Figure | None:
-    """Returns matched points and contrast of all stereo observations over time; red: too few points for a keyframe."""
+    """Returns matched points and contrast over time; red: stereo observations with too few points for a keyframe."""
     observations, path = run.keyframes.stereo_observations, run.trajectories.get("online")
     if path is None or not len(observations) or observations[:, 0].max() >= len(path):
         return None
@@ -263,7 +263,7 @@ def network_plot(run: Run) -> Figure | None:
 
 
 def timing_bars(run: Run) -> Figure | None:
-    """Returns the mean time per call of each processing stage, and its budget."""
+    """Returns bars of the mean time per call of each processing stage, with its budget."""
     rows = [
         row
         for row in stage_times(run.metrics or {}, run.scenario, run.keyframes.n_frames_per_keyframe)
@@ -328,7 +328,7 @@ def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None 
 
 
 def _extent(raster: Raster) -> tuple[float, float, float, float]:
-    """Returns west, east, south and north edge of a raster [m], as matplotlib takes them."""
+    """Returns west, east, south and north edge of a raster [m], in the order of matplotlib's `extent`."""
     grid = raster.grid
     return (grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m)
 

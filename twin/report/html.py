@@ -1,4 +1,4 @@
-"""HTML pages from Jinja templates, with one style sheet, one set of number filters and one list of terms."""
+"""HTML pages from Jinja templates, which share a style sheet, number filters and a list of terms."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SHARED_TEMPLATES = "twin.report"
 
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
-    """Returns a template as self-contained HTML.
+    """Renders a template to self-contained HTML.
 
     Args:
-        package: package that holds the template; files included by it may also lie in `twin.report`.
+        package: package that holds the template; the files that it includes may also be in `twin.report`.
         template: file name of the template.
         context: variables of the template.
     """

@@ -1,6 +1,6 @@
 """Oblique picture of the mapped surface: mesh.glb rendered with pyrender in a separate process.
 
-Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver ends the process. Therefore
+Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver can crash the process. Therefore
 `surface_picture` runs this module as a program and returns None if that fails.
 """
 
@@ -47,14 +47,14 @@ def surface_picture(mesh_file: Path) -> Image | None:
 
 
 def render_mesh(mesh: Any) -> Image:
-    """Returns a picture of a coloured trimesh on white, lit from the north-west and cropped to the mesh.
+    """Returns a picture of a coloured trimesh on a white background, lit from the north-west and cropped to the mesh.
 
     Args:
         mesh: trimesh.Trimesh in the axes of glTF (y up); its vertex colours are replaced by shaded ones.
     """
     import pyglet
 
-    pyglet.options["headless"] = True  # pyrender imports pyglet's windows, which need X libraries
+    pyglet.options["headless"] = True  # otherwise pyglet's window module, imported by pyrender, needs X libraries
     import pyrender
 
     scene = pyrender.Scene(bg_color=WHITE)
@@ -83,7 +83,7 @@ def shaded_colours(colours: Image, normals: Array) -> Image:
 
 
 def camera_pose(vertices: Array) -> Array:
-    """Returns the pose (4, 4) of the nearest OpenGL camera (viewing along -z) that has all framed vertices in view.
+    """Returns the pose (4, 4) of the nearest OpenGL camera (viewing along -z) with all vertices but outliers in view.
 
     Let the camera be at distance d from the centre of the vertices, and q a vertex relative to that centre in the axes
     of the camera. The vertex is in view if |q_x| <= t (d - q_z) for the tangent t of half the horizontal field of view,
@@ -111,7 +111,7 @@ def _axis_rotation(axis: int, angle_deg: float) -> Array:
 
 def _main(mesh_file: str, picture_file: str) -> None:
     """Renders a GLB file to an image file."""
-    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # before pyrender is imported
+    os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # must be set before pyrender is imported
     import trimesh
 
     picture = render_mesh(trimesh.load_scene(mesh_file).to_mesh())

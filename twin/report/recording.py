@@ -1,4 +1,4 @@
-"""Rerun recording of a survey (run.rrd) and live viewer. The only module that imports rerun."""
+"""Rerun recording of a survey (run.rrd) and live viewer. No other module imports rerun."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
 
     Args:
         folder: the run folder.
-        metrics: replaces metrics.json where that is not written yet.
+        metrics: used instead of metrics.json if that file does not exist yet.
 
     Raises:
-        TwinError: it is not a run folder, or one of its files is damaged.
+        TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"

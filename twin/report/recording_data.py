@@ -46,7 +46,7 @@ def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
 
 
 def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns the duration of each global alignment [ms], at the last keyframe of its track."""
+    """Returns the duration of each global alignment [ms], at the time of the last keyframe of its track."""
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
     rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]
@@ -54,10 +54,10 @@ def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]
 
 
 def stride(n: int, limit: int = N_SAMPLES) -> int:
-    """Returns the smallest stride that leaves at most `limit` of n items."""
+    """Returns the smallest stride that keeps at most `limit` of n items."""
     return max(1, -(-n // limit))
 
 
 def subsampled_rows(n: int) -> NDArray[np.int64]:
-    """Returns at most `N_SAMPLES` evenly spaced rows out of n."""
+    """Returns at most `N_SAMPLES` evenly spaced row numbers out of n."""
     return np.arange(0, n, stride(n))

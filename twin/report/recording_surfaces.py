@@ -45,7 +45,7 @@ def floor_surface(raster: Raster) -> Surface:
 
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
-    """Returns the estimated map in the colours of the orthomosaic, or coloured by height without one."""
+    """Returns the estimated map in the colours of the orthomosaic, or coloured by height if there is no orthomosaic."""
     if mosaic is not None and mosaic.values.shape[:2] == dem.values.shape:
         return _surface(dem, mosaic.values)
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
@@ -67,7 +67,7 @@ def _surface(raster: Raster, colours: Image) -> Surface:
 
 
 def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns (n,) number of the first group of cameras that observes each point; `NOT_OBSERVED` if none does.
+    """Returns the number (n,) of the first group of cameras that observes each point; `NOT_OBSERVED` if none does.
 
     Args:
         points: (n, 3) in the world [m].
@@ -84,7 +84,7 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
 
 
 def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
-    """Returns (n,) whether points (n, 3) project into the image of a camera."""
+    """Returns whether each of the points (n, 3) projects into the image of a camera, (n,) bool."""
     x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
     tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
     return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)

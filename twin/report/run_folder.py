@@ -38,7 +38,7 @@ class Network(NamedTuple):
 
     Args:
         positions: (n, 3) positions of the nodes [m].
-        edges: (m, 2) rows of `positions` that each link connects.
+        edges: (m, 2) indices into `positions` of the two nodes of each link.
     """
 
     positions: Array
@@ -54,7 +54,7 @@ class Keyframes(NamedTuple):
         n_frames_per_keyframe: planned frames from one keyframe to the next; None if unknown.
         timing_ms: durations of the calls of some stages, in order [ms].
         stereo_observations: (m, 3) frame number, matched points and contrast (NaN without images) of each stereo
-            observation, with or without a keyframe.
+            observation, including those without a keyframe.
     """
 
     frames: NDArray[np.int64]
@@ -66,7 +66,7 @@ class Keyframes(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """Contents of a run folder. Missing files are missing keys, empty arrays or None."""
+    """Contents of a run folder. A missing file gives a missing key, an empty array or None."""
 
     folder: Path
     scenario: dict[str, Any]
@@ -96,10 +96,10 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
     Args:
         folder: the run folder.
-        metrics: replaces metrics.json where that is not written yet.
+        metrics: used instead of metrics.json if that file does not exist yet.
 
     Raises:
-        TwinError: it is not a run folder, or one of its files is damaged.
+        TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     folder = Path(folder)
     if not (folder / SCENARIO_FILE).is_file():

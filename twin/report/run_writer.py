@@ -35,7 +35,7 @@ class SurveyRecord:
         elevation: elevation map; None if none was built.
         truth: true trajectory and floor, and the reference path.
         grid: cells of the maps.
-        start: (4, 4) world_from_camera of the planned start, whose orientation the reference path takes.
+        start: (4, 4) world_from_camera of the planned start, whose orientation is used for the reference path.
         n_frames_per_keyframe: planned frames from one keyframe to the next.
         stopwatch: durations of the processing stages.
         metrics: contents of metrics.json.
@@ -55,10 +55,10 @@ class RunFolder:
     """Folder of one run with its log (log.jsonl, one JSON object per line). Use as a context manager.
 
     Args:
-        folder: created if it does not exist.
+        folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run.
-        outputs: which of `PICTURES` to produce at the end. In a study they take longer than a short flight. None: write
-            the metrics only, without trajectories and maps.
+        outputs: members of `PICTURES` to produce at the end; this may take longer than a short survey. None: write the
+            metrics only, without trajectories and maps.
 
     Raises:
         TwinError: the folder cannot be written.

@@ -1,4 +1,4 @@
-"""Table of the positioning stages: error, improvement, inputs and disabled corrections of each."""
+"""Table of the positioning stages with the error, improvement, inputs and disabled corrections of each."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class StageRow(NamedTuple):
 
     Args:
         stage: key of the stage.
-        inputs: measurements that it uses.
+        inputs: measurements that the stage uses.
         rmse_m: RMS position error of the keyframes [m].
-        gain: error of the preceding stage / error of this stage; None if there is none.
-        disabled: note on what the scenario disables in it; "" for nothing.
+        gain: error of the preceding stage / error of this stage; None if there is no preceding stage.
+        disabled: note on the corrections that the scenario disables in this stage; "" if there are none.
     """
 
     stage: str

@@ -1,4 +1,4 @@
-"""report.html: one self-contained page about a survey, made from its run folder alone."""
+"""report.html: a self-contained page about a survey, created from its run folder alone."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
     Args:
         folder: the run folder.
-        metrics: replaces metrics.json where that is not written yet.
+        metrics: used instead of metrics.json if that file does not exist yet.
 
     Raises:
-        TwinError: it is not a run folder, or one of its files is damaged.
+        TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     file = Path(folder) / "report.html"
     file.write_text(render(load_run(folder, metrics)), encoding="utf-8")

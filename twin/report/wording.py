@@ -33,14 +33,14 @@ TERMS = {
     "values mean that the estimate is overconfident.",
     "NEES": "Normalised estimation error squared, e' C^-1 e, of an error e with the estimated covariance C. Its mean "
     "is 3 for consistent positions and 6 for consistent motions; larger values mean overconfident covariances.",
-    "Completeness": "Share of the observed map cells that have an estimated height. A cell is observed if at least one "
-    "keyframe sees it with both cameras.",
+    "Completeness": "Fraction of the observed map cells with an estimated height. A cell is observed if both images of "
+    "at least one keyframe show it.",
     "Keyframe": "Frame with a stereo pair that is a node of the network and contributes to the map.",
     "Link": "Measured motion between two keyframes.",
     "F2F": "Frame-to-frame motion: camera motion between consecutive frames, from optical flow.",
     "F2M": "Registration of a keyframe with the mosaic of earlier keyframes.",
     "GA": "Global alignment: least-squares adjustment of all keyframe poses to all links.",
-    "Eq. (2)": "Closed-form motion between two keyframes (Negahdaripour & Madjidi 2003), which takes depth as exact.",
+    "Eq. (2)": "Closed-form motion between two keyframes (Negahdaripour & Madjidi 2003), which treats depth as exact.",
 }
 
 
@@ -84,12 +84,12 @@ def percent(fraction: float | None) -> str:
 
 
 def angle(value_deg: float | None) -> str:
-    """Returns an angle in degrees."""
+    """Returns an angle as text in degrees."""
     return DASH if value_deg is None else f"{value_deg:.2f}°"
 
 
 def milliradians(value_deg: float | None) -> str:
-    """Returns an angle given in degrees in milliradians: 1 mrad is 1 mm at 1 m distance."""
+    """Converts an angle from degrees to text in milliradians; 1 mrad is 1 mm at 1 m distance."""
     return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
 
 
@@ -99,14 +99,14 @@ def ratio(value: float | None) -> str:
 
 
 def improvement(gain: float | None) -> str:
-    """Returns the ratio of errors before / after in words; "" if they differ by less than 5 %."""
+    """Returns the ratio of errors before / after as text, "smaller" or "larger"; "" if they differ by less than 5 %."""
     if gain is None or 0.95 <= gain <= 1.05:
         return ""
     return f"{ratio(gain)} smaller" if gain > 1 else f"{ratio(1 / gain)} larger"
 
 
 def milliseconds(value_ms: float | None) -> str:
-    """Returns a duration in ms, from one second on in s."""
+    """Returns a duration as text in ms, or in s if it is one second or longer."""
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
 
@@ -168,7 +168,7 @@ def closed_form_comparison(links: Mapping[str, Any]) -> str:
     if not changes:
         return "No motion between keyframes was measured."
     return (
-        "Eq. (2) takes the depth of one stereo pair as exact. Two-view structure and motion weights both stereo pairs "
+        "Eq. (2) treats the depth of one stereo pair as exact. Two-view structure and motion weights both stereo pairs "
         f"by their noise, which changes the RMS translation error of the links {' and '.join(changes)}."
     )
 

@@ -18,7 +18,7 @@ SAND, CONCRETE = (0.36, 0.31, 0.23), (0.45, 0.44, 0.42)  # albedo
 
 
 def block_on_sand(seed: int) -> Terrain:
-    """Returns a terrain around the origin; its reference plane is the mean height of the sand."""
+    """Returns a terrain with the block, centred at the origin; its reference plane is the mean height of the sand."""
     rng = np.random.default_rng(seed)
     x, y = _grid(SPACING_M, edges=True)
     ripples = 0.012 * np.sin(2 * np.pi * (x + 0.15 * np.sin(2.1 * y) + 0.04 * np.sin(5.3 * y)) / 0.16)
@@ -37,7 +37,7 @@ def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
 
     Args:
         step_m: grid spacing.
-        edges: include the edges of the terrain (grid nodes); else cell centres.
+        edges: whether to return the grid nodes, including the terrain edges; otherwise the cell centres.
     """
     axes = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
     east, north = (axis if edges else axis + step_m / 2 for axis in axes)
@@ -46,7 +46,7 @@ def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
 
 
 def _inside(x: Array, y: Array) -> NDArray[np.bool_]:
-    """Returns where the block is, without its cores."""
+    """Returns a mask of the points on the block, excluding its hollow cores."""
     heading = np.deg2rad(HEADING_DEG)
     along, across = x * np.cos(heading) + y * np.sin(heading), y * np.cos(heading) - x * np.sin(heading)
     block = (np.abs(along) < BLOCK_M[0] / 2) & (np.abs(across) < BLOCK_M[1] / 2)

@@ -1,4 +1,4 @@
-"""Fig. 8 of the paper with simulated images: one object at five turbidity levels, and contrast against range."""
+"""Fig. 8 of the paper with simulated images: one object at five turbidity levels, and contrast versus range."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ RANGES_M: Array = np.arange(0.3, 12.01, 0.05)
 def render_levels(
     turbidities: Sequence[float] = TURBIDITIES, settings: Sequence[str] = (), ranges_m: Array = RANGES_M
 ) -> list[TurbidityLevel]:
-    """Renders the block at each turbidity and computes the contrast against range.
+    """Renders the block at each turbidity and computes the contrast as a function of range.
 
     Args:
         turbidities: values of `water.turbidity`.
-        settings: further overrides of the scenario.
-        ranges_m: (n,) ranges of the contrast.
+        settings: further overrides of the scenario, each "key=value".
+        ranges_m: (n,) ranges at which the contrast is computed.
     """
     levels, floor = [], block_on_sand(seed=1)
     for turbidity in turbidities:
@@ -65,7 +65,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     Args:
         scenario: lamps and camera.
         illumination: water and daylight.
-        ranges_m: (n,) ranges.
+        ranges_m: (n,) ranges at which the contrast is computed.
 
     Returns:
         (n, 3) relative contrast for R, G, B.

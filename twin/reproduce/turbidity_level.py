@@ -1,4 +1,4 @@
-"""Image of one object at one turbidity level, with its image quality and the contrast against range."""
+"""Image of one object at one turbidity level, with its image quality and the contrast as a function of range."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TurbidityLevel(NamedTuple):
         image: (H, W, 3) image of the left camera.
         quality: image quality, see `look.image_quality`.
         ranges_m: (n,) ranges at which the contrast is given.
-        contrast: (n, 3) remaining fraction of the contrast of fine detail for R, G, B.
+        contrast: (n, 3) contrast of fine detail relative to clear water for R, G, B.
     """
 
     scenario: Scenario

@@ -1,4 +1,4 @@
-"""Figure of the turbidity levels: images, their histograms, and contrast against range."""
+"""Figure of the turbidity levels: images, their histograms, and contrast as a function of range."""
 
 from __future__ import annotations
 

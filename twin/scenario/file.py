@@ -1,4 +1,4 @@
-"""The scenario as a TOML file: read with its base file and overrides, checked, and written."""
+"""Reading, validation and writing of scenarios as TOML files, with base files and overrides."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
-    """Returns the keys and values of a scenario file, or a name in scenes/, merged with its base file; unchecked."""
+    """Returns the keys and values of a scenario (file or name in scenes/) merged with its base file, without checks."""
     return _read_with_base(find_scene(path), including_files=())[0]
 
 
@@ -53,9 +53,9 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
     """Returns the scenario of a tree in which some keys have new values.
 
     Args:
-        tree: keys and values of a scenario; stays unchanged.
+        tree: keys and values of a scenario; not modified.
         values: dotted keys and their values; file paths are relative to the folder of the source.
-        source: origin of the values, for the lines of error messages.
+        source: origin of the values, for file and line in error messages.
 
     Raises:
         ScenarioError: lists every error.
@@ -140,7 +140,7 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
     """Reads a file and merges it over its base file.
 
     Args:
-        including_files: resolved paths of the files that extend this one, directly or indirectly.
+        including_files: absolute paths of the files that extend this one, directly or indirectly.
 
     Returns:
         Keys and values, with absolute file paths, and the line of each key of `file` itself.
@@ -179,7 +179,7 @@ def _expand(value: str, folder: Path) -> Path:
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Returns both trees as one; where both have a value, that of `top`."""
+    """Returns the two trees merged; where both have a value, that of `top` is used."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -206,7 +206,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
     """Sets a dotted key in the tree.
 
     Args:
-        origin: first words of an error message.
+        origin: beginning of an error message.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -239,7 +239,7 @@ def _renamed(key: str) -> str | None:
 
 
 def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
-    """Returns one of pydantic's errors in the words of a scenario."""
+    """Returns a pydantic error as a TwinError with scenario key, problem and allowed values."""
     field = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         allowed = _fields(item["loc"][:-1], model)
@@ -252,7 +252,7 @@ def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
 
 
 _PREFIX = "Input should be "
-#: What a scenario allows where pydantic reports an error of this type; other messages are pydantic's own.
+#: Allowed value for each type of pydantic error; for other types, pydantic's message is used.
 _ALLOWED = {
     "model_type": "a section",
     "tuple_type": "a list",

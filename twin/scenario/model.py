@@ -34,7 +34,7 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Rejects strings and booleans as numbers, which pydantic would convert."""
+        """Rejects strings and booleans where a number is required; pydantic would convert them."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if kind in (float, int) and isinstance(value, str | bool):
             raise PydanticCustomError("float_type" if kind is float else "int_type", "a number")
@@ -90,7 +90,7 @@ class VehicleConfig(Section):
 
 
 class RigConfig(Section):
-    """Calibrated stereo pair that looks down, the top of the image towards the bow."""
+    """Calibrated stereo pair that looks down, with the top of the image towards the bow."""
 
     image_width_px: int = Field(default=320, ge=64, le=2048, description="image width [px]")
     image_height_px: int = Field(default=240, ge=48, le=2048, description="image height [px]")
@@ -245,7 +245,7 @@ class CalibrationErrorConfig(Section):
 
 
 class WaterConfig(Section):
-    """Inherent optical properties of the water for R, G, B: of a Jerlov type, or given here."""
+    """Inherent optical properties of the water for R, G, B: those of a Jerlov type, or given explicitly."""
 
     jerlov: JERLOV = Field(default="IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
     turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies the scattering coefficient")
@@ -484,7 +484,7 @@ class Source(BaseModel):
 
 
 class Scenario(Section):
-    """One survey, fully described."""
+    """Complete description of one survey."""
 
     name: str = Field(default="survey", min_length=1, max_length=80, description="name of the survey")
     seed: int = Field(default=0, ge=0, lt=2**32, description="seed of all random numbers")

@@ -29,7 +29,7 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
     """Returns the estimators of a survey, with visual measurements from images or from the surrogate world.
 
     Args:
-        folder: the run folder; images of keyframes are spooled below it.
+        folder: run folder; images of keyframes are spooled below it.
     """
     if mission.scenario.imaging.fidelity == "rendered":
         return navigator_with(mission, image_vision(mission, folder, stopwatch), stopwatch)
@@ -40,14 +40,14 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
 
 
 def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:
-    """Returns the visual measurements from images, with the believed calibration and without the truth."""
+    """Returns the visual measurements from images, which use the believed calibration and not the true one."""
     cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
     settings = mission.scenario.estimator_settings()
     return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch)
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators, with believed calibration and noise, settings and planned start, but not the truth."""
+    """Returns the estimators. They get believed calibration and noise, settings and planned start, not the truth."""
     scenario = mission.scenario
     return Navigator(
         mission.rig,

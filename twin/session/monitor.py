@@ -11,7 +11,7 @@ from twin.errors import SurveyAborted
 from twin.report.run_writer import RunFolder
 from twin.world.mission import Mission
 
-_MAX_BLIND_S = 2.0  # without vision for longer, the survey is aborted
+_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for longer
 
 
 class SurveyProgress(NamedTuple):
@@ -35,8 +35,8 @@ class SurveyMonitor:
     """Reports every frame of a survey, and aborts the survey if vision is lost for too long.
 
     Args:
-        progress: called with the progress after every frame.
-        live: show the survey in Rerun while it runs.
+        progress: function called with the progress after every frame.
+        live: whether to show the survey in Rerun while it runs.
     """
 
     def __init__(

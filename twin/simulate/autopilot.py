@@ -1,6 +1,6 @@
 """Pose controller of the BlueROV2, with published vehicle parameters.
 
-The controller does not use the factors by which a scenario changes drag and added mass: they act as model errors.
+The controller ignores the drag and added-mass factors of the scenario, which therefore act as model errors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     Drag is linear v + quadratic v |v| along each axis, so the thrust of each thruster is p v + q v^2.
 
     Args:
-        vehicle: trim and factors.
+        vehicle: trim, and factors of drag and added mass.
         direction: (3,) unit vector of the velocity in the body.
     """
     hull = trimmed_hull(vehicle)

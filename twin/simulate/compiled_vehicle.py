@@ -57,7 +57,7 @@ class CompiledVehicle:
     """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
 
     Args:
-        vehicle: trim and factors.
+        vehicle: trim, and factors of drag and added mass.
         current_mps: (3,) steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
         timestep_s: physics timestep.
@@ -91,7 +91,7 @@ class CompiledVehicle:
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
-        """Advances the time after the state was advanced.
+        """Advances the simulated time after `advance` has advanced the state.
 
         Raises:
             SurveyAborted: the physics diverged.

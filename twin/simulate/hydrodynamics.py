@@ -4,8 +4,8 @@
 
 A twist is the [angular, linear] velocity of the centre of gravity in body axes, a wrench is [moment, force]. The fourth
 term accounts for the rate of change of a steady current in rotating body axes: without it, the dynamics would not be
-Galilean invariant. The equation is solved for nu' including added mass; feeding back
-the acceleration of the last step would be unstable where added mass exceeds mass.
+Galilean invariant. The equation is solved for nu' including added mass; feeding back the acceleration of the last step
+would be unstable where added mass exceeds mass.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Hull(NamedTuple):
 
 
 def angular_first(linear_first: Array) -> Array:
-    """Reorders (6, ...) from [surge, sway, heave, roll, pitch, yaw] to [roll, pitch, yaw, surge, sway, heave]."""
+    """Reorders rows (6, ...) from [surge, sway, heave, roll, pitch, yaw] to [roll, pitch, yaw, surge, sway, heave]."""
     return np.roll(linear_first, 3, axis=0)
 
 
@@ -99,7 +99,7 @@ def free_joint_acceleration(
 
     Args:
         velocity: (6,) velocity of the free joint [m/s, rad/s].
-        hull, world_from_body, current_mps, wrench: see `acceleration`.
+        hull, world_from_body, current_mps, wrench: same as in `acceleration`.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
     body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)

@@ -28,7 +28,7 @@ class MujocoVehicle:
 
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        vehicle: trim and factors.
+        vehicle: trim, and factors of drag and added mass.
         current_mps: (3,) steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
     """
@@ -42,7 +42,7 @@ class MujocoVehicle:
         self._velocity = self._data.qvel[first_v : first_v + 6]  # a view into MjData
         self._dofs = slice(first_v, first_v + 6)
         self._acceleration = np.zeros(6)
-        self._kick = 0.5  # the first step advances the velocity by half a timestep, see above
+        self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
         self._thrusters = LaggedThrusters(BLUEROV2_HEAVY, self._model.opt.timestep)
         self._history: deque[tuple[float, Array, Array]] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]

@@ -25,8 +25,8 @@ class NavigationSensors:
 
     Args:
         settings: the sensors used for aiding, and the interval of acoustic fixes.
-        noise: standard deviations by data sheet, and the surveyed positions of the beacons.
-        rig: stereo rig as calibrated.
+        noise: standard deviations from the data sheets, and the surveyed positions of the beacons.
+        rig: nominal calibration of the stereo rig.
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
         project: true projection of the left camera: points (n, 3) in the camera to pixels (n, 2). None: `rig.project`.
     """
@@ -197,11 +197,11 @@ def _dvl_velocity(velocity_mps, gain, sigma_mps, numbers):
 
 
 class AcousticPositioning:
-    """Ultra-short baseline (USBL) positioning, triggered by keyframes so that a fix has the time of a stereo pair.
+    """Ultra-short baseline (USBL) positioning, triggered by keyframes so that each fix coincides with a stereo pair.
 
     Args:
         noise: standard deviations.
-        interval_s: least time between fixes.
+        interval_s: shortest time between fixes.
         rng: random generator of this sensor only.
     """
 
@@ -229,7 +229,7 @@ def detect_beacons(
     noise: SensorNoise,
     rng: np.random.Generator,
 ) -> tuple[BeaconDetection, ...]:
-    """Simulates the detection of beacons in the left image; beacons behind the floor are not detected.
+    """Simulates the detection of beacons in the left image; beacons occluded by the floor are not detected.
 
     Noise is drawn for every beacon, so that random numbers do not depend on which beacons are in view.
 

@@ -31,7 +31,7 @@ def steady_thrust_n(command: Array, coefficients: Array) -> Array:
 
 
 class ThrusterState(NamedTuple):
-    """State and parameters of n thrusters with a linear lag, for a fixed timestep; two arrays are modified in place.
+    """State and parameters of n thrusters with a linear lag for a fixed timestep; the state is modified in place.
 
     Args:
         a, b, c: (m, m), (m, 1), (m,) discrete state-space model of the lag: transition, input and output.

@@ -21,9 +21,10 @@ _MAX_REASONS = 12
 
 
 class MetricSummary(NamedTuple):
-    """Distribution of a metric over the surveys: median and 95 % bound, i.e. the 95th percentile.
+    """Distribution of a metric over the surveys: median, one-sided 95 % bound and required limit.
 
-    The bound of a metric of which more is better is the 5th percentile. `limit` is the requirement, if there is one.
+    The bound is the 95th percentile, or the 5th percentile if larger values of the metric are better. `limit` is None
+    if the metric has no requirement.
     """
 
     name: str
@@ -34,7 +35,7 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for text), and explained fraction of the rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN for text values) and explained rank variance."""
 
     key: str
     metric: str
@@ -86,7 +87,7 @@ class StudyAnalysis:
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is required, or any survey has a value of it (only images have a contrast)."""
+        """Returns whether the metric is required or has a value in any survey (surrogate surveys have no contrast)."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
@@ -205,7 +206,7 @@ class StudyAnalysis:
     def threshold(self) -> tuple[Interval, bool] | None:
         """Returns the value of the `seek` key at the required pass probability, and whether that probability increases.
 
-        None if the study has no `seek` key, or no survey could be evaluated.
+        Returns None if the study has no `seek` key, or if no survey could be evaluated.
         """
         key = self.study.seek
         x = self.key_numbers(key) if key is not None and key in self.keys else None
@@ -217,7 +218,7 @@ class StudyAnalysis:
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Returns the numeric keys of surveys that passed and that did not, best separation first."""
+        """Returns the comparison of each numeric key between surveys that passed and did not, best separation first."""
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)
@@ -230,7 +231,7 @@ class StudyAnalysis:
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:
-        """Returns the reasons why surveys did not pass, without their numbers, the most frequent first."""
+        """Returns the reasons why surveys did not pass, with numbers masked and the most frequent first."""
         counts: dict[tuple[str, str], int] = {}
         for k in np.flatnonzero(~self.passed):
             reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))

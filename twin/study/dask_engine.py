@@ -17,10 +17,10 @@ from twin.study.engine import Outcome, Result, Task
 from twin.study.worker import Reply, TaskLimits, WorkerPool, describe_exception
 
 _CONNECT_TIMEOUT_S = 20
-_QUEUED_PER_THREAD = 8  # keeps every worker busy, and the memory of a queue of 100,000 tasks bounded
+_QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all of up to 100,000 tasks at once
 _MIN_QUEUED = 64
 _REFRESH_S = 2.0
-_MAX_LOST_WORKERS = 3  # during one task
+_MAX_LOST_WORKERS = 3  # a task that loses more workers than this has failed
 
 
 @contextmanager
@@ -28,20 +28,20 @@ def connect_scheduler(address: str) -> Iterator[DaskEngine]:
     """Yields an engine on the workers of a running Dask scheduler.
 
     Raises:
-        TwinError: the scheduler does not answer.
+        TwinError: the scheduler does not respond.
     """
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
         allowed = "the address of a running scheduler, e.g. tcp://host:8786"
-        raise TwinError("--scheduler", f"{address} does not answer: {error}", allowed) from None
+        raise TwinError("--scheduler", f"{address} does not respond: {error}", allowed) from None
     with client:
         yield DaskEngine(client)
 
 
 @contextmanager
 def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
-    """Yields an engine on a new Dask cluster of this number of SLURM jobs.
+    """Yields an engine on a new Dask cluster of `jobs` SLURM jobs.
 
     Raises:
         TwinError: dask-jobqueue is not installed.
@@ -74,7 +74,7 @@ class DaskEngine:
     def run_many(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
     ) -> Iterator[Outcome[Task, Result]]:
-        """Runs `function` on every task; see `Engine.run_many`. If a Dask worker is lost, another one gets its tasks.
+        """Runs `function` on every task; see `Engine.run_many`. The tasks of a lost Dask worker are resubmitted.
 
         Raises:
             TwinError: the connection to the scheduler was lost.
@@ -96,7 +96,7 @@ class DaskEngine:
 
 
 class _WorkerPoolPlugin(WorkerPlugin):
-    """Worker pool of one Dask worker."""
+    """Dask plugin that holds the worker pool of one Dask worker."""
 
     name = "twin-worker-pool"
 
@@ -114,7 +114,7 @@ def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> 
 
 
 class _QueueSize:
-    """Number of tasks to submit to a cluster whose size may change; cached, because a query takes a round trip."""
+    """Number of tasks to submit to a cluster whose size may change; cached, because each query is a network call."""
 
     def __init__(self, client: Client):
         self.client, self.tasks, self.updated_s = client, 0, -math.inf
@@ -135,5 +135,5 @@ def _outcome(task: Any, future: Future, result: Any) -> Outcome:
         raise TwinError("--scheduler", "the connection was lost", "a running scheduler; continue with --resume")
     error: Any = result[1] if isinstance(result, tuple) else future.exception()
     if isinstance(error, KilledWorker):
-        return Outcome(task, None, "the Dask workers that ran it were lost", error.allowed_failures + 1)
+        return Outcome(task, None, "the Dask workers that ran the task were lost", error.allowed_failures + 1)
     return Outcome(task, None, describe_exception(error), 1)

@@ -25,7 +25,7 @@ class Sample(NamedTuple):
 def samples(study: Study) -> Iterator[Sample]:
     """Yields all settings of a study: each design point combined with every cell of the grids.
 
-    With "random" or "sobol", a larger number of samples begins with the samples of a smaller one.
+    With the methods "random" and "sobol", the first samples stay the same if the number of samples is increased.
     """
     axes = list(_sampled_axes(study))
     cells = [dict(pairs for part in cell for pairs in part) for cell in product(*_grid_axes(study))]
@@ -41,7 +41,7 @@ def samples(study: Study) -> Iterator[Sample]:
 
 
 def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
-    """Returns the seeds that a sample is flown with: common to all samples, or to those of its design point."""
+    """Returns the seeds of a sample, which are common to all samples or to those of the same design point."""
     plan = study.sampling
     first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]

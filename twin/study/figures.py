@@ -234,7 +234,7 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
 
 
 def key_histograms(analysis: StudyAnalysis) -> Figure | None:
-    """Draws the histogram of each numeric key, stacked by surveys that passed and that did not."""
+    """Draws the histogram of each numeric key, with surveys that passed and that did not stacked."""
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
     keys = [key for key in analysis.keys if analysis.key_numbers(key) is not None]
     if not keys or not good.any() or not bad.any():

@@ -14,9 +14,9 @@ from twin.errors import ScenarioError, TwinError
 from twin.study.surveys import Survey
 
 Row = dict[str, Any]
-#: Files of a run folder that are kept, by the study's `keep`.
+#: Files of a run folder that are kept, for each value of the study's `keep`.
 KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
-#: Outputs that a run writes, by the study's `keep`; outputs that would be removed are not made.
+#: Outputs that a run writes, for each value of the study's `keep`; outputs that would be removed are not written.
 OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
 
 
@@ -32,7 +32,7 @@ def fly(survey: Survey) -> Row:
     cv2.setNumThreads(1)
     start = time.perf_counter()
     for leftover in survey.folder.parent.glob(f".{survey.folder.name}.*"):
-        shutil.rmtree(leftover, ignore_errors=True)  # of an attempt that was killed
+        shutil.rmtree(leftover, ignore_errors=True)  # files of an attempt that was killed
     scratch = survey.folder.with_name(f".{survey.folder.name}.{uuid4().hex[:8]}")
     try:
         metrics = single_survey.run(survey.scenario, scratch, outputs=OUTPUTS[survey.keep]).metrics

@@ -30,7 +30,7 @@ class ResultsLog:
         self._unwritten: list[str] = []
 
     def add(self, row: Row) -> None:
-        """Writes a row, with the earlier ones that could not be written."""
+        """Writes a row, together with earlier rows that could not be written."""
         self._unwritten.append(json.dumps(row) + "\n")
         with suppress(OSError):
             self.flush()
@@ -65,7 +65,7 @@ class ResultsLog:
                     yield row
 
     def done(self) -> set[tuple[int, int]]:
-        """Returns sample and seed of the surveys that have a result; those that failed are to be flown again."""
+        """Returns sample and seed of every survey with a result; excludes failed surveys, which are flown again."""
         status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
         return {key for key, last in status.items() if last != "failed"}
 

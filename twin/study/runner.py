@@ -46,7 +46,7 @@ def run_study(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> StudyResult:
-    """Flies the surveys that the folder has no result of, and writes results.parquet and study.html.
+    """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
     Ctrl-C ends the study early; the results up to then are written.
 
@@ -85,7 +85,7 @@ def run_study(
 
 
 def open_folder(folder: Path, resume: bool, planned: Iterable[Survey]) -> ResultsLog:
-    """Returns the results log of a new folder, or with `resume` that of an earlier run of the same study.
+    """Returns the results log of a new folder or, with `resume`, of the folder of an earlier run of the study.
 
     Raises:
         TwinError: the folder is not empty, cannot be written, or belongs to another study.
@@ -114,7 +114,7 @@ def fly_surveys(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> bool:
-    """Flies surveys and calls `add_row` with the row of each as it ends; returns False if Ctrl-C interrupted it."""
+    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C."""
     try:
         for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
             row = row_of_outcome(outcome)

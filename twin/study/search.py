@@ -18,7 +18,7 @@ from twin.judge.require import more_is_better
 from twin.study.distribution import Distribution
 from twin.study.study_file import Study, TuningConfig
 
-NAME = "twin"  #: of the Optuna study in the journal
+NAME = "twin"  #: name of the Optuna study in the journal
 
 
 class Proposal(NamedTuple):
@@ -30,10 +30,10 @@ class Proposal(NamedTuple):
 
 
 class Search:
-    """Search of a plan; its trials are in `optuna.journal`, which other programs may read at the same time."""
+    """Search for a plan; its trials are in `optuna.journal`, which other programs may read at the same time."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path):
-        """Starts the search, or continues that of the folder.
+        """Starts a search, or continues the search stored in the folder.
 
         Raises:
             TwinError: the journal belongs to another search.

@@ -12,8 +12,8 @@ from scipy import optimize, stats
 
 Array = NDArray[np.float64]
 LEVEL = 0.95  #: confidence level of every interval
-RESAMPLES = 2000  #: of every bootstrap
-_MIN_CLUSTERS = 5  # for a bootstrap interval
+RESAMPLES = 2000  #: number of resamples of every bootstrap
+_MIN_CLUSTERS = 5  # smallest number of clusters for a bootstrap interval
 _MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value, others into bins
 
 
@@ -45,9 +45,9 @@ def wilson_interval(successes: float, n: float) -> Interval:
 def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
     """Returns the proportion of successes with Wilson's interval, corrected for correlation within clusters.
 
-    The number of surveys is divided by the design effect (Kish 1965): the variance of the proportion estimated between
-    clusters over that of independent surveys. This effective number is limited to the range from the number of
-    clusters to the number of surveys.
+    The effective number of surveys is their number divided by the design effect (Kish 1965), i.e. by the ratio of the
+    variance of the proportion, estimated from the variation between clusters, to its variance for independent surveys.
+    It is limited to the range from the number of clusters to the number of surveys.
 
     Args:
         passed: (n,) whether each survey passed.
@@ -76,7 +76,7 @@ def bootstrap_interval(
         clusters: (n,) label of the cluster of each value; None if the values are independent.
 
     Returns:
-        The bounds are NaN with fewer than five clusters.
+        The statistic with its interval; the bounds are NaN with fewer than five clusters.
     """
     data = np.asarray(values, dtype=float)
     table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
@@ -97,7 +97,7 @@ def bootstrap_interval(
 
 
 def _by_cluster(values: Array, clusters: NDArray) -> Array:
-    """Returns the values as a (clusters, size of the largest) table, padded with NaN."""
+    """Returns the values as a table with one row per cluster, padded with NaN to the size of the largest."""
     _, index = np.unique(clusters, return_inverse=True)
     order = np.argsort(index, kind="stable")
     sizes = np.bincount(index)
@@ -113,7 +113,7 @@ def median(values: Array) -> Array:
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Returns a percentile along the last axis, ignoring NaN; ten times slower if there are any."""
+    """Returns a percentile along the last axis, ignoring NaN; ten times slower if the array contains NaN."""
     function = np.nanpercentile if np.isnan(values).any() else np.percentile
     return function(values, percent, axis=-1)
 
@@ -136,7 +136,7 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
 def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
     """Returns the fraction of the variance of y's ranks that the groups explain, corrected for chance.
 
-    An estimate of the first-order Sobol index of the ranks, by epsilon squared (Kelley 1935):
+    This estimates the first-order Sobol index of the ranks by epsilon squared (Kelley 1935):
     1 - (within / (n - k)) / (total / (n - 1)). NaN with fewer than five values per group on average.
 
     Args:
@@ -184,7 +184,7 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
 
 def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool, clusters: ArrayLike) -> Interval:
-    """Returns the x at which the pass probability crosses a given value, with its cluster bootstrap interval.
+    """Returns the value of x at which the pass probability crosses a given value, with its bootstrap interval.
 
     The pass probability is estimated as a monotone function of x by isotonic regression (Barlow et al. 1972).
 
@@ -196,7 +196,7 @@ def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool,
         clusters: (n,) label of the cluster of each survey.
 
     Returns:
-        Infinite if the probability is not crossed within the data; NaN with fewer than five clusters.
+        The threshold; infinite if the probability is not crossed within the data; NaN with fewer than five clusters.
     """
     sign, success = 1.0 if rising else -1.0, np.asarray(passed, float)
     _, cluster = np.unique(np.asarray(clusters), return_inverse=True)
@@ -224,9 +224,9 @@ def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool,
 
 
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
-    """Returns the group of each number: its value if there are few distinct ones, else one of up to ten equal bins.
+    """Returns the group index of each number: one group per distinct value if these are few, else up to ten bins.
 
-    Each bin has about the same number of values.
+    Each bin has about the same number of elements.
     """
     values = np.asarray(x, dtype=float)
     distinct, index = np.unique(values, return_inverse=True)

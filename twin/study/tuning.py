@@ -1,4 +1,7 @@
-"""Search of a survey plan: candidates share samples and seeds; finalists are evaluated again with new ones."""
+"""Search for a survey plan.
+
+All candidates are flown with the same samples and seeds; finalists are evaluated again with new samples and seeds.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from twin.study.study_file import Study, TuningConfig
 from twin.study.surveys import Survey, merge_errors, scenario_of_sample, survey_keys, surveys_of_sample
 
 _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study has none
-_SEED_OFFSET = 1_000_000  # of the confirmation of finalists
+_SEED_OFFSET = 1_000_000  # added to the seed of the study for the confirmation of finalists
 _PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna does not accept infinity
 
 
@@ -69,7 +72,7 @@ def tune(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> TuningResult:
-    """Searches the plan that `[tune]` describes, and writes results.parquet. Ctrl-C ends the search early.
+    """Searches for the plan specified by `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
         folder: results folder, new or empty unless `resume` is set.
@@ -152,7 +155,7 @@ class CandidateSurveys:
             self.add(row)
 
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the surveys that confirm a finalist: with new samples and seeds, and `confirm` times as many.
+        """Returns the surveys that confirm a finalist: `confirm` times as many, with new samples and seeds.
 
         Args:
             rows: rows of the surveys flown so far.

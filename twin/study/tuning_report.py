@@ -83,9 +83,9 @@ def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[st
 
 
 def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -> str:
-    """Returns the recommended plan as a scenario file with the headline as a comment, or "" if there is no such plan.
+    """Returns the recommended plan as a scenario file with the headline as a comment, or "" if there is no plan.
 
-    The scenario is rendered, even if the search used the surrogate.
+    The scenario uses rendered images, even if the search used the surrogate.
     """
     if result.scenario is None:
         return ""

@@ -1,4 +1,4 @@
-"""Results of a study in sentences."""
+"""Text for the results of a study: names and values of metrics, and sentences."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _threshold(study: Study, analysis: StudyAnalysis) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the number of surveys with a warning and the first warning; "" without any."""
+    """Returns a sentence with the number of surveys with a warning and the first warning, or ""."""
     warned = analysis.warning[analysis.warning != ""]
     return f" Warning in {len(warned)} of {len(analysis.warning)} surveys: {warned[0]}." if len(warned) else ""
 
@@ -162,16 +162,16 @@ def _failed(analysis: StudyAnalysis) -> str:
 
 
 def superiority(comparison: KeyComparison) -> str:
-    """Returns how well the values of a key separate the surveys that did not pass from those that passed."""
+    """Returns a phrase on how well a key separates the surveys that did not pass from those that passed."""
     higher = comparison.superiority >= 0.5
     probability = comparison.superiority if higher else 1 - comparison.superiority
     if probability < 0.6:
         return "no clear difference"
-    return f"{'higher' if higher else 'lower'} if not passed, in {percent(probability)} of pairs"
+    return f"{'higher' if higher else 'lower'} in surveys that did not pass, in {percent(probability)} of pairs"
 
 
 def independence_note(analysis: StudyAnalysis) -> str:
-    """Returns which surveys the confidence intervals assume to be independent."""
+    """Returns a sentence on which surveys the confidence intervals assume to be independent."""
     n = len(np.unique(analysis.clusters))
     if n == analysis.rows.num_rows:
         return "The confidence intervals assume that the surveys are independent."
@@ -183,7 +183,7 @@ def independence_note(analysis: StudyAnalysis) -> str:
 
 
 def seeds_note(study: Study) -> str:
-    """Returns which surveys share their floor and noise, i.e. their seeds."""
+    """Returns a sentence on which surveys share their seeds, i.e. their floor and noise."""
     sampling = study.sampling
     if not sampling.paired:
         return "Each design point has its own seeds, i.e. its own floor and noise."

@@ -157,7 +157,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def main(pipe: int, core: int | None) -> None:
-    """Runs the worker process: answers each pickled (function, task) with a pickled `Reply` until the pipe closes."""
+    """Runs the worker process: sends a pickled `Reply` to each pickled (function, task) until the pipe closes."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     threading.Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()

@@ -1,4 +1,4 @@
-"""The closed loop between two keyframes, compiled: frames of which only motion and readings are simulated."""
+"""Compiled closed loop of vehicle, sensors, navigator and pilot over the frames between two keyframes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from twin.world.world import FastForward, World
 def compiled_loop(
     world: World, vehicle: CompiledVehicle, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
 ) -> FastForward:
-    """Returns the loop of `survey.fly` over all frames up to the next keyframe, as long as F2F can track them.
+    """Returns a function that runs the loop of `survey.fly` up to the next keyframe, if F2F can track points.
 
-    Every frame passes the same steps with the same random numbers as in `survey.fly`.
+    Each frame is computed with the same operations and random numbers as in `survey.fly`.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
@@ -57,8 +57,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     """Runs the closed loop over n frames.
 
     Returns:
-        The number of frames (fewer where the physics diverged), the dead reckoning state after them, and the poses
-        (n, 4, 4): true, by F2F alone, online.
+        Number of frames simulated (fewer than n if the physics diverged), dead-reckoning state after the last frame,
+        and three arrays of poses (n, 4, 4): true, integrated from F2F alone, and estimated online.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals
@@ -76,7 +76,7 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
         geometry.copy_into(f2f[k], state.f2f)
         geometry.copy_into(online[k], state.online)
         last = true[k]
-        twist = geometry.log(motion) * (1 / interval_s)  # the expression of `Navigator.update`, to the last bit
+        twist = geometry.log(motion) * (1 / interval_s)  # bit-identical to `Navigator.update`
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
         if has_diverged(body):

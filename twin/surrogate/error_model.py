@@ -57,9 +57,10 @@ class ErrorModel(NamedTuple):
         match_sigma_px: reported standard deviation of a patch's position in one image.
         match_error_ratio: true over reported standard deviation of that position.
         lamp_error_growth: growth of the match error under lamps that move with the vehicle: the square of
-            `match_error_ratio` is multiplied by 1 + (lamp_error_growth * lamps' share of the light)^2.
+            `match_error_ratio` is multiplied by 1 + (lamp_error_growth * lamp_share)^2, with
+            lamp_share the fraction of the reflected light that comes from the lamps.
         match_fraction: fraction of the points in view of another keyframe that are matched there.
-        match_covariance_inflation: factor on the covariance of a link, for matches of overlapping patches are
+        match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
             correlated; see `matching.variance_inflation`.
         match_bias_fraction: fraction of the standard deviation in the earlier stereo pair of a link that is a bias of
             that pair, common to all of its links. The remainder is independent from link to link.
@@ -77,12 +78,12 @@ class ErrorModel(NamedTuple):
         f2f_error_ratio: true over reported standard deviation of a frame-to-frame motion.
         f2f_anticorrelation: fraction of a frame's error that the next frame cancels (a moving-average process of order
             one), because both are measured relative to the same points.
-        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as that of a flow
-            vector with as many vectors as from frame to frame.
+        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
+            deviation of a flow vector, for as many flow vectors as in F2F.
         mosaic_error_ratio: true over reported standard deviation of a registration.
         depth_sigma_px: reported standard deviation of a pixel's filtered depth [px of disparity].
         depth_error_ratio: true over reported standard deviation of that depth.
-        lateral_sigma_px: standard deviation of a lateral shift of the surface that all views of it share.
+        lateral_sigma_px: standard deviation of the lateral shift of the surface that is common to all of its views.
         map_completeness: fraction of the cells in view whose depth is known.
     """
 

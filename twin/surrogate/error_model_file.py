@@ -1,4 +1,4 @@
-"""TOML file of an error model: its parameters, the misfit of the fit, and the range of the surveys fitted to."""
+"""TOML file of an error model: its parameters, the number of surveys that it was fitted to, and the misfit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
 _RANGE_FACTOR = 1.5  # factor by which a bound may lie outside the fitted range without a warning
-#: Current names of keys by their former names.
+#: Renamed keys: former name to current name.
 _RENAMED = {
     "surveys": "n_surveys",
     "bound_px": "bound_range_px",
@@ -69,7 +69,7 @@ class FittedErrorModel:
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
-    """Reads an error model from a file, or the project's own if None.
+    """Reads an error model from a file; None reads the error model supplied with this package.
 
     Raises:
         TwinError: the file does not exist, is not an error model, or uses former names.

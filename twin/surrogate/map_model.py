@@ -26,9 +26,9 @@ class CellErrors(NamedTuple):
 
     Args:
         lateral_noise: (rows, cols) standard normal numbers of the lateral error that all views of a cell share.
-        dropout: (rows, cols) uniform numbers in [0, 1); a cell above `completeness` stays unknown.
+        dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
         lateral_sigma_px: standard deviation of the lateral error.
-        depths_m: (m,) ascending depths at which the following are given.
+        depths_m: (m,) ascending depths at which the arrays below are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth [px of disparity].
         completeness: (m,) fraction of the cells whose depth is known.
@@ -67,7 +67,7 @@ class MapModel:
 
     @property
     def steepness(self) -> Map:
-        """Magnitude of the floor's gradient (rows, cols)."""
+        """Returns the magnitude of the floor's gradient (rows, cols)."""
         return np.hypot(*np.moveaxis(self._slope, -1, 0))
 
     def mark_seen(self, world_from_camera: Array) -> None:
@@ -96,7 +96,7 @@ class MapModel:
             rng: random generator of the errors of this view alone.
 
         Returns:
-            the patch, or None if the view does not overlap the grid.
+            The patch, or None if the view does not overlap the grid.
         """
         row, end_row, col, end_col = self._window(true)
         if row >= end_row or col >= end_col:

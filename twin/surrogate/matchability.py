@@ -24,8 +24,8 @@ from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 
 _DEPTHS = 6
-_PATCHES = 300  # sampled for the unevenness
-_SAMPLES = 9  # along each side of a patch
+_PATCHES = 300  # number of patches sampled to estimate the unevenness
+_SAMPLES = 9  # number of height samples along each side of a patch
 
 
 class Matchability:
@@ -143,7 +143,7 @@ def _gray(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns a piece of the floor's texture of the given extent, at most the whole, and its texel size [m]."""
+    """Returns the texture of a terrain file, or one generated for the given extent, and its texel size [m]."""
     t = scenario.terrain
     if t.kind == "file":
         return terrain.texture, terrain.texture_px_m

@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
 
-MIN_POINTS = 6  # for a motion
+MIN_POINTS = 6  # smallest number of points that determine a motion
 
 
 @njit(cache=True, nogil=True)
@@ -38,7 +38,7 @@ def sample_link(
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
         later_noise: (n, 3) standard normal numbers of the later pair's errors at these points.
         earlier_noise: (rows, cols, 3) standard normal numbers of the earlier pair's biases, over its image.
-        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, over the floor (repeated).
+        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, repeated every f floor cells.
         normals: (n + 1, 3) standard normal numbers of this link alone: of its points, and of their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
@@ -52,7 +52,7 @@ def sample_link(
         inflation: factor on the reported covariance due to correlated matches.
 
     Returns:
-        number of points that both keyframes see, motion earlier_from_later (4, 4), its reported covariance (6, 6).
+        Number of points that both keyframes see, motion earlier_from_later (4, 4), its reported covariance (6, 6).
     """
     focal, cx, cy, width, height, margin, baseline = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
@@ -93,7 +93,7 @@ def sample_link(
 
 @njit(cache=True, nogil=True, inline="always")
 def _floor_cell(pose, point, baseline, cell_m, n):
-    """Returns row and column, modulo n, of the floor cell at (x, y, disparity) in a camera."""
+    """Returns row and column, modulo n, of the floor cell that contains a point (x, y, disparity) of a camera."""
     depth = baseline / point[2]
     x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
     y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
@@ -105,7 +105,7 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
     """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its square root.
 
     Least squares of Negahdaripour & Madjidi (2003), eq. (2), with `n_effective` flow vectors of unit standard deviation
-    distributed as these points (n, 3), normalised (x, y, disparity).
+    distributed over the image and in depth like `points` (n, 3), normalised (x, y, disparity).
     """
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])

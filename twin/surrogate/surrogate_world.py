@@ -27,14 +27,14 @@ from twin.world.mission import Mission, Step
 from twin.world.pilot import PilotOfEstimates, RovPilot
 from twin.world.world import CameraImages, FastForward, World, left_camera, streams
 
-_BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # a camera without pixels
+_BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # image without pixels
 
 
 class SurrogateWorld(World):
     """World in which visual measurements are sampled from an error model.
 
     Attributes:
-        vision: the visual measurements.
+        vision: source of the sampled visual measurements.
     """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, fitted: FittedErrorModel):
@@ -50,7 +50,7 @@ class SurrogateWorld(World):
         super().__init__(
             mission, stopwatch, vehicle, NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
         )
-        # the vision must not refer to `self`, which refers to it: a reference cycle would keep the survey in memory
+        # `vision` must not hold a reference to `self`: the reference cycle would keep the survey in memory
         true_pose = partial(left_camera, vehicle, rig)
         self.vision = surrogate_vision(mission, fitted.model, true_pose, stopwatch)
         warning = fitted.coverage_warning(*self.vision.bounds_px)
@@ -79,7 +79,7 @@ class SurrogateWorld(World):
 def surrogate_vision(
     mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer
 ) -> SurrogateVision:
-    """Creates the sampled visual measurements of a mission.
+    """Returns a `Vision` that samples the visual measurements of a mission.
 
     Args:
         true_pose: returns the true world_from_camera (4, 4) of the left camera.

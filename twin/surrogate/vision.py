@@ -1,9 +1,9 @@
 """Visual measurements of a surrogate survey: true values with errors sampled from an error model.
 
 The surrogate is part of the simulated world: it has access to the truth and returns measurements only, each with the
-covariance that the estimators from images would report. A raster of points represents all matched points of a keyframe,
-with their noise scaled to the larger number. Links are computed from these points by the same equations as from images.
-The stereo noise of a keyframe is sampled once and is common to all of its links.
+covariance that the estimators from images would report. A raster of points represents all matched points of a keyframe;
+its noise is reduced to account for their larger number. Links are computed from these points by the same equations as
+from images. The stereo noise of a keyframe is sampled once and is common to all of its links.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _RASTER = (6, 8)  # rows and columns of points
 _RELIEF_CELLS = 128  # period of the errors due to relief, in floor cells
-_MIN_POINTS = 12  # represented by the raster
+_MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
 
 
@@ -70,7 +70,7 @@ class _KeyframeTruth(NamedTuple):
 
 
 class FrameErrors(NamedTuple):
-    """Errors of frame-to-frame motions since the last keyframe.
+    """Distribution of the errors of frame-to-frame motions since the last keyframe.
 
     Args:
         root: (6, 6) square root of the true covariance of the independent part of an error.
@@ -115,7 +115,7 @@ class SurrogateVision:
         last_normals: (6,) standard normal numbers of the last frame-to-frame motion.
     """
 
-    runs_in_background = False  # a link takes less time than the change of threads
+    runs_in_background = False  # sampling a link takes less time than a thread switch
 
     def __init__(
         self,
@@ -155,24 +155,24 @@ class SurrogateVision:
 
     @property
     def bounds_px(self) -> tuple[float, float]:
-        """Smallest and largest Cramer-Rao bound over the depths of the survey [px]."""
+        """Returns the smallest and the largest Cramer-Rao bound over the depths of the survey [px]."""
         bounds_px = self.scene.matchability.bounds_px
         return float(bounds_px.min()), float(bounds_px.max())
 
     @property
     def lamp_share(self) -> float:
-        """Fraction of the reflected light that comes from the lamps."""
+        """Returns the fraction of the reflected light that comes from the lamps."""
         return self.scene.matchability.lamp_share
 
     @property
     def bound_px(self) -> float:
-        """Cramer-Rao bound of a patch's position in the last keyframe [px]."""
+        """Returns the Cramer-Rao bound of a patch's position in the last keyframe [px]."""
         assert self._latest is not None
         return self._latest.bound_px
 
     @property
     def raster_fraction(self) -> float:
-        """Number of raster points of the last keyframe over the number of matched points that they represent."""
+        """Returns the ratio of raster points to the matched points that they represent, for the last keyframe."""
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
@@ -195,11 +195,11 @@ class SurrogateVision:
 
     @property
     def frame_errors(self) -> FrameErrors | None:
-        """Errors of frame-to-frame motions since the last keyframe; None if no points can be tracked."""
+        """Returns the errors of frame-to-frame motions since the last keyframe; None if no points can be tracked."""
         return self._f2f
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
-        self._f2f = None  # until `restart_tracking`: without stereo points there are none to track
+        self._f2f = None  # no points to track until `restart_tracking`
         with self.stopwatch("stereo"):
             pose, model, scene = self.scene.left_camera(), self.model, self.scene
             scene.map_model.mark_seen(pose)
@@ -247,7 +247,7 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns the square root of a covariance and the covariance (6, 6): motion from flow with this sigma."""
+        """Returns the square root of the covariance, and the covariance (6, 6), of a motion from flow vectors."""
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2
@@ -322,7 +322,7 @@ class SurrogateVision:
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns the standard normal numbers (n, 3) of a link between two keyframes."""
         state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
-        with self._link_lock:  # links are measured by other threads
+        with self._link_lock:  # links may be measured in other threads
             self._link_rng.bit_generator.state = state
             return self._link_rng.standard_normal((n, 3))
 

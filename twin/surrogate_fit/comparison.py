@@ -1,8 +1,8 @@
 """Comparison of measurements from images with those of the surrogate and with the truth, for the fit.
 
 During a rendered survey every measurement is made from the images and also sampled by the surrogate at the same true
-poses. The statistics are the ratios of the reported covariances of both, and the errors relative to the truth. Both
-measure the same geometry, so the ratios depend on the error model alone.
+poses. The statistics are ratios of covariances reported from images to those of the surrogate, and errors relative to
+the truth. Both measure the same geometry, so the ratios depend on the error model alone.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from twin.surrogate.vision import SurrogateVision
 _MIN_CELLS = 300
 _LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # a level cell has a smaller slope, a steep cell a larger one
 _NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
-#: Values of the link models in which one error source acts alone.
+#: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
 
 
 class ComparisonVision:
-    """`Vision` from images that collects statistics of the comparison with a surrogate.
+    """Implementation of `Vision` with images that also collects statistics of a comparison with a surrogate.
 
     Args:
         images: vision whose measurements are returned.
@@ -52,7 +52,7 @@ class ComparisonVision:
         self.statistics["lamp_share"] = [surrogate.lamp_share]
         self._poses: dict[int, Array] = {}
         self._last_node = -1
-        self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the path's last link
+        self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the last link along the path
         self._last_pose: Array | None = None
         self._frames: list[tuple[Array, Array]] = []  # error and covariance of each frame since the last keyframe
 
@@ -166,7 +166,7 @@ class ComparisonVision:
         return elevation
 
     def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds robust variance of the height errors and median reported variance, of level and steep cells [m^2]."""
+        """Adds the robust variance of height errors and the median reported variance of level and steep cells [m^2]."""
         map_model = self.surrogate.scene.map_model
         error = elevation.height_m - map_model.height_m
         level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE

@@ -1,8 +1,8 @@
 """Fit of the error model to the statistics of rendered surveys.
 
-Reported standard deviations are fitted by the medians of their ratios to the surrogate's, error ratios by those of
-squared errors in units of the reported covariance: medians, so that a few failed measurements have no effect. Every
-survey has the same weight.
+Reported standard deviations are fitted to the medians of their ratios to those of the surrogate, error ratios to the
+medians of squared errors normalised by the reported covariance. Medians are robust against a few failed measurements.
+Every survey has the same weight.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
         compared_gain: relief gain of the compared model.
 
     Returns:
-        ratio (n,) of the patch errors to those of the model with patch errors alone, relief gain, bias fraction.
+        Ratio (n,) of the patch errors to those of the model with patch errors alone, relief gain, bias fraction.
     """
     thirds = np.array([_squared_errors_by_distance(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
@@ -163,9 +163,10 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
 
 
 def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """Returns the error ratio of patches without lamps, and its growth with the lamps' share of the light.
+    """Returns the error ratio of patches without lamps, and its growth with `lamp_share`.
 
-    Fitted to the squared error ratios (n,) by least squares of their relative errors.
+    Both are fitted to the squared error ratios (n,) by least squares of their relative errors. `lamp_share` (n,) is
+    the fraction of the reflected light that comes from the lamps.
     """
     effects = np.column_stack([np.ones_like(error_ratios), lamp_share**2]) / error_ratios[:, None] ** 2
     constant, growth = nnls(effects, np.ones(len(error_ratios)))[0]
@@ -173,9 +174,9 @@ def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
-    """Returns mean squared link errors (3, 3): thirds of the links by distance, columns as `_SOURCES`.
+    """Returns mean squared link errors (3, 3): one row per third of the links by distance, one column per source.
 
-    The largest twentieth of each is left out.
+    The sources are those of `_SOURCES`. The largest 5 % of the squared errors in each third are excluded.
     """
     errors = np.column_stack([statistics[f"link_nees_{name}"] for name in _SOURCES])
     order = np.argsort(statistics["link_distance"])
@@ -186,10 +187,10 @@ def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
 def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: float) -> tuple[float, np.ndarray]:
     """Fits the growth of the reported link covariance with the distance between the keyframes.
 
-    Only the earlier pair's variance grows, so that of a link is multiplied by 1 + (growth * distance)^2 / 2.
+    Only the variance of the earlier pair grows, so the link variance is multiplied by 1 + (growth * distance)^2 / 2.
 
     Returns:
-        growth, ratio (n,) of the reported standard deviations at distance zero by survey.
+        Growth, and for each survey the ratio (n,) of the reported standard deviations at distance zero.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [

@@ -27,7 +27,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     """Returns the error model fitted to rendered surveys.
 
     Args:
-        surveys: statistics of each survey; those of aborted surveys are ignored.
+        surveys: statistics of each survey; aborted surveys are ignored.
         compared: error model of the surrogate in these comparisons.
 
     Raises:
@@ -41,12 +41,12 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Returns the statistics of a rendered survey, from its folder if they are there for the same error model."""
+    """Returns the statistics of a rendered survey; reads them from its folder if saved for the same error model."""
     return _load(scenario, folder, compared) or _fly(scenario, folder, compared)
 
 
 def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics | None:
-    """Returns the statistics in a folder; None if there are none of this scenario and error model."""
+    """Returns the statistics in a folder; None if there are none for this scenario and error model."""
     try:
         saved = json.loads((folder / _FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):

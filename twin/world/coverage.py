@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid, StereoRig
 
-#: Four neighbouring pixels whose depths differ by more than this share are an occluding edge and not a surface. At
+#: Four neighbouring pixels whose depths differ by more than this fraction span an occluding edge. At
 #: 0.2 deg per pixel, a slope of 86 deg is still a surface.
 EDGE_SHARE = 0.05
-#: Tolerance of the left-right depth comparison, as a share of the depth.
+#: Tolerance of the left-right depth comparison, as a fraction of the depth.
 DEPTH_TOLERANCE = 0.005
 _ROWS_PER_CALL = 64
 

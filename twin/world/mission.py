@@ -90,7 +90,7 @@ class Mission:
         return Course(self.plan.references(track, times_s), keyframes, holding=False)
 
     def hold(self, track: int) -> Course:
-        """Returns the frames of half the station keeping after a track (from 1)."""
+        """Returns the frames of half of the station-keeping time after a track (from 1)."""
         n = self._n_holding
         end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
         return Course(end, np.zeros(n, np.bool_), holding=True)
@@ -145,7 +145,7 @@ def prepare(scenario: Scenario) -> Mission:
 
 
 def _attempt(build, source: Source, errors: list[str]):
-    """Returns what `build` returns, or None and appends its error to the list."""
+    """Returns the result of `build`; if it raises an error, appends the error to the list and returns None."""
     try:
         return build()
     except TwinError as error:
@@ -219,9 +219,9 @@ def _check_surrogate(scenario: Scenario) -> None:
 
 
 def _check_beacons_listed(scenario: Scenario) -> None:
-    """Checks that a survey that is aided by beacons has some."""
+    """Checks that the scenario defines beacons if they are used for aiding."""
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
-        raise TwinError("navigation.aiding", "'beacons': the scenario has none", "with a [[beacons]] position_m")
+        raise TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
@@ -264,7 +264,7 @@ def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan
     if (least := above.min()) < 0:
         raise TwinError(
             f"lamps.{number}.position_m", f"is {-least:.2f} m below the floor at x {x[above.argmin()]:.1f},"
-            f" y {y[above.argmin()]:.1f}", f"{scenario.lamps[number].position_m[2] - least:.2f} up or more",
+            f" y {y[above.argmin()]:.1f}", f"{scenario.lamps[number].position_m[2] - least:.2f} or more for z (up)",
         )  # fmt: skip
 
 
@@ -308,7 +308,7 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
-    """Returns the grid of the map: the reference plane in view along the planned path, plus a margin of 0.5 m."""
+    """Returns the grid of the map: the part of the reference plane in view along the path, plus a margin of 0.5 m."""
     corners = plan.outline()[:, :2]
     across_m, along_m = plan.footprint_m
     margin = np.array([along_m, across_m]) / 2 + 0.5

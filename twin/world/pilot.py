@@ -1,4 +1,4 @@
-"""The pilot: from the online estimate of the camera to the command of the vehicle."""
+"""Pilot, which computes the vehicle command from the online estimate of the camera pose."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from twin.core.records import Estimate
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
 
-_VELOCITY_SMOOTHING_S = 0.1  # frame-to-frame velocity is noisy; the hull cannot change its own faster
+_VELOCITY_SMOOTHING_S = 0.1  # frame-to-frame velocity is noisy; the true velocity changes more slowly
 
 
 PilotOfEstimates = Callable[[Estimate, Reference], Array]
@@ -46,7 +46,7 @@ class PilotState(NamedTuple):
         lever_arm_m: (3,) position of the camera in the body [m].
         smoothing: weight of a new velocity in the moving average.
         twist: (6,) smoothed twist of the body [rad/s, m/s].
-        controller: state of the controller of the body.
+        controller: state of the body's controller.
     """
 
     camera_from_body: Array
@@ -58,7 +58,7 @@ class PilotState(NamedTuple):
 
 
 class RovPilot:
-    """Pilot of the ROV; its command is (8,) thruster commands, -1 to 1."""
+    """Pilot of the ROV; its commands are those of the eight thrusters (8,), -1 to 1."""
 
     def __init__(self, mission: Mission):
         rig = mission.rig
@@ -80,7 +80,7 @@ class RovPilot:
 
 @njit(cache=True, nogil=True)
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
-    """Returns thruster commands for an estimated pose (4, 4) and twist (6,) of the camera and its reference."""
+    """Returns the thruster commands (8,) for an estimated pose (4, 4) and twist (6,) of the camera and a reference."""
     geometry.copy_into(
         state.twist,
         state.twist + state.smoothing * (state.body_from_camera_twist @ camera_velocity - state.twist),

@@ -22,7 +22,7 @@ from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
-    """World whose images are rendered by MuJoCo and lit by the optics of `twin.imaging`; holds an OpenGL context."""
+    """World whose images are rendered by MuJoCo and lit by the optics of `twin.imaging`; owns an OpenGL context."""
 
     def __init__(self, mission: Mission, stopwatch: StageTimer):
         scenario, cameras = mission.scenario, mission.true_cameras

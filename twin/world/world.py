@@ -1,4 +1,4 @@
-"""The simulated world of a survey: thruster commands in, frames out, and a record of the ground truth."""
+"""Simulated world of a survey: executes commands, returns frames and records the ground truth."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
-#: Random streams in the order in which seeds are spawned: appending one leaves the draws of the others unchanged.
+#: Random streams in the order in which seeds are spawned: a stream added at the end leaves the others unchanged.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
 
-#: Advances the closed loop from frame k of a course towards the next keyframe; returns the next frame.
+#: Advances the closed loop from frame k of a course towards the next keyframe; returns the index of the next frame.
 FastForward = Callable[[Course, int], int]
 
 
@@ -78,11 +78,11 @@ class World(ABC):
 
     @abstractmethod
     def capture(self, step: Step) -> CameraImages:
-        """Returns the images of the cameras at the present pose."""
+        """Returns the images of the cameras at the current pose."""
 
     @abstractmethod
     def seen(self) -> NDArray[np.bool_]:
-        """Returns the cells of the map (rows, cols) that both cameras saw in at least one keyframe."""
+        """Returns the cells of the map (rows, cols) that both cameras observed in at least one keyframe."""
 
     @property
     def world_from_camera(self) -> Array:
@@ -90,11 +90,11 @@ class World(ABC):
         return left_camera(self.vehicle, self.mission.rig)
 
     def start_course(self, course: Course, track: int) -> None:
-        """Starts a course: the frames that follow are its frames, all of them unless the survey is aborted."""
+        """Starts a course: the next frames belong to it. All of its frames follow unless the survey is aborted."""
         self._courses.append((course.reference.position, course.holding, track))
 
     def observe(self, step: Step) -> Frame:
-        """Returns the frame of the present pose and records its ground truth."""
+        """Returns the frame at the current pose and records its ground truth."""
         index, images = len(self), self.capture(step)
         self.record(self.world_from_camera)
         time_s = index / self.mission.rig.frame_rate_hz
@@ -112,7 +112,7 @@ class World(ABC):
         return len(self._true_poses)
 
     def record(self, poses: Array) -> None:
-        """Records the true poses of one frame (4, 4) or several (n, 4, 4)."""
+        """Records the true pose (4, 4) of one frame, or the poses (n, 4, 4) of several frames."""
         self._true_poses.append(poses)
 
     def fast_forward(self, navigator: Any, pilot: PilotOfEstimates) -> FastForward:

@@ -2,11 +2,11 @@
 
 Factorisation is right-looking (Davis 2006, chapter 4): a finished panel subtracts its outer product from the panels
 after it, so no memory is needed in addition to the panels. A finished panel stores L1^-1 above L2, where L1 is the
-triangle of its own rows and L2 the rows below.
+lower triangle in its own rows and L2 the rows below.
 
 Blocks of the inverse follow Takahashi et al. (1973), from the last panel to the first. With W = L2 L1^-1,
-cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. All of cov(below) is by then stored in
-later panels, where it has replaced their part of the factor.
+cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. By then, all of cov(below) is stored in
+the later panels, where it has replaced the factor.
 
 In the kernels, s is the `SymbolicFactor`, p a panel and `_D` the size of a block.
 """
@@ -23,7 +23,7 @@ from twin.core.geometry import Array
 from twin.estimate.adjustment.elimination import BLOCK as _D
 from twin.estimate.adjustment.elimination import SymbolicFactor
 
-_MIN_RELATIVE_PIVOT = 1e-13  # of the original diagonal entry; a smaller pivot is rounding: the matrix is singular
+_MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; below it, the matrix is singular
 
 
 class CholeskyFactor(NamedTuple):
@@ -43,8 +43,8 @@ class CholeskyFactor(NamedTuple):
     def inverse_block(self, node: int) -> Array:
         """Returns the diagonal block (6, 6) of the inverse at a node.
 
-        It is y'y with y = L^-1 e and e the columns of the node in the identity. Only the ancestors of the node's panel
-        in the elimination tree contribute.
+        The block is y'y with y = L^-1 e, where e is the node's columns of the identity matrix. Only the node's panel
+        and its ancestors in the elimination tree contribute.
         """
         s = self.symbolic
         right, block = np.zeros((len(s.permutation), _D, _D)), np.zeros((_D, _D))
@@ -98,7 +98,7 @@ class BlockMatrix(NamedTuple):
             diagonal: (n, 6, 6) diagonal blocks.
 
         Raises:
-            LinAlgError: the matrix is not positive definite to rounding.
+            LinAlgError: the matrix is not numerically positive definite.
         """
         s, original = self.symbolic, np.empty((len(diagonal), _D))
         original[s.permutation] = np.diagonal(diagonal, axis1=1, axis2=2)
@@ -134,7 +134,7 @@ def _add(s, start, blocks, panels):
 
 @njit(cache=True, nogil=True)
 def _panel_matrix(s, panels, p):
-    """Returns a panel as a matrix, a view."""
+    """Returns a panel as a matrix (a view)."""
     return panels[s.offset[p] : s.offset[p + 1]].reshape(-1, _D * (s.panel_start[p + 1] - s.panel_start[p]))
 
 
@@ -169,7 +169,7 @@ def _invert_root(matrix, original, inverse):
 
     Args:
         matrix: (n, n), only the lower triangle is read.
-        original: (n,) diagonal of the matrix before elimination; a pivot that is small in comparison is rounding.
+        original: (n,) diagonal of the matrix before elimination; a pivot much smaller than this is rounding error.
         inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
     root = np.zeros_like(matrix)
@@ -203,7 +203,7 @@ def _next_ancestor(s, positions, start):
 
     Returns:
         end: positions[start:end] belong to the panel itself, the others are below it.
-        panel: its number.
+        panel: number of that panel.
         at: (m - start,) block row of each remaining position in that panel.
     """
     p, end = s.panel_of[positions[start]], start

@@ -58,9 +58,10 @@ def solve_pose_graph(
 
 
 def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
-    """Returns initial poses (4, 4) by node number, computed from the links alone; the lowest number is at the identity.
+    """Returns initial poses (4, 4) by node number, computed from the links alone.
 
-    Links are weighted by the inverse of their mean rotation variance and mean translation variance.
+    The pose of the node with the lowest number is the identity. Links are weighted by the inverse of their mean
+    rotation variance and mean translation variance.
     """
     columns = Links.from_sequence(links)
     numbers = np.unique(np.concatenate([columns.i, columns.j])).tolist()
@@ -86,10 +87,10 @@ def _least_squares(i: Indices, j: Indices, by_i: Array, right: Array, first: Arr
 
     Args:
         i, j: (m,) indices of the unknowns of each equation.
-        by_i: (m, d, d).
-        right: (m, d, 3).
-        first: (d, 3).
-        weights: (m,).
+        by_i: (m, d, d) coefficients of x_i.
+        right: (m, d, 3) constant terms.
+        first: (d, 3) value of x_0.
+        weights: (m,) weights of the equations.
     """
     m, d, _ = right.shape
     row = np.arange(m * d).reshape(m, d)

@@ -50,7 +50,8 @@ class SymbolicFactor(NamedTuple):
     def parent(self, panel: int) -> int | None:
         """Returns the parent of a panel in the elimination tree, None for a root.
 
-        The parent holds the first position below the panel, and its own rows include all others.
+        The parent is the panel that holds the first position below this panel. All other positions below this panel are
+        in the parent or below it.
         """
         below = self.rows_below(panel)
         return int(self.panel_of[below[0]]) if len(below) else None
@@ -126,7 +127,7 @@ def _fill_in(n, start, later):
     start[k + 1]], and the rows of its children in the elimination tree except k itself.
 
     Returns:
-        at (n + 1,) and below.
+        The arrays `at` (n + 1,) and `below`.
     """
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists

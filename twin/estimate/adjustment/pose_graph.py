@@ -25,8 +25,8 @@ from twin.estimate.adjustment import block_cholesky, elimination
 from twin.estimate.adjustment.elimination import Indices
 
 #: A step that raises the cost by more than this is rejected. The search ends when the decrease by an undamped step
-#: agrees with the prediction of the linear model to this tolerance. The next step could then gain about as much, which
-#: moves no pose by more than 0.05 of its standard deviation.
+#: agrees with the prediction of the linear model to this tolerance. The next step could then lower the cost by about
+#: this amount, which moves no pose by more than 0.05 of its standard deviation.
 _COST_TOLERANCE = 5e-4
 _INITIAL_DAMPING, _MIN_DAMPING = 1e-4, 1e-6  # relative to the diagonal
 _BATCH = 4096  # binary factors whose Jacobians are in memory at a time
@@ -71,7 +71,7 @@ class BinaryFactors(NamedTuple):
 
 
 class FactorGraph(NamedTuple):
-    """Factors of n poses, and the prior standard deviation of the shared parameter, of mean 0; None without one."""
+    """Factors of n poses, and the standard deviation of the shared parameter's zero-mean prior; None: no parameter."""
 
     n_poses: int
     unary: Sequence[UnaryFactors]
@@ -90,7 +90,7 @@ class _Evaluation(NamedTuple):
     """A factor graph evaluated at a state.
 
     Args:
-        cost: F.
+        cost: value of F.
         unary: residuals (m, d) of each kind of unary factors.
         binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
         chi2: squared whitened residuals (m,) of each kind of binary factors.
@@ -360,7 +360,7 @@ def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> Unary
 
     Args:
         pose_index: (m,) indices of the poses.
-        poses: (m, 4, 4) means.
+        poses: (m, 4, 4) mean poses.
         covs: (m, 6, 6) covariances [rotation, translation] (rad, m) in the poses' own axes.
     """
     return UnaryFactors(
@@ -406,7 +406,7 @@ def _relative_poses(poses, i, j):
 
 
 def transposed(matrices: Array) -> Array:
-    """Returns the transposes (m, b, a) of matrices (m, a, b), a view."""
+    """Returns the transposes (m, b, a) of matrices (m, a, b) (a view)."""
     return matrices.transpose(0, 2, 1)
 
 

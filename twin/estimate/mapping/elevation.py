@@ -17,7 +17,7 @@ Map = NDArray[np.float32]
 _VARIANCE_RATIO = 10.0
 #: Measured probability that the chosen hypothesis is wrong.
 _WRONG_CHOICE = 0.16
-#: Connected groups of fewer cells are removed.
+#: Connected groups with fewer cells than this are removed.
 MIN_CELLS = 12
 
 
@@ -25,18 +25,19 @@ class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
     A cell keeps up to two hypotheses of its height, because a steep cell is measured at its foot in one view and at its
-    edge in another. Each patch updates the hypothesis that fits best if it passes the gate (z - h)^2 < GATE (P + R);
-    otherwise it opens the second hypothesis, or replaces the one with the larger variance if its own is smaller. The
-    lower hypothesis is the result unless the higher one is much more certain, because matching windows extend near
-    surfaces over the floor behind them. Among cells with two hypotheses of the horseshoe reef, the lower one was right
-    in 82 %, the more certain one in 67 %, and this rule in 84 %.
+    edge in another. The height z in a patch updates the best-fitting hypothesis h if the innovation passes the gate
+    (z - h)^2 < GATE (P + R); otherwise z becomes the second hypothesis, or replaces the hypothesis with the larger
+    variance if its own variance is smaller. The lower hypothesis is the result unless the higher one is much more
+    certain, because matching windows extend near surfaces over the floor behind them. Of the cells of the horseshoe
+    reef with two hypotheses, the lower one was right in 82 %, the more certain one in 67 %, and this rule in 84 %.
 
-    The variance has two parts. That of depth is independent between patches and decreases with each fusion. That of
-    pose and smoothed slopes is shared by all cells of a leg, and mostly by all legs; its weighted mean over the patches
-    is kept, so it never averages out. The result adds two terms: the lateral error times the relief around the cell,
-    and a fraction of the squared height step for cells that may be on the wrong side of an edge. The fraction is the
-    lateral error relative to the cell, for steps larger than a cell. Without this term, the 1 % of cells at the edges
-    of a reef that show the other side made sigma 1.9 times too small over the whole map.
+    The variance has two parts. The part due to depth is independent between patches and decreases with each fusion. The
+    part due to the pose and to smoothed slopes is common to all cells of a leg, and mostly to all legs; its weighted
+    mean over the patches is kept, so it never averages out. The result adds two terms: the lateral error times the
+    relief around the cell, and a fraction of the squared height step for cells that may be on the wrong side of an
+    edge. The fraction is the lateral error relative to the cell, for steps larger than a cell. Without this term,
+    sigma was 1.9 times too small over the whole map of a reef, because 1 % of the cells, at the edges, have the height
+    of the wrong side.
 
     Args:
         grid: grid of the map.
@@ -49,7 +50,7 @@ class ElevationMapper:
         self._variance = np.full((2, *shape), np.inf, np.float32)
         self._systematic = np.zeros((2, *shape), np.float32)
         self._colour = np.zeros((*shape, 4), np.float32)
-        self._lateral_m: list[float] = [0.0, 0.0]  # sum, count
+        self._lateral_m: list[float] = [0.0, 0.0]  # sum and number of the lateral errors of the patches
 
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
@@ -144,7 +145,7 @@ def _remove_propagated(
 
 @njit(cache=True, nogil=True)
 def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances, systematics):
-    """Fuses a patch (rows, cols) into the two hypotheses per cell, layers (2, grid rows, grid cols), in place."""
+    """Fuses a patch (rows, cols) into the two hypotheses per cell, arrays (2, grid rows, grid cols), in place."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]

@@ -14,7 +14,7 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = 
     """Returns the grid that covers the images of all keyframes, each at the median depth of its matched points.
 
     Args:
-        result: with at least one keyframe.
+        result: result of a survey with at least one keyframe.
         cell_m: side of a cell [m]; by default three pixels at the median depth of the survey.
     """
     depth_m = result.keyframe_depth_m

@@ -49,7 +49,7 @@ class KeyframePath(NamedTuple):
 
 
 class _StereoDepth(NamedTuple):
-    """A stereo pair, its grey left image (H, W) and its depth by stereo alone."""
+    """A stereo pair, its grey left image (H, W) and its depth from stereo alone."""
 
     pair: KeyframeImages
     gray: Map
@@ -108,7 +108,7 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items, and computes the next one in a second thread meanwhile."""
+    """Yields the items, while a second thread computes the next one."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -131,7 +131,7 @@ def _advance(
     """Advances the filter to the next keyframe: propagation, fusion with stereo depth, fusion with depth from motion.
 
     Returns:
-        The depth map, and the pixels (H, W) bool that contain information of the old one.
+        The depth map, and the pixels (H, W) bool that contain information of the old depth map.
     """
     old_from_new = geometry.inverse(old.pose) @ pose
     propagated = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)

@@ -17,7 +17,7 @@ Map = NDArray[np.float32]
 #: Smallest cosine between a triangle's normal and the ray to it; below, it may connect two separate surfaces.
 MIN_COSINE = 0.05
 #: Lateral error of the surface that fusion does not reduce [px on the floor]: the matching window smooths relief and
-#: displaces edges in similar ways in all views. On a slope s it causes a height error of s times this.
+#: displaces edges in similar ways in all views. On a slope s it causes a height error of s times this value.
 LATERAL_SIGMA_PX = 0.35
 
 
@@ -28,9 +28,9 @@ class HeightPatch(NamedTuple):
         row, col: first cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
         variance_m2: (rows, cols) variance due to depth, independent between the depth maps that leave the filter.
-        systematic_m2: (rows, cols) variance that views share, due to the pose and the smoothing of slopes.
+        systematic_m2: (rows, cols) variance of errors common to the views, due to the pose and smoothed slopes.
         pixel: (rows, cols, 2) position (u, v) of the cell in the image.
-        lateral_m: lateral error at the mean depth of the map [m].
+        lateral_m: lateral error at the mean depth of the depth map [m].
     """
 
     row: int
@@ -47,8 +47,8 @@ def rasterise(
 ) -> HeightPatch | None:
     """Computes the heights of a depth map at the cell centres of a grid, linear in triangles between pixels.
 
-    Each square of four pixels makes two triangles. Triangles across a depth discontinuity, seen from below or at a
-    grazing angle are left out, so that no surface appears between the edge of a reef and the floor behind it. The
+    Each square of four pixels makes two triangles. Triangles across a depth discontinuity and those seen from below or
+    at a grazing angle are omitted, so that no surface appears between the edge of a reef and the floor behind it. The
     variance of depth is projected along the ray to the height of the surface. The covariance of the pose is projected
     likewise, with the effect of a horizontal error on a slope.
 
@@ -90,10 +90,10 @@ def rasterise(
 
 
 class _ViewGeometry(NamedTuple):
-    """View of a depth map onto the grid.
+    """Camera of a depth map, relative to the grid.
 
     Args:
-        position: (3,) camera relative to the north-west corner of the grid [m].
+        position: (3,) position of the camera relative to the north-west corner of the grid [m].
         axis: (3,) optical axis in the world.
         cov: (6, 6) covariance of the pose in world axes.
         cell_m: cell size.
@@ -116,7 +116,7 @@ def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row, first column, number of rows and of columns of the cells within bounds; None if none."""
+    """Returns first row, first column, number of rows and number of columns of the cells in bounds, None if empty."""
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -179,11 +179,11 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside one triangle of pixels a, b, c; the highest surface over a cell wins."""
+    """Writes the cells inside one triangle of pixels a, b, c; the highest surface over a cell is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
-    if not (j0 <= j1 and i0 <= i1):  # contains no cell centre, as most triangles
+    if not (j0 <= j1 and i0 <= i1):  # most triangles contain no cell centre
         return
     za, zb, zc = depth[va, ua], depth[vb, ub], depth[vc, uc]
     if not (za > 0 and zb > 0 and zc > 0) or 1 / min(za, zb, zc) - 1 / max(za, zb, zc) > view.max_jump:

@@ -1,8 +1,8 @@
 """Factors of the navigation sensors in the graph of the global alignment.
 
-Pressure, acoustic position fixes and attitude each constrain one node. Beacons have surveyed positions, so their pixels
-resect the camera of a node. The DVL constrains the displacement between two nodes. Its scale error is one parameter
-shared by all displacements: modelled as independent noise it would average out along a path, while in truth it
+Pressure, acoustic position fixes and attitude each constrain one node. Beacons have surveyed positions, so their image
+coordinates constrain the camera pose of a node. The DVL constrains the displacement between two nodes. Its scale error
+is one parameter shared by all displacements: as independent noise it would average out along a path, but the real error
 accumulates.
 """
 
@@ -27,8 +27,8 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
     """Returns the factors of pressure, attitude, position fixes and beacons, in this order.
 
     Args:
-        nodes: their position in the sequence is the index of their pose in the graph.
-        rig, noise: nominal calibration.
+        nodes: keyframes, in the order of the poses in the graph.
+        rig, noise: nominal calibration and sensor noise.
     """
     return [
         _height_factors(nodes, noise),
@@ -124,7 +124,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
     d is the displacement of the body's origin in the axes of the earlier body, s the scale error (shared parameter).
 
     Args:
-        nodes: their position in the sequence is the index of their pose in the graph.
+        nodes: keyframes, in the order of the poses in the graph.
         rig: nominal calibration.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
@@ -146,7 +146,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
 @njit(cache=True, nogil=True)
 def _body_displacements(motions, body_from_camera):
-    """Returns `body_displacement` (m, 3) and its Jacobian (m, 3, 6) of motions (m, 4, 4)."""
+    """Computes `body_displacement` for motions (m, 4, 4): displacements (m, 3) and Jacobians (m, 3, 6)."""
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
         displacement, jacobian = body_displacement(motions[k], body_from_camera)

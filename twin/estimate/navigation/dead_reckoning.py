@@ -15,10 +15,10 @@ from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressur
 
 
 class DeadReckoningState(NamedTuple):
-    """Poses (4, 4) and covariances (6, 6) after a frame; every frame returns a new state.
+    """State of dead reckoning after a frame: poses (4, 4) and covariances (6, 6). Not modified in place.
 
     Args:
-        f2f: world_from_camera by frame-to-frame motion alone.
+        f2f: world_from_camera from frame-to-frame motion alone.
         online, cov: estimated world_from_camera and its covariance.
         since_node, since_node_cov: estimated motion since the last node and its covariance.
     """
@@ -31,7 +31,7 @@ class DeadReckoningState(NamedTuple):
 
 
 class FrameAiding(NamedTuple):
-    """Models of the sensors with a reading at every frame, and the state of the DVL integration.
+    """Error models of the sensors that are read at every frame, and the state of the DVL integration.
 
     The arrays of `dvl_state` are modified in place.
     """
@@ -65,9 +65,9 @@ def dead_reckon(
     """Computes the state after one frame.
 
     Args:
-        last: `DeadReckoningState` of the frame before.
+        last: `DeadReckoningState` of the previous frame.
         aiding: `FrameAiding`.
-        a_from_b, cov: (4, 4), (6, 6) visual motion since then.
+        a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
         height_m, rpy_rad, velocity_mps: readings of this frame; NaN where there is none.
 
     Returns:

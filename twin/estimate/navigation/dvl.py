@@ -18,9 +18,9 @@ class DvlModel(NamedTuple):
     """Error model of the DVL.
 
     Args:
-        body_from_camera: (4, 4) mount of the left camera.
+        body_from_camera: (4, 4) pose of the left camera in the body.
         step_s: time between readings.
-        white_m2: variance of each component of a frame's displacement by white noise [m^2].
+        white_m2: variance of each component of a frame's displacement due to white noise [m^2].
         scale_variance: variance of the scale error.
     """
 
@@ -34,9 +34,10 @@ class DvlState(NamedTuple):
     """Integration of DVL velocities since the last node. All arrays are modified in place.
 
     Args:
-        velocity: (3,) last reading [m/s]; NaN: none.
+        velocity: (3,) last reading [m/s]; NaN if there was none.
         node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance [rad^2].
-        displacement_m, cov: (3,), (3, 3) displacement in the body at the node, and its covariance by white noise [m^2].
+        displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
+            white noise [m^2].
         path_m: (1,) path length since the node.
         complete: (1,) whether no reading was missing.
     """
@@ -76,13 +77,13 @@ class DvlIntegrator:
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
     def displacement_at_node(self, number: int) -> Displacement | None:
-        """Returns the displacement from the last node to this one and restarts the integration here.
+        """Returns the displacement from the last node to the current one and restarts the integration at the latter.
 
         Args:
-            number: of this node.
+            number: number of the current node.
 
         Returns:
-            None if a reading was missing.
+            The displacement, or None if a reading was missing.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]
@@ -97,7 +98,7 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
     Args:
         a_from_b: (4, 4) motion of the camera.
-        body_from_camera: (4, 4) mount.
+        body_from_camera: (4, 4) pose of the camera in the body.
 
     Returns:
         Displacement (3,) [m] in the axes of the earlier body, and its Jacobian (3, 6) with respect to an increment of
@@ -119,13 +120,13 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
     """Fuses a frame's visual motion with the DVL and adds the frame to the integration.
 
     Args:
-        state: `DvlState`, updated.
+        state: `DvlState`, modified in place.
         model: `DvlModel`.
-        a_from_b, cov: (4, 4), (6, 6) visual motion of the camera.
-        velocity: (3,) reading at the end of the frame, in the body [m/s]; NaN: none.
+        a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
+        velocity: (3,) reading at the end of the frame, in body axes [m/s]; NaN if there is none.
 
     Returns:
-        The motion (4, 4) and its covariance (6, 6); the visual ones unless there are readings at both ends.
+        The fused motion (4, 4) and its covariance (6, 6); the visual motion if a reading at either end is missing.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -157,8 +158,8 @@ def _length(step):
 def _step_cov(state, model, step):
     """Computes the covariance (3, 3) of a frame's displacement of length l.
 
-    The scale error s accumulates along the path L since the node: the frames' shares s^2 ((L + l)^2 - L^2) sum to the
-    variance s^2 L^2.
+    The scale error s accumulates along the path of length L since the node: the contributions of the frames,
+    s^2 ((L + l)^2 - L^2), sum to s^2 L^2 over the path.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
@@ -173,8 +174,8 @@ def _accumulate(state, model, step, a_from_b, cov):
     """Adds a frame to the integration since the node.
 
     Args:
-        step: (3,) displacement in the body before the frame [m].
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera.
+        step: (3,) displacement in the axes of the body before the frame [m].
+        a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
     """
     state.path_m[0] += _length(step)
     node_from_body = state.node_from_body
@@ -207,12 +208,12 @@ def _restart(state):
 
 @njit(cache=True, nogil=True)
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera):
-    """Kalman update of a camera motion by a measured displacement of the body's origin.
+    """Updates a camera motion with a measured displacement of the body's origin (Kalman update).
 
     Args:
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera.
-        step, step_cov: (3,), (3, 3) displacement in the body before the motion [m].
-        body_from_camera: (4, 4) mount.
+        a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
+        step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
+        body_from_camera: (4, 4) pose of the camera in the body.
 
     Returns:
         Updated motion and covariance.

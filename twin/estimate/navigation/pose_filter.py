@@ -20,7 +20,7 @@ _GATE = 30.0  # chi2 of a 6-DOF correction above which it is rejected as an outl
 class PoseFilter:
     """Extended Kalman filter of one pose.
 
-    Errors are motions [rotation, translation] (rad, m) in the camera, pose @ exp(error).
+    Errors are motions [rotation, translation] (rad, m) in camera axes: true pose = pose @ exp(error).
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
@@ -89,7 +89,7 @@ class PressureAhrsModel(NamedTuple):
     """Error model of the pressure sensor and the AHRS.
 
     Args:
-        camera_from_body: (4, 4) inverse of the camera's mount.
+        camera_from_body: (4, 4) pose of the body in the camera.
         pressure_m2: variance of the height [m^2].
         attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw.
     """
@@ -104,9 +104,9 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     """Fuses readings of height and attitude into a pose.
 
     Args:
-        world_from_camera, cov: (4, 4), (6, 6).
+        world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
         model: `PressureAhrsModel`.
-        height_m, rpy_rad: readings, the attitude (3,); NaN: none.
+        height_m, rpy_rad: readings of the height and of roll, pitch and yaw (3,); NaN where there is none.
 
     Returns:
         Updated pose and covariance.
@@ -126,7 +126,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
 
 @njit(cache=True, nogil=True)
 def predict(world_from_camera, cov, a_from_b, motion_cov):
-    """Returns the pose and its covariance after a motion with its covariance, eqs. (3) to (5)."""
+    """Returns the pose and its covariance after a motion with covariance `motion_cov`, eqs. (3) to (5)."""
     return geometry.compose(world_from_camera, a_from_b), transport_covariance(cov, a_from_b) + motion_cov
 
 
@@ -145,20 +145,20 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
 
 @njit(cache=True, nogil=True)
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of pose a expressed in the axes of b, which is rigidly attached."""
+    """Returns the covariance (6, 6) of pose a expressed in the axes of b, a frame rigidly attached to a."""
     return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
 @njit(cache=True, nogil=True)
 def kalman_update(world_from_camera, prior, residual, jacobian, cov):
-    """Kalman update of a pose in Joseph's form.
+    """Updates a pose with an observation (Kalman update in Joseph's form).
 
     Args:
-        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) of the observation; k is three at most.
+        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) of the observation, k <= 3.
 
     Returns:
-        Pose (4, 4) and covariance (6, 6) after.
+        Pose (4, 4) and covariance (6, 6) after the update.
     """
     gain = _gain(prior, jacobian, cov)
     keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
@@ -215,7 +215,7 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
 
 
 def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
-    """Returns the rotation world_from_camera (3, 3) of an AHRS reading and its covariance (3, 3) in the camera."""
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading and its covariance (3, 3) in camera axes."""
     return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 
 

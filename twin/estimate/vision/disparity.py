@@ -16,19 +16,20 @@ Map = NDArray[np.float32]
 
 #: Block of semi-global matching [px]: 5 matches more pixels than 3 in turbid water; refinement restores sharp edges.
 BLOCK_PX = 5
-#: Connected regions of fewer pixels are mismatches.
+#: Connected regions with fewer pixels than this are removed as mismatches.
 SPECKLE_PX = 60
 #: Window of the contrast normalisation before matching, as a fraction of the image width. Illumination and backscatter
 #: vary slowly. A small window (25 px) is affected by the brightness of near objects next to a pixel, and differently in
 #: the two cameras.
 NORMALISATION_WINDOW = 1 / 7
-#: Largest difference between the left-to-right and the right-to-left disparity [px]; beyond, the pixel is occluded.
+#: Largest difference between the left-to-right and the right-to-left disparity [px]; beyond it, the pixel is occluded.
 CONSISTENCY_PX = 1.0
 #: Error that refinement does not model (interpolation, relief inside the window): a lower bound of sigma [px].
 MIN_SIGMA_PX = 0.03
 #: Largest disparity that is searched, as a fraction of the image width.
 MAX_DISPARITY_FRACTION = 0.4
-#: Largest standard deviation of a valid disparity, if the noise of pixels were independent [px]; beyond are mismatches.
+#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px]; pixels beyond it
+#: are mismatches.
 MAX_SIGMA_PX = 1.0
 
 
@@ -48,11 +49,11 @@ class Disparity(NamedTuple):
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
     """Computes the disparity of every pixel of the left image that is visible in both images.
 
-    Semi-global matching (Hirschmueller 2008, three-way), on locally normalised contrast, finds the disparity to a
-    pixel, with a left-right consistency check against occlusions and mismatches. Its sub-pixel interpolation is biased
-    towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef), so `epipolar.refine` replaces it
-    (bias 0.002 px, standard deviation 0.06 px). Sigma is that of the refinement as an independent measurement, so it
-    increases where texture is weak compared with noise.
+    Semi-global matching (Hirschmueller 2008, three-way), on locally normalised contrast, finds the disparity to the
+    nearest pixel, with a left-right consistency check against occlusions and mismatches. Its sub-pixel interpolation is
+    biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef), so `epipolar.refine`
+    replaces it (bias 0.002 px, standard deviation 0.06 px). Sigma is that of the refinement as an independent
+    measurement, so it increases where texture is weak compared with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.

@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Marks unknown disparity inside the kernels; so far from any other that the pixel never supports its neighbours.
+#: Marks unknown disparity inside the kernels; so far from any real value that the pixel never supports others.
 UNKNOWN_PX = np.float32(-1e4)
-#: Neighbours support a pixel if their disparities differ by less than this [px]; beyond, they are on another surface.
+#: Neighbours support a pixel if their disparities differ by less than this [px]; otherwise they are on another surface.
 SUPPORT_PX = 1.2
 #: Standard deviation of the prior of the correction and of the plane's slope [px, px/px]; effective without texture
 #: only.
@@ -70,7 +70,7 @@ class Refinement(NamedTuple):
 
     @property
     def measurement_sigma_px(self) -> Map:
-        """Standard deviation (H, W) as a measurement independent of the initial disparity; infinite without texture."""
+        """Standard deviation (H, W) of the disparity if the prior is not used; infinite without texture [px]."""
         return _measurement_sigma(self.sigma_px, self.gain) * np.float32(self.variance_inflation**0.5)
 
 
@@ -95,15 +95,15 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
     With the other image O warped by the current disparities d, each pixel measures e = d_true - d = (I - O) / (dO/dd).
     A plane is fitted to the d + e of a window, weighted by (dO/dd)^2 and the taper of the window; its value at the
-    centre is the refined disparity. It is unbiased on slopes and not biased towards whole pixels; neighbours on another
-    surface are excluded. Brightness and contrast of O are first equalised locally, because backscatter and illumination
-    change with the viewpoint.
+    centre is the refined disparity. This value is unbiased on slopes and not biased towards whole pixels; neighbours on
+    another surface are excluded. Brightness and contrast of O are first equalised locally, because backscatter and
+    illumination change with the viewpoint.
 
     The variance is that of least squares with the noise of nearby residuals (dark and uniform parts have less), or of
     the window's own residuals if they are larger. With strong noise, the window of the last iteration is larger. Slopes
     that noise alone can cause do not count as texture. `measurement_sigma_px` agrees with the error to 15 % in clear
-    water; where noise is a fifth and a half of the contrast, the error (mismatches included) is 1.3 and 1.7 times
-    sigma.
+    water; where noise is a fifth of the contrast, the error (mismatches included) is 1.3 times sigma; where it is half
+    of the contrast, 1.7 times.
 
     Args:
         reference, other: (H, W) float32 grey images.
@@ -157,7 +157,7 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
     """Warps the other image O to the reference I and equalises its local mean and standard deviation.
 
     Returns:
-        Residual I - O, slope dO/dd and which pixels are visible in O, each (H, W).
+        Residual I - O, slope dO/dd, and a mask of the pixels that are visible in O, each (H, W).
     """
     warped, slope = np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
@@ -319,7 +319,7 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
                 fitted[v, u] = disparity[v, u] + step
                 # tapering increases the variance by sum w^2 / sum w
                 unit_variance[v, u] = c00 / det * (sums[11, u] + p0) / a00
-                # squared slopes due to noise alone, mean plus three standard deviations, are not texture
+                # squared slopes up to the mean plus three standard deviations of noise alone do not count as texture
                 noise_slopes = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))
                 gain[v, u] = max(sums[0, u] - noise_slopes, 0.03 * sums[0, u]) / a00
                 mean_square[v, u] = sums[9, u] / sums[10, u]

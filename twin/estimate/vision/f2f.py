@@ -13,9 +13,9 @@ from twin.estimate.vision import matching, observation_equations, two_view_motio
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.stereo import StereoPoints
 
-MAX_POINTS = 150  # the strongest; keyframes correct the drift of the frames between them
+MAX_POINTS = 150  # only the strongest points; keyframes correct the drift of the frames between them
 _MIN_TRACKED = 0.7  # fraction of the reference points; below it, patches may have changed their appearance too
-_UNKNOWN_VARIANCE = 1.0  # of the disparity, which a single image does not measure, normalised
+_UNKNOWN_VARIANCE = 1.0  # normalised variance of the disparity, which a single image does not measure
 
 
 class _Reference(NamedTuple):
@@ -77,8 +77,9 @@ class FrameToFrame:
             interval_ratio: time since the last frame divided by the time between the two frames before.
 
         Returns:
-            The motion, and "ok" or the reason for a failure. The covariance is that of the pose in the reference, so
-            the errors of successive motions cancel partly: the sum of their covariances is an upper bound.
+            The motion, and "ok" or the reason for a failure. The covariance is that of the pose in the reference
+            camera. Because the errors of successive motions partly cancel, the sum of their covariances is an upper
+            bound.
         """
         if not self.started:
             self.started = True
@@ -120,7 +121,7 @@ class FrameToFrame:
         if motion is None:
             return None
         adjoint = geometry.adjoint(motion.a_from_b)
-        # rounding errors would double with every frame
+        # without orthogonalisation, rounding errors would double with every frame
         self.reference_from_current = geometry.nearest_rigid(geometry.inverse(motion.a_from_b))
         located = motion._replace(a_from_b=self.reference_from_current, cov=adjoint @ motion.cov @ adjoint.T)
         if ok.mean() < _MIN_TRACKED:

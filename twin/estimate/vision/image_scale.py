@@ -14,11 +14,11 @@ from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import disparity, matching, stereo
 
 _BINNINGS = (1, 2, 4)
-_MIN_MATCHED = 2 / 3  # fraction of the corners
+_MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning at which most corners are matched in both images, else the one that matches most.
+    """Returns the smallest binning with enough corners matched in both images, otherwise the one with the most.
 
     Args:
         left, right: (height, width, 3) images of the first keyframe.

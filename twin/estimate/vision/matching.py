@@ -49,7 +49,7 @@ def normalise(levels: Gray) -> Image:
 
     Returns:
         (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
-        surroundings, which are cut off at the border: not suited to measurements of a hundredth of a pixel.
+        surroundings, which are cut off at the border, so they do not permit matching to a hundredth of a pixel.
     """
     mean, square = _local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
@@ -145,8 +145,8 @@ def track(
         levels: pyramid levels above the full image.
 
     Returns:
-        (n, 2) positions in the target [px], and (n,) bool: tracked back to within half a pixel, window inside the
-        image.
+        (n, 2) positions in the target [px], and (n,) bool, true if the point is tracked back to within half a pixel
+        and its window is inside the image.
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
@@ -160,7 +160,7 @@ def track(
 def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
-    """Returns positions (n, 2) in the target, and which were tracked (n,)."""
+    """Returns positions (n, 2) in the target, and which points were tracked (n,)."""
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,

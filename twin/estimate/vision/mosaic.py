@@ -6,9 +6,9 @@ registered by direct image alignment: textured cells are projected into the fram
 brightness agrees (Gauss-Newton with Huber weights).
 
 The residuals are dominated by errors of height and by uneven illumination rather than by pixel noise, and neighbouring
-cells share them. A covariance for independent cells claimed 0.4 mrad where the error was 1.4 to 6 mrad, over a floor of
-coarse texture. The covariance is therefore that of clustered data (Liang & Zeger 1986), with blocks of the image as
-clusters.
+cells share them. With cells taken as independent, the standard deviation was 0.4 mrad where the error was 1.4 to 6
+mrad, over a floor of coarse texture. The covariance is therefore that of clustered data (Liang & Zeger 1986), with
+blocks of the image as clusters.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Registration(NamedTuple):
 
     Args:
         correction: estimated pose of the frame relative to its predicted pose (predicted_from_true).
-        reference_keyframe: number of the keyframe that the median of the compared cells was taken from; half of the
-            cells are as old or older.
+        reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells are from this
+            keyframe or older ones.
     """
 
     correction: two_view_motion.Motion
@@ -72,7 +72,7 @@ class Mosaic:
         Args:
             number: number of the keyframe.
             image: (height, width) normalised left image.
-            depth_m: (height, width), NaN where unknown.
+            depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.
             rig: calibration at the scale of the image.
         """
@@ -101,7 +101,7 @@ class Mosaic:
 
         Args:
             image: (height, width) normalised frame.
-            depth_m: (height, width) depth by the frame's own stereo pair, NaN where unknown.
+            depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
             footprint_m: half the side of the square around the camera whose cells are used.
             rig: calibration at the scale of the image.
@@ -130,7 +130,7 @@ class Mosaic:
         inverse = np.linalg.inv(normal)
         cov = np.asarray(inverse @ scatter @ inverse.T, np.float64)
         correction = geometry.inverse(world_from_camera) @ current
-        median = np.partition(keyframe[used], n_used // 2)[n_used // 2]  # always a number that occurs
+        median = np.partition(keyframe[used], n_used // 2)[n_used // 2]  # unlike np.median, always one of the numbers
         return Registration(two_view_motion.Motion(correction, cov, n_used, sigma), int(median))
 
     def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
@@ -169,7 +169,7 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 
 @njit(cache=True, nogil=True)
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
-    """Writes empty cells: the mean height of the pixels in the cell, and the brightness at the projected cell centre.
+    """Fills empty cells with the mean height of the pixels in the cell and the brightness at the projected cell centre.
 
     Taking the brightness of the pixels in the cell instead would bias the position by 5 mm, because they are not at the
     cell's centre.
@@ -210,13 +210,14 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
     Args:
         points: (n, 3) cells in the world [m], with brightness (n,).
         frame, depth: (height, width) brightness and depth of the frame.
-        camera_from_world: (4, 4).
+        camera_from_world: (4, 4) pose.
         camera: focal length, column and row of the principal point [px].
-        max_residual: largest brightness residual of an inlier.
+        max_residual: largest brightness residual of an inlier [grey levels].
 
     Returns:
         Jacobian (m, 6) of the projected brightness with respect to the motion, with the depth of the mosaic; the same
-        with the depth of the frame; residuals (m,); block of the image (m,); and which cells are used (n,) bool.
+        Jacobian with the depth of the frame; residuals (m,); index of the image block of each (m,); and a mask of the
+        cells that are used (n,).
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS

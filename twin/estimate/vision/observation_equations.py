@@ -1,7 +1,8 @@
 """Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
 Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity is divided by f too, so that
-depth = baseline / disparity. A keyframe with five links needs 30 solutions of 500 points each, hence compiled.
+depth = baseline / disparity. A keyframe with five links needs 30 solutions with 500 points each, so the
+functions are compiled.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class LinearisedObservations(NamedTuple):
     """Observation equations of n points in two stereo pairs, linearised at a motion and a structure.
 
     Args:
-        residual: (n, 3) of the measurements in a, minus their prediction from the measurements in b.
+        residual: (n, 3) measurements in a, minus their prediction from the measurements in b.
         jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
         jacobian_motion: (n, 3, 6) derivative of the prediction with respect to the twist of the motion a_from_b.
         information: (n, 3, 3) inverse covariance of the residual.
@@ -50,7 +51,7 @@ class LinearisedObservations(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def image_jacobian(x, y, depth):
-    """Returns the Jacobian of image coordinates for the camera's twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
+    """Returns the Jacobian of image position with respect to the twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
 
     Args:
         x, y: (n,) normalised image coordinates.
@@ -72,9 +73,9 @@ def normal_equations(jacobian, weight, residual):
     """Returns the normal matrix (6, 6) and right-hand side (6,) of weighted least squares.
 
     Args:
-        jacobian: (n, k, 6).
-        weight: (n,).
-        residual: (n, k).
+        jacobian: (n, k, 6) derivatives of k observations per point.
+        weight: (n,) weights of the points.
+        residual: (n, k) residuals.
     """
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for i in range(len(jacobian)):
@@ -107,7 +108,7 @@ def transfer(points_b, a_from_b, baseline):
         translation[r] = a_from_b[r, 3] / baseline
         for c in range(3):
             rotation[r, c] = a_from_b[r, c]
-    q, q_jacobian = np.empty(3), np.empty((3, 9))  # point in a, times disparity / baseline; its derivatives
+    q, q_jacobian = np.empty(3), np.empty((3, 9))  # point in a, times disparity / baseline, and its derivatives
     for i in range(n):
         x, y, d = points_b[i]
         for r in range(3):

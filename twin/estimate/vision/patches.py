@@ -3,8 +3,8 @@
 Systematic errors of patch matching, measured against the simulated truth, and their remedies here:
 
 - A patch shows a slanted surface, so it appears sheared in another camera. Matched as a square, it covers a different
-  part of the floor there and averages other relief (0.4 mrad between legs at 21 px). The patch is therefore warped by
-  the plane that stereo measures under it, so that all images are matched over the same support.
+  part of the floor there and averages other relief (0.4 mrad between legs with patches of 21 px). The patch is
+  therefore warped by the plane that stereo measures under it, so that all images are matched over the same support.
 - The lamps move with the vehicle. A change of illumination across the patch shifts a match by about the squared
   correlation length of the texture times the gradient of the change (0.01 px on a lamp-lit reef, always backwards). A
   ramp of brightness and a ramp of contrast are therefore projected out.
@@ -15,8 +15,8 @@ Systematic errors of patch matching, measured against the simulated truth, and t
   against the next. Grey levels are therefore matched as they are; brightness and contrast are nuisance parameters
   anyway.
 
-Inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to fine; cubic
-B-spline interpolation (Unser 1999).
+Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
+fine, with cubic B-spline interpolation (Unser 1999).
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def match_templates(
         templates: patches per pyramid level (`extract_templates`).
         target: spline coefficients per pyramid level (`spline_coefficients`).
         guess: (n, 2) expected positions in the target [px]; at most about two pixels of the coarsest level off.
-        warp: (n, 2, 2) derivative of target pixels by source pixels over each patch.
+        warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
     """
     points = guess.astype(np.float64)
     correlation, cov = np.full(len(guess), -1.0), np.zeros((len(guess), 2, 2))
@@ -139,7 +139,7 @@ def match_templates(
         centres, correlation, cov = _match(energy, gradient, nuisance, target[level], start, warp, half, tolerance)
         matched = correlation > _MIN_CORRELATION
         shift = centres * scale - offset - points
-        if level and matched.any():  # patches cut off by the border are likely to be shifted as the others are
+        if level and matched.any():  # the patches cut off by the border probably have the same shift
             shift[~matched] = np.median(shift[matched], axis=0)
             matched[:] = True
         points[matched] += shift[matched]
@@ -155,7 +155,7 @@ def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floati
         patch_px: side of the patch.
 
     Returns:
-        (n, 2) slope by column and by row [px/px]; 0 where it is unknown.
+        (n, 2) slope with respect to column and row [px/px]; 0 where it is unknown.
     """
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 

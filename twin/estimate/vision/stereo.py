@@ -13,7 +13,7 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, patches
 
 _EPIPOLAR_PX = 1.0
-_BORDER_PX = 4  # two for interpolation, the rest exceeds the matching error
+_BORDER_PX = 4  # two pixels for interpolation; the other two exceed the matching error
 _MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
 
 
@@ -22,12 +22,12 @@ class StereoPoints(NamedTuple):
 
     Args:
         pixels: (n, 2) whole pixels in the left image.
-        disparity_slope: (n, 2) slope of the disparity around each point, by column and by row [px/px].
+        disparity_slope: (n, 2) slope of the disparity around each point, with respect to column and row [px/px].
         mean_disparity_px: (n,) mean disparity around each point [px]. It is free of the point's own noise and predicts
             whether another image shows the point.
         measured: (n, 3) normalised (x, y, disparity).
         cov: (n, 3, 3) covariance of `measured`.
-        xyz: (n, 3) in the left camera [m].
+        xyz: (n, 3) positions in the left camera [m].
     """
 
     pixels: NDArray[np.float32]
@@ -48,9 +48,9 @@ class StereoPoints(NamedTuple):
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
 
-    Both positions have covariance `cov`. Disparity is the difference of two columns, one of which is x, so both are
-    correlated. The difference in row must be zero; this constraint is applied as a Kalman update, which also corrects
-    the columns where `cov` correlates them with the rows.
+    Both positions have covariance `cov`. Disparity is the difference of two columns, one of which is x, so x and
+    disparity are correlated. The difference in row must be zero; this constraint is applied as a Kalman update, which
+    also corrects the columns where `cov` correlates them with the rows.
 
     Args:
         left, right: (n, 2) positions [px].
@@ -71,7 +71,7 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 
 
 def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Returns which matches (n, 2), (n, 2) [px] are possible in a rectified pair: equal rows, positive disparity."""
+    """Returns which matches (n, 2) [px] are possible in a rectified pair: equal rows, positive disparity."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
@@ -84,8 +84,8 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
     """Returns which patches lie so far inside the image that matching errors cannot move them out.
 
     The test must use expected positions that are independent of the matching noise. A test of the measured positions
-    selects matches with errors towards the inside: over coarse texture, with matching errors of 0.1 to 0.2 px, it
-    biased disparities at the border by -0.02 px and links over two keyframes by 0.16 mrad.
+    selects matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
+    it biased disparities at the border by -0.02 px and links over two keyframes by 0.16 mrad.
 
     Args:
         pixels: (n, 2) expected patch centres [px].
@@ -117,7 +117,7 @@ def match_stereo_points(
 
     Args:
         left, right: (height, width) grey levels (`matching.gray`).
-        dense_px: (height, width) disparity that matching starts from, NaN where unknown [px].
+        dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration.
         count: largest number of corners.
         patch_px: side of the matched patches (odd).

@@ -73,7 +73,7 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
         x, y: (n,) normalised image coordinates.
         depth: (n,) depth [m].
         flow: (n, 2) displacement of the normalised coordinates.
-        weight: (n,).
+        weight: (n,) weights of the points.
 
     Returns:
         Twist (6,) and normal matrix (6, 6).
@@ -83,10 +83,10 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
 
 
 def frame_motion(points: Array, observed: Array, guess: Array, iterations: int = 4) -> Motion | None:
-    """Estimates the motion from known points and their image in the next frame: eq. (2), iterated with Huber weights.
+    """Estimates the motion from points and their projections in the next frame: eq. (2), iterated with Huber weights.
 
     Args:
-        points: (n, 3) in the earlier camera [m].
+        points: (n, 3) positions in the earlier camera [m].
         observed: (n, 2) normalised coordinates in the later image.
         guess: (4, 4) initial pose of the later camera in the earlier one.
         iterations: number of Gauss-Newton iterations.
@@ -133,14 +133,14 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
 
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
-    """Returns Huber weights (n,) of residuals of this size; zero beyond `cutoff` standard deviations."""
+    """Returns Huber weights (n,) of residuals of these magnitudes (n,); zero beyond `cutoff` standard deviations."""
     return np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
 
 
 def pair_motion(
     measured: PairMeasurements, baseline_m: float, guess: Array, settings: PairMotionSettings = _DEFAULT_SETTINGS
 ) -> Motion | None:
-    """Estimates the motion between two stereo pairs jointly with the structure, so without errors-in-variables bias.
+    """Estimates the motion between two stereo pairs jointly with the structure, which avoids errors-in-variables bias.
 
     Both pairs measure each point as z = (x, y, disparity); the true point in b is unknown. With e = z_a - g(z_b),
     G = dg/dz_b and A = dg/dmotion, the structure is eliminated: the cost is e' (C_a + G C_b G')^-1 e, linearised at the
