@@ -179,3 +179,30 @@ def test_rerun_is_imported_by_one_module():
         if any(within(name, "rerun") for name in imports(ast.parse(path.read_text())))
     }
     assert importers == {"twin.report.recording"}
+
+
+def parameters(node):
+    arguments = node.args
+    names = [a.arg for a in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)]
+    return [name for name in names if name not in ("self", "cls")]
+
+
+def test_no_function_outside_compiled_kernels_has_more_than_seven_parameters():
+    wide = [
+        f"{dotted(path)}.{node.name}"
+        for path in modules()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+        and len(parameters(node)) > 7
+        and not any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
+    assert wide == []
+
+
+def test_every_class_name_has_one_meaning():
+    found = {}
+    for path in modules():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(dotted(path))
+    assert {name: places for name, places in found.items() if len(places) > 1} == {}
