@@ -28,7 +28,7 @@ class Forecast(NamedTuple):
         swath_spacing_m: greatest distance between neighbouring swaths.
         overlap_along: overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`.
         overlap_across: sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`.
-        disparity_px: expected disparity.
+        disparity_px: expected disparity of the reference plane.
         depth_sigma_m: expected standard deviation of the depth from one stereo pair.
     """
 
@@ -57,7 +57,7 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     Args:
         plan: the survey plan.
         baseline_m: stereo baseline b.
-        disparity_sigma_px: standard deviation of disparity sigma_d.
+        disparity_sigma_px: standard deviation sigma_d of the disparity.
     """
     tracks = range(1, plan.n_tracks + 1)
     keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])

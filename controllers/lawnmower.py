@@ -49,7 +49,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
 
 
 def _track(request: SurveyRequest, spacing_m: float, track: int, last: bool) -> tuple[Segment, ...]:
-    """Returns a track (from 1): leg, cross segment, return leg and, unless it is the last, the segment to the next."""
+    """Returns a track (from 1): leg, cross segment, return leg and, unless it is the last, a segment to the next."""
     half_x, half_y = request.area_m[0] / 2, request.area_m[1] / 2
     south = (2 * track - 1.5) * spacing_m - half_y
     out = [(-half_x, south), (half_x, south)]

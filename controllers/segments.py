@@ -77,7 +77,7 @@ class Circle(NamedTuple):
         )
 
     def _from_centre(self, angle: Array) -> Array:
-        """Returns the vectors (n, 3) [m] from the centre to the points at angles (n,) [rad] after the start."""
+        """Returns the vectors (n, 3) [m] from the centre to the points at angles (n,) [rad] from the start."""
         x, y, _ = np.array(self.start) - self.centre
         c, s = np.cos(angle), np.sin(angle)
         return np.stack([c * x - s * y, s * x + c * y, np.zeros_like(c)], axis=-1)

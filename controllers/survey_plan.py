@@ -134,7 +134,7 @@ def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
     """Returns the number of frames per keyframe N (Negahdaripour & Madjidi 2003, section III-A).
 
     N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)); ImgSize is the image width, as in
-    the paper.
+    that paper.
 
     Raises:
         TwinError: N would be 0 at this speed.

@@ -23,9 +23,9 @@ class HullModel(NamedTuple):
 
     Args:
         inertia: (6,) moments of inertia [kg m2] and masses [kg], including added mass.
-        added_mass: (3,) added masses [kg].
-        linear_drag: (6,) [N m s/rad], [N s/m], positive.
-        quadratic_drag: (6,) [N m s2/rad2], [N s2/m2], positive.
+        added_mass: (3,) added masses along the axes [kg].
+        linear_drag: (6,) coefficients of linear drag [N m s/rad, then N s/m], positive.
+        quadratic_drag: (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive.
     """
 
     inertia: Array
@@ -48,7 +48,7 @@ def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
 
 
 class Gains(NamedTuple):
-    """PID gains of the pose error, each (6,) [1/s2, 1/s, 1/s3]."""
+    """Proportional, derivative and integral gain of the pose error, each (6,) [1/s2, 1/s, 1/s3]."""
 
     proportional: Array
     derivative: Array
@@ -63,7 +63,7 @@ def pole_placement_gains(natural_frequency_radps: float) -> Gains:
 
 
 def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Returns the reference of a level body whose camera follows a reference.
+    """Converts the reference of the camera to the reference of the level body that carries it.
 
     Args:
         camera: reference of the camera.
@@ -85,8 +85,8 @@ def commanded_velocity(position: Array, reference: Reference, natural_frequency_
 
     Args:
         position: (3,) estimated position [m].
-        reference: reference of the same point.
-        natural_frequency_radps: w.
+        reference: reference of the point whose position is given.
+        natural_frequency_radps: natural frequency w of the closed loop.
     """
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 

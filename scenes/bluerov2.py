@@ -44,14 +44,14 @@ class VehicleParameters:
     """Rigid body, hydrodynamics and thrusters of a vehicle; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
 
     Args:
-        mass_kg, displaced_volume_m3: dry mass, volume of displaced water.
-        inertia_kgm2: (3,) principal moments about the centre of gravity, along the body axes.
-        centre_of_buoyancy_m: (3,) from the centre of gravity, in the body.
+        mass_kg, displaced_volume_m3: dry mass, and volume of displaced water.
+        inertia_kgm2: (3,) principal moments of inertia about the centre of gravity, along the body axes.
+        centre_of_buoyancy_m: (3,) position of the centre of buoyancy relative to the centre of gravity, in the body.
         added_mass: (6,) diagonal of the added mass matrix M_A [kg, kg m2].
         linear_damping, quadratic_damping: (6,) diagonals of D_l and D_q in D(nu) = D_l + D_q |nu|.
-        thruster_positions_m, thruster_directions: (8, 3) in the body: four horizontal thrusters (front right, front
-            left, rear right, rear left), then four vertical ones in the same order. Positive thrust pushes the vehicle
-            along the direction.
+        thruster_positions_m, thruster_directions: (8, 3) positions and unit vectors in the body: four horizontal
+            thrusters (front right, front left, rear right, rear left), then four vertical ones in the same order.
+            Positive thrust pushes the vehicle along the direction.
         thrust_coefficients: polynomial coefficients of u^9, u^7, u^5, u^3, u for the thrust [N] of a T200 thruster at
             command u in [-1, 1].
         thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) of the transfer function from steady

@@ -20,10 +20,10 @@ CAMERAS = ("left", "right")
 
 @dataclass(frozen=True)
 class CameraPair:
-    """The two identical cameras of the stereo rig.
+    """Intrinsics and poses of the stereo rig, whose two cameras have the same intrinsics and orientation.
 
     Args:
-        width_px, height_px: image size.
+        width_px, height_px: width and height of each image.
         vfov_deg: vertical field of view.
         baseline_m: distance of the right camera from the left one, along the left camera's +x axis.
         body_from_camera: (4, 4) pose of the left camera in the body; camera axes x right, y down, z forward.
@@ -45,10 +45,10 @@ class SceneModel:
         terrain: the terrain that the floor was built from.
         tile_geom_ids: (n,) geom ids of the floor tiles.
         tile_low_m, tile_high_m: (n, 3) lowest and highest corners of the tiles' bounding boxes in the world.
-        body_id: body of the vehicle; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
+        body_id: id of the vehicle's body; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
         camera_ids: ids of the left and the right camera.
-        thruster_site_ids: (8,) in the order of `VehicleParameters`; the z axis of a site is the direction of thrust.
-        lamp_site_ids: (n,) in the order of the lamp positions.
+        thruster_site_ids: (8,) site ids in the order of `VehicleParameters`; thrust acts along the z axis of a site.
+        lamp_site_ids: (n,) site ids in the order of the lamp positions.
     """
 
     model: MjModel
@@ -76,7 +76,7 @@ def build(
         terrain: the seafloor.
         cameras: the stereo rig.
         timestep_s: physics timestep.
-        lamp_positions_m: (n, 3) in the body.
+        lamp_positions_m: (n, 3) positions of the lamps in the body.
     """
     spec = _empty_model(cameras.width_px, cameras.height_px, timestep_s)
     tiles = add_floor(spec, terrain)
@@ -103,7 +103,7 @@ def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -
     spec = mujoco.MjSpec()
     spec.modelname = "seabed"
     spec.option.timestep = timestep_s
-    spec.stat.extent = 1.0  # MuJoCo scales the clipping distances by it
+    spec.stat.extent = 1.0  # MuJoCo multiplies the clipping distances by the extent
     spec.visual.headlight.active = 0
     spec.visual.quality.offsamples = 0  # multisampling would shift depth by a fraction of a pixel
     spec.visual.quality.shadowsize = 0

@@ -16,7 +16,7 @@ from scenes.gl import MjSpec, mujoco
 from terrains import Terrain
 from twin.core.grid_triangles import grid_triangles
 
-TILE_CELLS = 48  #: side of a tile; measured: smaller tiles cost state changes, larger ones unseen vertices
+TILE_CELLS = 48  #: side of a tile; smaller tiles need more OpenGL state changes, larger ones more vertices out of view
 MAX_TILES = 900  #: MuJoCo supports at most 1000 textures
 MARGIN_TEXELS = 16  #: margin of neighbouring texture around each tile: enough to filter 4 mip-map levels
 FLOOR_GROUP = 0
@@ -43,7 +43,7 @@ def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
 
 
 def tile_cells(n_rows: int, n_cols: int) -> int:
-    """Returns the number of cells along a tile's side: TILE_CELLS, or more if that gave over MAX_TILES tiles."""
+    """Returns the number of cells along a tile's side: TILE_CELLS, or more if that would give over MAX_TILES tiles."""
     cells = TILE_CELLS
     while -(-n_rows // cells) * -(-n_cols // cells) > MAX_TILES:
         cells += 16

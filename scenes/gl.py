@@ -49,7 +49,7 @@ MjvScene: TypeAlias = Any
 
 
 def offscreen_context(width_px: int, height_px: int) -> Any:
-    """Returns a current OpenGL context without a window; call its ``free()`` when done.
+    """Returns a current OpenGL context without a window; the caller must call its ``free()``.
 
     Raises:
         TwinError: OpenGL is missing; the message contains the command that installs it.

@@ -23,7 +23,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
     Args:
         path: a TOML file, or a name in scenes/.
-        overrides: `key=value` each, as in `plan.tracks=2`.
+        overrides: strings `key=value` that replace values of the file, for example `plan.tracks=2`.
 
     Raises:
         ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.

@@ -1,4 +1,4 @@
-"""Runs the command line: `python -m twin` is the same as `twin`."""
+"""Entry point of `python -m twin`, which runs the command line `twin`."""
 
 from twin.cli import main
 

@@ -27,7 +27,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-reproductions = typer.Typer(help="Reproduce experiments of the paper.", no_args_is_help=True)
+reproductions = typer.Typer(help="Reproduce experiments of Negahdaripour & Madjidi (2003).", no_args_is_help=True)
 app.add_typer(reproductions, name="reproduce")
 
 SceneArgument = Annotated[
@@ -161,7 +161,7 @@ def look(
 
 @reproductions.command()
 def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: SummaryOption = False) -> None:
-    """Render one object at five turbidity levels with histograms (Fig. 8 of the paper), and contrast against range."""
+    """Render a block at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003) and plot contrast versus range."""
     from twin.reproduce import turbidity as experiment
 
     _require_rendering()

@@ -1,4 +1,4 @@
-"""One survey in the order of the paper: plan, fly and estimate track by track, map, judge, report."""
+"""Complete survey: plan, fly and estimate track by track, build the map, compare with the truth, write the report."""
 
 from __future__ import annotations
 

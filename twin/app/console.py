@@ -36,7 +36,7 @@ def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
 
 
 def progress_note(now: SurveyProgress) -> str:
-    """Returns simulated time, real-time factor and standard deviation of the position; wall time after the flight."""
+    """Returns simulated time, real-time factor and position uncertainty as text; after the flight, the wall time."""
     if not now.simulated_s:
         return f"{now.wall_s:.0f} s"
     factor = now.simulated_s / max(now.wall_s, 1e-3)

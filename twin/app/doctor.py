@@ -1,6 +1,6 @@
 """Checks of this machine: Python, packages, rendering and disk, each with the command that fixes a failure.
 
-`python -m twin.app.doctor` renders one image. It runs in a process of its own, which a broken driver can crash.
+`python -m twin.app.doctor` renders one image. It runs in a separate process because a broken driver can crash it.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def _print_result(study: Study, result: StudyResult) -> None:
 
 
 def exit_status(result: StudyResult) -> int:
-    """Returns 0; 1 if too few surveys pass or results could not be written; 130 if the study was interrupted."""
+    """Returns the exit status: 130 interrupted; 1 too few surveys passed or results were not written; 0 otherwise."""
     if result.interrupted:
         return 130
     analysis = result.analysis

@@ -149,7 +149,7 @@ def so3_exp(w: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def _left_jacobian(w: Array) -> Array:
-    """Returns the left Jacobian (3, 3) of SO(3) at a rotation vector (3,): it maps translations in `exp`."""
+    """Returns the left Jacobian (3, 3) of SO(3) at a rotation vector (3,); `exp` multiplies the translation by it."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-3:
@@ -226,7 +226,7 @@ def log(a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def log_derivative(motion: Array) -> Array:
-    """Returns the inverse right Jacobian (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) = motion + J d.
+    """Returns the inverse right Jacobian (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
     For the rotation alone it is I + K / 2 + c K^2 with K = skew(w). A motion is a rotation by the dual vector w + e v,
     so the lower left block (translation from rotation) is the derivative of that matrix along v (Selig 2005).

@@ -1,6 +1,6 @@
 """Compiled kernels that interpolate between the pixels of an image.
 
-All kernels take the position between the middle two samples as a fraction in [0, 1).
+Fractions are positions between two neighbouring samples, in [0, 1).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def bilinear(image, row, col, row_fraction, col_fraction):
 def catmull_rom(a, b, c, e, t):
     """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
 
-    Cubic convolution with a = -1/2 (Keys 1981).
+    This is cubic convolution with a parameter of -1/2 (Keys 1981).
     """
     c1 = 0.5 * (c - a)
     c2 = a - 2.5 * b + 2 * c - 0.5 * e
@@ -53,7 +53,7 @@ def bicubic_with_gradient(image, x, y):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def bspline_weights(s):
-    """Returns the weights of four cubic B-spline coefficients at a fraction s (float32) between the middle two."""
+    """Returns the weights of four cubic B-spline coefficients at a fraction s (float32) between the two middle ones."""
     one, sixth = np.float32(1), np.float32(1 / 6)
     left, right = (one - s) * (one - s) * (one - s) * sixth, s * s * s * sixth
     middle = np.float32(2 / 3) - s * s * (one - s * np.float32(0.5))

@@ -23,7 +23,8 @@ class Link(NamedTuple):
         n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
         shared_by: number of links that share the stereo observation of node j. Their errors are correlated, which `cov`
             accounts for: it is the covariance of the single measurement times this number.
-        closed_form: (4, 4) motion from the closed form of eq. (2), with depth treated as exact; None: not computed.
+        closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
+            exact; None: not computed.
     """
 
     i: int

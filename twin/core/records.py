@@ -114,13 +114,14 @@ class SensorNoise:
     """Believed noise of the navigation sensors: standard deviations from data sheets, and surveyed beacon positions.
 
     Args:
-        pressure_m: height from the pressure sensor [m].
-        attitude_rad: roll and pitch from the AHRS [rad].
-        heading_rad: heading from the AHRS [rad].
-        dvl_mps: white noise of each axis of the DVL velocity [m/s].
-        dvl_scale: relative scale error of the DVL, constant over a survey (speed of sound, beam angles).
-        usbl_m: each axis of an acoustic position fix [m].
-        beacon_px: column and row of a beacon in the image [px].
+        pressure_m: standard deviation of the height from the pressure sensor [m].
+        attitude_rad: standard deviation of roll and of pitch from the AHRS [rad].
+        heading_rad: standard deviation of the heading from the AHRS [rad].
+        dvl_mps: standard deviation of the white noise of each axis of the DVL velocity [m/s].
+        dvl_scale: standard deviation of the relative scale error of the DVL, which is constant over a survey (speed of
+            sound, beam angles).
+        usbl_m: standard deviation of each axis of an acoustic position fix [m].
+        beacon_px: standard deviation of column and of row of a beacon in the image [px].
         beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
     """
 
@@ -294,14 +295,18 @@ class SurveyResult:
     """Result of the estimators over a whole survey.
 
     Args:
-        f2f, online, final: trajectories from frame-to-frame motion alone, estimated online, after the last alignment.
+        f2f: trajectory from frame-to-frame motion alone.
+        online: trajectory of the online estimates.
+        final: trajectory after the last global alignment.
         keyframe_rows: (n_keyframes,) rows of the trajectories that are keyframes.
         track_of_keyframe: (n_keyframes,) track number of each keyframe, from 1.
-        node_cov: (n_keyframes, 6, 6) marginal covariance of each final pose [rotation, translation] in camera axes.
+        node_cov: (n_keyframes, 6, 6) marginal covariance of each final keyframe pose, [rotation, translation] (rad, m)
+            in camera axes.
         keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
         links: measured motions of the network.
         alignments: size and cost of each global alignment.
-        before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
+        before_ga, after_ga: positions (n, 3) of the keyframes just before and after the global alignment at the end of
+            each track [m].
         stereo_observations: image quality of all stereo pairs, also of those with too few points for a keyframe.
     """
 
@@ -329,7 +334,13 @@ class SurveyResult:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """Cells of the maps of a survey; row 0 is the northernmost, (west_m, north_m) the outer corner of cell (0, 0)."""
+    """Regular grid of the cells of a map.
+
+    Args:
+        west_m, north_m: x and y of the outer corner of cell (0, 0) [m].
+        cell_m: side of a cell [m].
+        rows, cols: number of rows, of which row 0 is the northernmost, and of columns.
+    """
 
     west_m: float
     north_m: float

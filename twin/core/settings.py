@@ -21,8 +21,8 @@ class EstimatorSettings:
         node_stride: every n-th keyframe is a node of the network.
         min_overlap: smallest overlap of linked nodes, a fraction of the node's matched points.
         max_links: largest number of links from a node to earlier nodes.
-        use_f2m: register keyframes with the mosaic (F2M).
-        use_ga: align the network globally (GA) at the end of each track and of the survey.
+        use_f2m: whether to register keyframes with the mosaic (F2M).
+        use_ga: whether to align the network globally (GA) at the end of each track and of the survey.
         points: largest number of matched points of a keyframe.
         patch_px: side of the matching window, the same for stereo and for motion [px]; odd.
         keyframe_overlap: a frame becomes a keyframe where its overlap with the last keyframe falls below this fraction;

@@ -1,8 +1,8 @@
 """Global alignment: maximum-likelihood poses of all nodes given the motions measured between them.
 
-Eliminating the Lagrange multipliers of the mixed-adjustment model, eq. (7), leaves a least-squares problem with one
-residual block per link. It is solved as a factor graph with Huber loss; links that contradict all others are removed
-and reported.
+Eliminating the Lagrange multipliers of the mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) leaves a
+least-squares problem with one residual block per link. It is solved as a factor graph with Huber loss; outlier links
+are removed and reported.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class AlignmentResult(NamedTuple):
 
     Args:
         poses: (n, 4, 4) aligned world_from_camera of the nodes.
-        covs: (n, 6, 6) marginal covariances; zeros for nodes whose covariance was not requested.
+        covs: (n, 6, 6) marginal covariances of the poses; zeros for nodes whose covariance was not requested.
         dropped: links that were removed as outliers.
     """
 
@@ -59,7 +59,8 @@ def align(
         nodes: nodes of the window; their poses are the initial values.
         links: motions between nodes of the window.
         anchors: prior covariance (6, 6) [rotation, translation] of each anchored node (rad, m), by node number.
-        rig, noise: nominal calibration.
+        rig: nominal calibration of the stereo camera.
+        noise: nominal noise of the navigation sensors.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
@@ -86,7 +87,13 @@ def align(
 
 
 class _Window(NamedTuple):
-    """Window of nodes: its links and its factor graph, whose first binary factors are these links."""
+    """Nodes that are aligned together.
+
+    Args:
+        links: links between the nodes.
+        index_of: index of each node in the factor graph, by node number.
+        graph: factor graph; its first binary factors are the links.
+    """
 
     links: Links
     index_of: dict[int, int]
@@ -99,8 +106,8 @@ class _Window(NamedTuple):
     def outliers(self, chi2: Array) -> Mask:
         """Returns a mask (n,) of the links to remove, given the chi2 (n,) of all links.
 
-        If chi2 of a link is large but far below the largest, the worst link may be its cause; such a link stays until
-        the next round. Links between consecutive keyframes are never removed.
+        If the chi2 of a link is large but far below the largest, the worst link may be the cause; such a link stays
+        until the next round. Links between consecutive keyframes are never removed.
         """
         chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))

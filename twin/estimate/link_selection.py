@@ -15,12 +15,19 @@ from twin.core.records import StereoRig
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
-_SAME_SWATH = 2  # number of previous nodes on the same swath that are linked, as in the paper
+_SAME_SWATH = 2  # number of linked previous nodes on the same swath, as in Negahdaripour & Madjidi 2003
 _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
 class _View(NamedTuple):
-    """Camera intrinsics, image size, and the smallest distance of a visible point from the image border, all in px."""
+    """Camera intrinsics and image size, for projection in compiled code.
+
+    Args:
+        fx, fy: focal lengths along columns and rows [px].
+        cx, cy: principal point [px].
+        width, height: image size [px].
+        margin: smallest distance of a visible point from the image border [px].
+    """
 
     fx: float
     fy: float
@@ -34,8 +41,8 @@ class _View(NamedTuple):
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Returns the overlap (n,) of a node with the left image at each of the poses (n, 4, 4), 0 to 1.
 
-    The overlap is the fraction of the node's matched points that project into the other image: it is predicted from
-    poses and depth and does not assume a flat floor.
+    The overlap is the fraction of the node's matched points that project into the other image. It is predicted from
+    poses and depth, and does not assume a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -56,9 +63,9 @@ def choose_links(
 ) -> list[tuple[Keyframe, float]]:
     """Selects the earlier nodes that a new node is linked to.
 
-    These are the two previous nodes, the farthest node of the same swath, and nodes of other swaths in the order of
-    their overlap. The farthest node of a swath gives the longest baseline; links to other swaths connect the legs, and
-    the oldest of these nodes closes loops.
+    The selected nodes are the two previous nodes, the farthest node of the same swath, and nodes of other swaths in the
+    order of their overlap. The farthest node of a swath gives the longest baseline; links to other swaths connect the
+    legs, and the oldest of these nodes closes loops.
 
     Args:
         node: the new node.
@@ -87,15 +94,15 @@ def choose_links(
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     """Returns the links of one new node with inflated covariances, because their errors are correlated.
 
-    All n links use the same stereo points of the node, whose noise dominates their error. Treated as independent, they
-    would count one stereo observation n times, and the positions would be overconfident by a factor of about 5 in
-    variance. The covariance of each link is multiplied by n.
+    All n links use the same stereo points of the node, whose noise dominates the errors of the links. If the
+    links were treated as independent, one stereo observation would count n times, and the variance of the positions
+    would be underestimated by a factor of about 5. The covariance of each link is multiplied by n.
     """
     return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the unbroken run of linked nodes back from node `newest`: the rest of the swath of the new node."""
+    """Returns the consecutive linked nodes from node `newest` backwards: the rest of the swath of the new node."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
@@ -109,7 +116,7 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the distance beyond which no camera sees the points (n, 3): the image diagonal at their largest depth."""
+    """Returns the distance beyond which no camera sees the points (n, 3): the image diagonal at the largest depth."""
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 

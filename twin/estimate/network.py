@@ -34,7 +34,8 @@ class LinkQueue:
     """Link measurements in progress, in the order of their nodes.
 
     Args:
-        background: True measures in a separate thread, which is faster with images; False measures in `collect`.
+        background: whether links are measured in a separate thread, which is faster with images; otherwise `collect`
+            measures them.
     """
 
     def __init__(self, background: bool):
@@ -74,7 +75,8 @@ class AlignmentHistory:
     Attributes:
         alignments: cost and size of each alignment.
         dropped: links rejected as outliers.
-        before_ga, after_ga: per track, positions (n, 3) of the keyframes just before and after its alignment [m].
+        before_ga: per track, positions (n, 3) of the keyframes just before the alignment of the track [m].
+        after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -87,8 +89,9 @@ class KeyframeNetwork:
     """Keyframes of a survey, the nodes among them, and the measured motions that link the nodes.
 
     Args:
-        vision: measures the links.
-        rig, noise: believed calibration, and believed noise of the navigation sensors.
+        vision: source of the visual measurements, which measures the links.
+        rig: believed calibration.
+        noise: believed noise of the navigation sensors.
         settings: settings of the estimators.
         stopwatch: returns the context manager that times the stage of a given name.
     """
@@ -115,7 +118,7 @@ class KeyframeNetwork:
         return np.array([k.world_from_camera for k in self.keyframes]).reshape(-1, 4, 4)
 
     def add(self, keyframe: Keyframe) -> None:
-        """Adds a keyframe; memory keeps the matched points of the newest one only."""
+        """Adds a keyframe; only the newest keyframe keeps its matched points in memory."""
         if self.keyframes:
             self.keyframes[-1].points = None  # links start from the points of the newer node
         self.keyframes.append(keyframe)
@@ -125,13 +128,13 @@ class KeyframeNetwork:
         return keyframe.number % self.settings.node_stride == 0
 
     def overlap_with_last(self, world_from_camera: Array) -> float:
-        """Returns the predicted overlap of a pose (4, 4) with the last keyframe, 0 to 1."""
+        """Returns the predicted overlap of the image at a pose (4, 4) with the last keyframe, 0 to 1."""
         last = self.keyframes[-1]
         poses = np.ascontiguousarray(world_from_camera[None])
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
 
     def link_to_last_node(self, node: Keyframe) -> Link | None:
-        """Measures the motion from the last node to a new one; None where that fails or the node is the first."""
+        """Returns the measured link from the last node to a new one; None if it fails or the new node is the first."""
         if not self.nodes:
             return None
         last = self.nodes[-1]
@@ -146,6 +149,7 @@ class KeyframeNetwork:
         """Adds a node and links it to earlier ones; the links are measured in the background.
 
         Args:
+            node: the new node.
             chain: measured motion from the last node.
             bridge: F2F motion from the last node; used where `chain` could not be measured.
             displacement: displacement since the last node, measured by the DVL.
@@ -171,7 +175,7 @@ class KeyframeNetwork:
         """Aligns the window of tracks that ends with this track, and rebuilds the mosaic from this track.
 
         Returns:
-            (6, 6) marginal covariance of the last node in its own axes, or None where nothing was aligned.
+            (6, 6) marginal covariance of the pose of the last node, in its camera axes; None if nothing was aligned.
         """
         if not self.settings.use_ga or len(self.nodes) < 2:
             return None
@@ -191,7 +195,7 @@ class KeyframeNetwork:
         """Aligns all nodes.
 
         Returns:
-            (n_keyframes, 6, 6) marginal covariance of each keyframe's node, or None where nothing was aligned.
+            (n_keyframes, 6, 6) marginal covariance of the pose of each keyframe's node; None if nothing was aligned.
 
         Raises:
             SurveyAborted: the alignment failed; a second call returns None.
@@ -229,7 +233,7 @@ class KeyframeNetwork:
         ]
 
     def _collect_links(self, all_but: int = 0) -> None:
-        """Adds the links that were measured in the background.
+        """Adds the measured links of the oldest pending nodes, until at most `all_but` nodes are pending.
 
         Raises:
             OSError: images could not be read or written; the incomplete network is not aligned any more.
@@ -242,7 +246,9 @@ class KeyframeNetwork:
             raise
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
-        """Aligns the last nodes; older nodes linked to them are fixed. Keyframes between nodes move with their node."""
+        """Aligns the last nodes; older nodes linked to them are fixed. Keyframes between nodes keep their pose relative
+        to the node before them.
+        """
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())
@@ -266,7 +272,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets new poses of nodes by number; keyframes between nodes move with the node before them."""
+        """Sets new poses of nodes by number; keyframes between nodes keep their pose relative to the node before."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

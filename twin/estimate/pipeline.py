@@ -1,4 +1,8 @@
-"""Navigation pipeline of the paper: F2F at every frame; stereo, F2M, links at keyframes; GA at the end of a track."""
+"""Navigation pipeline, after Negahdaripour & Madjidi 2003.
+
+Frame-to-frame motion (F2F) is estimated at every frame. Stereo matching, registration with the mosaic (F2M) and the
+measurement of links follow at keyframes, the global alignment (GA) at the end of a track.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +44,7 @@ class MotionSinceNode(NamedTuple):
 
     Args:
         motion: (4, 4) pose of the present camera in the camera of the node.
-        cov: (6, 6) its covariance [rotation, translation] (rad, m).
+        cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m).
         cov_at_node: (6, 6) covariance of the online pose at the node.
     """
 
@@ -59,8 +63,8 @@ class Navigator:
             origin with its optical axis along -z of the world. Readings of height or attitude require a world whose
             z axis points up.
         readings_noise: believed noise of the navigation sensors whose readings come with the frames.
-        vision: visual measurements; by default from the images of the frames.
-        folder: where images of keyframes and the mosaic are kept while the survey runs; by default a temporary folder.
+        vision: source of the visual measurements; by default they are computed from the images of the frames.
+        folder: folder for keyframe images and the mosaic while the survey runs; by default a temporary folder.
         stopwatch: returns the context manager that times the stage of a given name.
     """
 
@@ -105,6 +109,7 @@ class Navigator:
         `settings.keyframe_overlap`, or where tracking failed.
 
         Args:
+            frame: images and sensor readings of the frame.
             track: number of the track, from 1; tracks limit the window of `align_track`.
         """
         interval_s = self._interval_s(frame.time_s)
@@ -121,7 +126,10 @@ class Navigator:
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
 
     def align_track(self, track: int) -> None:
-        """Aligns the window of tracks that ends with this track, and moves the online pose with its last keyframe."""
+        """Aligns the window of tracks that ends with this track, and corrects the online pose accordingly.
+
+        The online pose receives the correction of the last keyframe.
+        """
         node_cov = self.network.align_window(track)
         if node_cov is not None:
             self._follow_last_keyframe(node_cov)
@@ -167,7 +175,7 @@ class Navigator:
         down, otherwise along this axis (`ElevationMap.map_from_world`).
 
         Args:
-            grid: grid of the map; by default it covers all that the keyframes show.
+            grid: grid of the map; by default it covers the images of all keyframes.
             progress: called with the fraction done.
 
         Returns:
@@ -205,13 +213,16 @@ class Navigator:
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
     def _image_vision(self, folder: Path | None) -> StereoVision:
-        """Returns the visual measurements from images; `close` releases them and their temporary folder."""
+        """Returns the source of visual measurements that works on images.
+
+        `close` releases it and its temporary folder.
+        """
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
 
     def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s]: the nominal interval where timestamps differ by rounding only."""
+        """Returns the time since the last frame [s]; the nominal interval if only rounding of timestamps differs."""
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
@@ -248,10 +259,11 @@ class Navigator:
         return status
 
     def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion since the last node, and replaces the F2F motion in the online pose by it.
+        """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
 
         Two stereo pairs determine the motion more accurately than the frames between them, and give GA better initial
-        values (section IV-5 of the paper). Corrections by navigation sensors since the last node are kept.
+        values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by navigation sensors since the last node are
+        kept.
         """
         link = self.network.link_to_last_node(node)
         if link is None:
@@ -285,7 +297,7 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Links a new node to earlier nodes; to the last node by the F2F motion if `chain` is None."""
+        """Links a new node to earlier nodes; the link to the last node is the F2F motion if `chain` is None."""
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
@@ -294,7 +306,11 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, node_cov: Array) -> None:
-        """Moves the online pose with the last keyframe after an alignment; `node_cov` (6, 6) is the node covariance."""
+        """Applies the correction that an alignment gave the last keyframe to the online pose.
+
+        Args:
+            node_cov: (6, 6) covariance of the pose of the last keyframe's node [rotation, translation] (rad, m).
+        """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))

@@ -37,8 +37,9 @@ class StereoVision:
     Args:
         rig: believed calibration.
         settings: settings of the estimators.
-        folder: where images of keyframes and tiles of the mosaic are kept.
-        cell_m: cell of the mosaic at full image size [m]; by default the ground sample distance of the first keyframe.
+        folder: folder for images of keyframes and tiles of the mosaic.
+        cell_m: cell size of the mosaic at full image size [m]; by default the ground sample distance of the first
+            keyframe.
         stopwatch: returns the context manager that times the stage of a given name.
     """
 
@@ -69,7 +70,7 @@ class StereoVision:
         self.close()
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Ends the threads of the image spool and of the matcher."""
         self.spool.close()
         self.matcher.close()
 
@@ -86,7 +87,7 @@ class StereoVision:
 
     @cached_property
     def mosaic(self) -> Mosaic:
-        """The mosaic; exists from the first keyframe on."""
+        """The mosaic, created when first used; requires a keyframe."""
         assert self._points is not None
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
@@ -96,7 +97,7 @@ class StereoVision:
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
     def _interval_ratio(self, time_s: float) -> float:
-        """Returns the time since the last frame divided by the interval before it; 1 where only rounding differs."""
+        """Returns the time since the last frame divided by the interval before that; 1 if only rounding differs."""
         before, last = self._times_s
         self._times_s = last, time_s
         ratio = (time_s - last) / (last - before) if last > before else 1.0
@@ -118,7 +119,7 @@ class StereoVision:
             self.f2f.step(self._image)
 
     def _set_image(self, left: Image) -> None:
-        """Sets the present left image."""
+        """Sets the current left image: its grey levels and the normalised image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 

@@ -18,11 +18,11 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
     Args:
         f2f: (n, 4, 4) poses from frame-to-frame motion alone.
         rows: (m,) indices of the frames that are keyframes, ascending.
-        keyframe_poses: (m, 4, 4) their aligned poses.
+        keyframe_poses: (m, 4, 4) aligned poses of these keyframes.
 
     Returns:
-        (n, 4, 4), equal to `keyframe_poses` at the keyframes. Before the first and after the last keyframe the
-        frame-to-frame motion is followed without correction.
+        (n, 4, 4) poses of all frames, equal to `keyframe_poses` at the keyframes. Before the first and after the last
+        keyframe the frame-to-frame motion is followed without correction.
     """
     if len(rows) == 0:
         return f2f.copy()
@@ -42,9 +42,9 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
 
 @njit(cache=True, nogil=True)
 def _distribute(world_from_start, f2f, misclosure, out):
-    """Fills `out` (n, 4, 4) with `f2f` moved by `world_from_start`, each pose with its fraction of the misclosure (6,).
+    """Writes the poses `world_from_start` @ `f2f`, corrected for the misclosure (6,), to `out` (n, 4, 4).
 
-    The fraction of pose k is k / n, so the frame after the last one would have the whole misclosure.
+    Pose k receives the fraction k / n of the misclosure, so the next keyframe would receive all of it.
     """
     step = 1 / len(f2f)
     for k in range(len(f2f)):

@@ -1,4 +1,4 @@
-"""Interface between the estimation pipeline and the stereo camera.
+"""Interface between the estimation pipeline and the source of visual measurements.
 
 `pipeline.Navigator` uses this interface only, so that measurements can come from images (`stereo_vision.StereoVision`)
 or from an error model without images.
@@ -18,7 +18,7 @@ from twin.estimate.vision.two_view_motion import Motion
 
 
 class Vision(Protocol):
-    """Visual measurements. Poses are (4, 4) world_from_camera of the left camera.
+    """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
 
     Attributes:
         stereo_observations: image quality of every stereo pair so far.
@@ -36,6 +36,7 @@ class Vision(Protocol):
         """Matches a stereo pair.
 
         Args:
+            frame: frame with both images.
             row: index of the frame in the trajectories.
 
         Returns:
@@ -56,7 +57,7 @@ class Vision(Protocol):
         ...
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
-        """Rebuilds the mosaic from these keyframes alone, the last ones of the path, at their present poses."""
+        """Rebuilds the mosaic from these keyframes alone, the last ones of the path, at their current poses."""
         ...
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
@@ -76,7 +77,9 @@ class Vision(Protocol):
         """Builds the elevation map along the final trajectory.
 
         Args:
-            step_cov: (n_keyframes, 6, 6) covariance of each keyframe relative to the one before.
+            result: result of the survey, with the final trajectory.
+            grid: grid of the map.
+            step_cov: (n_keyframes, 6, 6) covariance of the pose of each keyframe relative to the previous keyframe.
             progress: called with the number of keyframes that are done.
         """
         ...

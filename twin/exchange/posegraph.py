@@ -85,10 +85,10 @@ def _floats(words: Sequence[str], size: int) -> Array:
 
 
 def _link(i: int, j: int, i_from_j: Array, rotation_jacobian: Array, upper: Array) -> Link:
-    """Returns a link with the covariance of [rotation vector, translation] in j.
+    """Returns a link with the covariance of [rotation vector, translation] in the frame of vertex j.
 
     Args:
-        rotation_jacobian: (3, 3) derivative of the file's rotation parameters with respect to the rotation vector in j.
+        rotation_jacobian: (3, 3) derivative of the file's rotation parameters with respect to the rotation vector.
         upper: (21,) upper triangle of the information matrix of [translation, rotation parameters of the file].
     """
     information = np.zeros((6, 6))

@@ -43,7 +43,7 @@ class DecomposedImage(NamedTuple):
     """Left image with the quantities from which it is computed.
 
     Args:
-        albedo: (H, W, 3) uint8, 255 = white.
+        albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
         depth: (H, W) depth along the optical axis [m].
         components: radiance, separated by origin.
         setting: exposure, metered on this image.
@@ -61,7 +61,7 @@ class DecomposedImage(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Signal per radiance on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
+        """Image signal per unit of light on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
         return self.setting.gain
 
 

@@ -33,8 +33,8 @@ class Caustics:
     """Caustics of one survey, on a horizontal plane at the depth of the reference plane.
 
     Args:
-        illumination: water, depth of the reference plane, and the fraction of the daylight that is focused; the rest is
-            diffuse light from the sky and uniform.
+        illumination: water, depth of the reference plane, and the fraction of the daylight that is focused; the rest of
+            the daylight is diffuse and uniform.
         seed: seed of the scenario.
     """
 
@@ -84,7 +84,7 @@ class Caustics:
 
 
 def _blur(k: Array, depth_m: float, water: Medium) -> Array:
-    """Returns the modulation transfer function of the solar disc and of the scattering of green light.
+    """Returns the modulation transfer function of the blur by the solar disc and by the scattering of green light.
 
     With t the optical thickness of forward scattering, the fraction exp(-t) of the light is not scattered; the rest is
     scattered n = t / (1 - exp(-t)) times on average.
@@ -104,7 +104,7 @@ def _blur(k: Array, depth_m: float, water: Medium) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces evenly spaced rays through the surface; adds each to four cells of `light` (n, n), weighted bilinearly."""
+    """Traces evenly spaced rays through the surface; adds each to four cells of `light` (n, n), bilinearly weighted."""
     n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
     for i in range(n):
         i1 = (i + 1) & (n - 1)

@@ -39,7 +39,7 @@ MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
 
 
 class ForwardScattering(NamedTuple):
-    """Forward part of the scattering: its fraction of b, and the variance of its angle along one axis [rad2]."""
+    """Forward scattering: fraction of b below the limiting angle; variance of its angle along one axis [rad2]."""
 
     share: float
     variance_rad2: float
@@ -73,10 +73,10 @@ class ForwardScatter:
         self._bin_px = _bin_px(rig.width_px, rig.height_px, float(np.sqrt(self._variance_px2[0])))
 
     def spread(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Returns the forward-scattered radiance (H, W, 3) [cd/m2].
+        """Returns the forward-scattered light (H, W, 3) per colour band in photometric units [cd/m2].
 
         Args:
-            direct: (H, W, 3) direct signal [cd/m2].
+            direct: (H, W, 3) light of the floor that arrives without being scattered [cd/m2].
             depth: (H, W) depth along the optical axis [m].
         """
         return self._blur(direct, depth).copy()
@@ -105,7 +105,7 @@ class ForwardScatter:
 
 
 def _level_of(ratio: Array) -> Array:
-    """Returns fractional levels for variances of `ratio` times the smallest: 1 per factor of two, linear in between."""
+    """Returns fractional blur levels for variances `ratio` times the smallest; linear between factors of two."""
     below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
     return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 
@@ -160,7 +160,7 @@ def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, en
 
 @njit(cache=True, nogil=True)
 def _add(light, one, other, first, end):
-    """Adds two images to `light` (H, 3 W) in rows `first` to `end`."""
+    """Adds the images `one` and `other` to `light` (H, 3 W) in rows `first` to `end`."""
     for v in range(first, end):
         for k in range(light.shape[1]):
             light[v, k] = light[v, k] + one[v, k] + other[v, k]

@@ -18,7 +18,7 @@ class Daylight(NamedTuple):
     """Daylight from the zenith in the bands R, G, B.
 
     Args:
-        surface_lx: (3,) illuminance just below the water surface; without a surface, that on the floor.
+        surface_lx: (3,) illuminance just below the water surface; without a surface, illuminance of the floor.
         illuminance_lx: (3,) illuminance of a horizontal plane at the planned altitude.
         attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
@@ -42,7 +42,7 @@ class Illumination(NamedTuple):
 
 
 def illumination_of(scenario: Scenario) -> Illumination:
-    """Returns the water and the daylight of a scenario.
+    """Returns the optical properties of the water, and the daylight, of a scenario.
 
     Raises:
         TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or

@@ -27,15 +27,15 @@ class StampedPose(NamedTuple):
 
 
 class RadianceComponents(NamedTuple):
-    """Radiance that reaches a camera, separated by origin; each array is (H, W, 3) float32.
+    """Light that reaches a camera, separated by origin, per colour band in photometric units; (H, W, 3) float32 each.
 
     Args:
-        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where no measurable light returns from there.
-        direct: radiance of the floor that was not scattered on its path to the camera [cd/m2].
-        forward: radiance of the floor that was scattered forward [cd/m2]; None where forward scatter is disabled.
-        backscatter: radiance of lamps and daylight that the water scatters to the camera [cd/m2].
-        snow: change of radiance due to marine snow [cd/m2]; None where marine snow is disabled.
-        total: total radiance [cd/m2].
+        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where no measurable light of it returns.
+        direct: light of the floor that was not scattered on its path to the camera [cd/m2].
+        forward: light of the floor that was scattered forward [cd/m2]; None where forward scatter is disabled.
+        backscatter: light of lamps and daylight that the water scatters to the camera [cd/m2].
+        snow: change of the light due to marine snow [cd/m2]; None where marine snow is disabled.
+        total: sum of all components [cd/m2].
     """
 
     floor_lx: Radiance
@@ -47,7 +47,7 @@ class RadianceComponents(NamedTuple):
 
 
 class ImageFormation:
-    """Model of the radiance [cd/m2] in R, G, B that reaches each camera (0 left, 1 right), given albedo and depth.
+    """Model of the light that reaches each camera of the stereo camera, given albedo and depth of the floor.
 
     Args:
         scenario: lamps, marine snow, current and enabled effects.
@@ -80,13 +80,13 @@ class ImageFormation:
         self._snow = MarineSnow(snow, current_mps, rig, water, sources, snow_rng) if snows else None
 
     def radiance(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
-        """Returns the radiance that reaches a camera (H, W, 3) [cd/m2].
+        """Returns the light (H, W, 3) that reaches a camera, per colour band in photometric units [cd/m2].
 
         Args:
-            albedo: (H, W, 3) uint8, 255 = white.
+            albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
             depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
-            pose: pose of the left camera and time.
+            pose: pose of the left camera, and time since the start of the survey.
         """
         lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
         if self._forward is None:
@@ -99,7 +99,7 @@ class ImageFormation:
         return light
 
     def components(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> RadianceComponents:
-        """Returns the radiance separated by origin; the arguments are those of `radiance`."""
+        """Returns the light that reaches a camera, separated by origin; takes the same arguments as `radiance`."""
         lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
         direct, backscatter = self._optics.split(albedo, depth, camera, lit, surface)
         forward = None if self._forward is None else self._forward.spread(direct, depth)

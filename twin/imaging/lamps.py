@@ -29,14 +29,14 @@ _HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
 
 
 class LightSources(NamedTuple):
-    """Lamps in the axes of one camera, and daylight along its optical axis.
+    """Light sources of one camera: lamps in its axes, and daylight that propagates along its optical axis.
 
     Args:
         position_m: (n, 3) positions of the lamps [m].
-        axis: (n, 3) unit vectors of their beams.
-        intensity_cd: (n,) luminous intensity on the axis.
+        axis: (n, 3) unit vectors of the beam axes of the lamps.
+        intensity_cd: (n,) luminous intensity of each lamp on its beam axis.
         colour: (n, 3) factors of the intensity for R, G, B.
-        beam: n tables (m, 2) of angle from the axis [deg] and intensity relative to that on the axis.
+        beam: for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to that on the axis.
         daylight: daylight in the water.
     """
 

@@ -18,7 +18,7 @@ from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
-STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; the tolerance is a tangent; 1e-9 is a millionth of a pixel
+STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; the tolerance is a tangent (1e-9 corresponds to 1e-6 px)
 
 
 class Distortion(NamedTuple):

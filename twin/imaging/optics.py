@@ -1,6 +1,6 @@
 """Image formation in water: direct signal and backscatter of lamps and daylight.
 
-Radiance of a pixel that shows a floor of albedo rho at range r, for a camera that moves with the lamps
+Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle
 (Jaffe 1990, McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
 
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_sun) * exp(-c r)  +  B(r)
@@ -44,7 +44,7 @@ class WaterSurface(NamedTuple):
 
     Args:
         caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
-            first ones. None where daylight is uniform.
+            first row and column. None where daylight is uniform.
         from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics` and depth below the
             surface [m].
     """
@@ -68,7 +68,7 @@ class _Tables(NamedTuple):
 
 
 class Optics:
-    """Model of direct signal and backscatter [cd/m2] for R, G, B at each camera (0 left, 1 right).
+    """Model of the direct signal and the backscatter that reach each camera, for R, G, B.
 
     Args:
         rig: the rendered cameras.
@@ -93,11 +93,11 @@ class Optics:
     def radiance(
         self, albedo: Image, depth: Depth, camera: int, lit: Lit | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the radiance that reaches a camera (H, W, 3) float32 [cd/m2].
+        """Returns the light (H, W, 3) float32 that reaches a camera, per colour band in photometric units [cd/m2].
 
         Args:
-            albedo: (H, W, 3) uint8, 255 = white.
-            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor but only backscatter.
+            albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
+            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
             lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; None = no shadows.
             surface: the water surface; None = a calm surface, and a camera that points straight down at the planned
@@ -170,12 +170,12 @@ def backscatter_per_m(sources: LightSources, water: Medium, ray: Array, range_m:
 
     Args:
         sources: lamps and daylight in the axes of the camera.
-        water: optical properties.
-        ray: (..., 3) unit viewing direction in the camera.
+        water: optical properties of the water.
+        ray: (..., 3) unit viewing direction in the axes of the camera.
         range_m: (..., n) distances along the ray [m].
 
     Returns:
-        (..., n, 3) radiance per metre [cd/m3].
+        (..., n, 3) light per metre of range and colour band, in photometric units [cd/m3].
     """
     scattering, attenuation = water.scattering_per_m, water.attenuation_per_m
     points = ray[..., None, :] * range_m[..., None]

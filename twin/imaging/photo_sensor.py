@@ -1,4 +1,4 @@
-"""Physical sensor of a scenario with [sensor]: photons, electrons, digital numbers, exposure time and read-out time."""
+"""Physical sensor (section [sensor] of a scenario): photons, electrons, digital numbers, exposure and read-out time."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
 
 
 class PhotoSensor:
-    """Physical sensor of both cameras: exposure time is increased first, then gain.
+    """Physical sensor of both cameras, with auto-exposure that increases the exposure time first, then the gain.
 
     Beyond the limits of exposure and gain, images stay dark or saturate. Auto-exposure meters the radiance and not the
     image, so that it does not oscillate where an image saturates.
@@ -126,7 +126,7 @@ class PhotoSensor:
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _weighted_mean(light, weights):
-    """Returns the mean (3,) of each band of `light` (H, W, 3) times `weights` (H, W)."""
+    """Returns the mean (3,) over all pixels of `light` (H, W, 3) multiplied by `weights` (H, W), for each band."""
     total = np.zeros(3)
     for v in range(weights.shape[0]):
         row, shares = light[v].reshape(-1), weights[v]

@@ -30,7 +30,8 @@ class PixelResponse(NamedTuple):
         full_well_e: full-well capacity [e-].
         read_noise_e: standard deviation of the read noise [e-].
         dn_per_e: digital numbers per electron, K of EMVA 1288.
-        black_dn, top_dn: black level, and the largest digital number.
+        black_dn: black level, as a digital number.
+        top_dn: largest digital number.
     """
 
     electrons_per_cd: NDArray[np.float64]
@@ -51,7 +52,7 @@ def read_out(
     """Returns raw digital numbers: (H, W) with a Bayer filter (R G / G B from the top left), else (H, W, 3).
 
     Args:
-        light: (H, W, 3) radiance [cd/m2].
+        light: (H, W, 3) light per colour band in photometric units [cd/m2].
         vignetting: (H, W) illuminance relative to the axis.
         response: response of the pixels.
         bayer: whether each pixel has one colour band only.
@@ -98,10 +99,10 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 
 @njit(cache=True, nogil=True)
 def _normal_to_poisson(expected, shot):
-    """Replaces normal numbers z in `shot` by whole electrons with Poisson mean m, variance and skewness.
+    """Replaces normal numbers z in `shot` by electron counts with mean m, variance and skewness of a Poisson number.
 
     The numbers are m + s z + (z^2 - 1) / 6, the first terms of the Cornish-Fisher expansion (1938), with
-    s^2 = m - 1/18 - 1/12 to compensate the variance of the quadratic term and of the rounding.
+    s^2 = m - 1/18 - 1/12 to compensate for the variance of the quadratic term and of the rounding.
     """
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):

@@ -29,8 +29,8 @@ class Pinhole(NamedTuple):
     """Pinhole camera in water that is equivalent to a camera behind a port near its axis.
 
     Args:
-        centre_m: position of its centre on the axis, forward of the entrance pupil.
-        focal_ratio: its focal length divided by that of the lens in air.
+        centre_m: position of the pinhole on the optical axis, positive in front of the entrance pupil.
+        focal_ratio: focal length of the pinhole camera divided by that of the lens in air.
     """
 
     centre_m: float
@@ -111,7 +111,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with a flat pane, on the plane `depth_m` into its glass."""
+    """Returns intersections and normals (..., 3) of rays with the plane at `depth_m` in the glass of a flat pane."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     along = ray @ normal
@@ -120,7 +120,7 @@ def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tup
 
 
 def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with a dome, on the sphere `depth_m` into its glass."""
+    """Returns intersections and normals (..., 3) of rays with the sphere at depth `depth_m` in the glass of a dome."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre
     along = (from_centre * ray).sum(axis=-1)

@@ -56,7 +56,7 @@ class Renderer:
         self._shown = np.ones(len(self._tiles), dtype=bool)
 
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m], inf without floor.
+        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; depth inf = no floor.
 
         Args:
             world_from_camera: (4, 4) pose of the camera.

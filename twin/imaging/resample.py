@@ -24,7 +24,7 @@ INTERSECTION_PX = 1e-3  # size of the last step; the remaining error is a few pe
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
-    """Returns the radiance (h, w, 3) that pixels at these positions collect from radiance (H, W, 3).
+    """Returns the radiance (h, w, 3) that pixels at these positions collect from a radiance image (H, W, 3).
 
     Beyond the image border the last row or column is repeated.
     """
@@ -32,7 +32,7 @@ def sample(light: Radiance, positions: Positions) -> Radiance:
 
 
 def interpolate(image: Image, positions: Positions) -> Image:
-    """Returns an image (H, W, 3) interpolated at positions (h, w, 2); exact at the pixels."""
+    """Returns the image (h, w, 3) interpolated from `image` (H, W, 3) at `positions`; exact at pixel centres."""
     spline = image.reshape(len(image), -1).astype(np.float32)
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
@@ -131,7 +131,7 @@ def _filter_columns(image, first, end):
 
 @njit(cache=True, nogil=True)
 def _filter_rows(image, first, end):
-    """Same as `_filter_columns` along rows `first` to `end` of an image (H, 3 W)."""
+    """Same as `_filter_columns`, but for rows `first` to `end` of an image (H, 3 W)."""
     for v in range(first, end):
         _filter_columns(image[v].reshape(-1, 3), 0, 3)
 

@@ -17,7 +17,7 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1)
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
         n_rows: number of rows.
-        pixels: number of image rows that each row stands for.
+        pixels: number of image rows that each processed row represents.
     Raises:
         Exception: any exception that `work` raises in any band.
     """
@@ -35,7 +35,7 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1)
 
 @cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Returns the pool of threads that work next to the calling thread; a forked process gets a pool of its own."""
+    """Returns the pool of threads that work in addition to the calling thread; each forked process has its own pool."""
     return ThreadPoolExecutor(THREADS - 1, thread_name_prefix=f"bands-{process}")
 
 

@@ -1,6 +1,6 @@
 """Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8 bits.
 
-It is used for scenarios without [sensor]; its gain is unlimited and its exposure time zero.
+It is used for scenarios without a section [sensor]; its gain is unlimited and its exposure time zero.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class AutoExposure:
     """Auto-exposure: sets the gain that brings the mean of the brightest channel to `gray_level`, with a lag.
 
     The brightest channel is used because water absorbs colours: if the mean of all channels were metered, the least
-    absorbed one would saturate. The gain of a frame follows from the previous frames, as in a real camera; that of the
-    first frame is metered on this frame.
+    absorbed channel would saturate. The gain of a frame is computed from the previous frames, as in a real camera; the
+    gain of the first frame is computed from that frame itself.
 
     Args:
         gray_level: target mean as a fraction of full scale.
@@ -70,7 +70,7 @@ class ExposureSetting(NamedTuple):
     """Exposure of one frame.
 
     Args:
-        gain: signal per radiance on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
+        gain: image signal per unit of light on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
         exposure_s: exposure time; 0 for a sensor without motion blur.
         analogue_gain: amplification before digitization.
     """
@@ -107,8 +107,8 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
     """Returns the 8-bit image (H, W, 3) of a radiance; the noise variance is read^2 + shot^2 * signal.
 
     Args:
-        radiance: (H, W, 3) [cd/m2].
-        gain: signal per radiance [1 / (cd/m2)]; a signal of 1 saturates.
+        radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
+        gain: image signal per unit of light [1 / (cd/m2)]; a signal of 1 saturates.
         imaging: standard deviations of read noise, and of shot noise at full scale, as fractions of full scale.
         rng: random stream of this camera; one number is drawn per image.
     """

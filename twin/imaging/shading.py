@@ -126,7 +126,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp with this beam, attenuated from lamp to floor to camera."""
+    """Adds to `light` (3, W) the illuminance by a lamp, attenuated from the lamp to the floor and to the camera."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
@@ -151,7 +151,7 @@ def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
-    """Fills `share` (W,) with the daylight on a row's floor relative to its mean: 0 where there is no floor."""
+    """Fills `share` (W,) with the daylight on the floor in a row of pixels relative to its mean; 0 without floor."""
     half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
         share[u] = one if here[u] < far else zero
@@ -178,7 +178,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light):
-    """Adds to `light` (3, W) the daylight on the floor in a row of pixels, times `share`, attenuated to the camera."""
+    """Adds to `light` (3, W) the daylight on the floor, times `share`, attenuated on the path to the camera."""
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for c in range(3):
         incident, by_depth, by_range = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]
@@ -191,7 +191,7 @@ def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_rows(table, row, out):
-    """Interpolates the backscatter table to one row of pixels, between two rows of the grid."""
+    """Fills `out` with the backscatter table of one row of pixels, interpolated between two rows of `table`."""
     j = min(int(row), table.shape[0] - 2)
     w = row - np.float32(j)
     lower, upper = table[j], table[j + 1]
@@ -203,9 +203,9 @@ def _interpolate_rows(table, row, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"}, error_model="numpy")
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
-    """Computes the backscatter (3, W) in front of the floor in a row of pixels by bilinear interpolation.
+    """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range.
 
-    The order of operations is fixed for each band, so that images stay identical to the last bit.
+    The order of operations is deliberate in each band: another order would change the last bits of the images.
     """
     cols, _, ranges = table.shape
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)

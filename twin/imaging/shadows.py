@@ -1,4 +1,4 @@
-"""Shadows that the floor casts in the light of the lamps, which are mounted away from the cameras.
+"""Shadows that the floor casts in the light of the lamps, which are mounted at a distance from the cameras.
 
 A point of the floor is in shadow where the straight ray to the lamp passes below the floor. The floor is the rendered
 surface itself: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses its edges, so
@@ -40,7 +40,7 @@ class Heights(Protocol):
 
 
 class _Grid(NamedTuple):
-    """Heights of nodes (ny, nx); highest node and steepest slope [m per cell] of each block; origin and spacing."""
+    """Heights (ny, nx) of the grid nodes; per block, highest node and steepest slope [m per cell]; origin, spacing."""
 
     height_m: NDArray[np.float32]
     block_top_m: NDArray[np.float32]

@@ -49,7 +49,7 @@ def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array,
 
 
 def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) as seen by a rolling shutter.
+    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records.
 
     Args:
         light, depth, focal_px, twist: see `blur_by_motion`.
@@ -66,7 +66,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 def _flow(x, y, near, scale, twist):
     """Returns the optical flow at tangents x, y, with `near` = 1 / depth.
 
-    The unit is px/s if `scale` is the focal length f, and px if it is f times a duration."""
+    The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration."""
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]

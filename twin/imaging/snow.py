@@ -30,7 +30,7 @@ PIXEL_BLUR_PX = 1.0
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera: column and row (n, 2) [px], depth (n,) [m], radiance (n, 3) [cd/m2]."""
+    """Particles in view of a camera: column and row (n, 2) [px], depth (n,) [m], light per band (n, 3) [cd/m2]."""
 
     pixel: Array
     depth_m: Array
@@ -41,7 +41,7 @@ class MarineSnow:
     """Marine snow particles of one survey.
 
     Args:
-        snow: density, size and albedo.
+        snow: density, size and albedo of the particles.
         current_mps: (3,) velocity of the particles in the world.
         rig: the rendered cameras.
         water: optical properties of the water.
@@ -94,7 +94,7 @@ class MarineSnow:
         _draw(light, depth, particles.pixel, particles.depth_m, particles.radiance, width_px, cover_px2)
 
     def _radiance(self, points: Array, sources: LightSources) -> Array:
-        """Returns the radiance (n, 3) [cd/m2] of particles at `points` (n, 3) in the camera axes."""
+        """Returns the light (n, 3) of particles at `points` (n, 3) in the camera axes, per colour band [cd/m2]."""
         range_m = np.linalg.norm(points, axis=1)[:, None]
         attenuation = self._water.attenuation_per_m
         day = sources.daylight
@@ -108,7 +108,7 @@ class MarineSnow:
 
 
 def _width_px(focal_px: float, diameter_m: float, depth_m: Array | float) -> Array:
-    """Returns the image diameter of a particle, including blur [px]."""
+    """Returns the diameter of a particle in the image [px], including blur."""
     return np.sqrt((focal_px / np.asarray(depth_m)) ** 2 * (diameter_m**2 + APERTURE_M**2) + PIXEL_BLUR_PX**2)
 
 

@@ -1,6 +1,6 @@
-"""True cameras: convert rendered images to the raw images of the true cameras, and raw images to rectified frames.
+"""Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
 
-The floor is rendered for two parallel pinhole cameras in water, with larger images than the frames where necessary.
+The floor is rendered for two parallel pinhole cameras in water, with images larger than the frames where necessary.
 Each pixel of a raw image has its own ray through lens and port; its radiance is sampled where that ray intersects the
 rendered depth. The sensor makes a raw image of the sampled radiance, and a frame is the raw image rectified with the
 believed calibration. Where the true cameras are the believed pinholes, the rendered image is used unchanged.
@@ -42,9 +42,10 @@ class CameraModel(NamedTuple):
     Args:
         focal_px: focal length of the lens, in air.
         principal_px: (2,) column and row of the principal point.
-        lens, port: distortion and refraction.
-        pinhole: equivalent pinhole in water near the axis.
-        believed_from_camera: (3, 3) rotation about the centre of that pinhole.
+        lens: distortion coefficients.
+        port: geometry and refractive indices of the port.
+        pinhole: pinhole camera in water that is equivalent to lens and port near the optical axis.
+        believed_from_camera: (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`.
     """
 
     focal_px: float
@@ -78,8 +79,9 @@ class SamplingMap(NamedTuple):
     """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled.
 
     Args:
-        positions: (h, w, 2) positions of points at infinity [px].
-        parallax_px_m: (h, w, 2) displacement for points at a finite depth, times that depth; None without a port.
+        positions: (h, w, 2) position for each raw pixel if the point it shows is at infinity [px].
+        parallax_px_m: (h, w, 2) shift of that position for a point at a finite depth, times the depth [px m]; None if
+            zero.
     """
 
     positions: Positions
@@ -88,17 +90,20 @@ class SamplingMap(NamedTuple):
 
 @dataclass(frozen=True)
 class TrueCameras:
-    """Geometry of the true stereo camera: from rendered images to raw images and frames.
+    """Geometry of the true stereo camera: maps rendered images to raw images, and raw images to rectified frames.
 
     Args:
-        rendered_rig: cameras that are rendered: the believed rig with the true baseline and a margin around its images.
-        margin_px: (columns, rows) of the rendered image on each side of the frame.
-        raw_rig: size of the raw images, and the focal length of the lens, in air.
-        sampling: maps of the left and the right camera; None where the rendered image is the raw image.
-        rectification: positions (H, W, 2) of the frame's pixels in the raw image; None where both are the same.
+        rendered_rig: calibration used for rendering: the believed rig with the true baseline, and images enlarged by
+            the margin.
+        margin_px: (columns, rows) by which the rendered image extends beyond the frame on each side.
+        raw_rig: calibration of the raw images: their size, the focal length of the lens in air, the true baseline.
+        sampling: for the left and the right camera, position in the rendered image of each raw pixel; None where the
+            raw image is the rendered image.
+        rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None where the
+            frame is the raw image.
         models: models of the true left and right camera.
-        believed: model with which both cameras are rectified.
-        rectified_depth_m: depth at which the rectification is exact.
+        believed: camera model that is used to rectify the images of both cameras.
+        rectified_depth_m: depth of the points for which the rectification is exact.
     """
 
     rendered_rig: StereoRig
@@ -124,16 +129,16 @@ class TrueCameras:
         return resample.sample(light, positions if parallax is None else resample.intersect(depth, positions, parallax))
 
     def rectify(self, raw: Image) -> Image:
-        """Returns the raw image of either camera, rectified with the believed calibration."""
+        """Returns the frame: the raw image of either camera, rectified with the believed calibration."""
         return raw if self.rectification is None else resample.interpolate(raw, self.rectification)
 
     def crop(self, rendered: NDArray[Any]) -> NDArray[Any]:
-        """Returns the part of a rendered image that the frame of the believed camera covers."""
+        """Returns a rendered image without its margin, i.e. with the size of the frame."""
         (x, y), (height, width) = self.margin_px, rendered.shape[:2]
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixels (n, 2) in a frame of points (n, 3) in the rendered camera [m]; NaN if not imaged."""
+        """Returns the frame pixels (n, 2) of points (n, 3) [m] in the rendered camera's axes; NaN if not imaged."""
         rig = self.rendered_rig
         if self.sampling is None:
             return rig.project(points_m)
@@ -203,7 +208,7 @@ def _believed_model(scenario: Scenario) -> CameraModel:
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:
-    """Returns the rotation error (3, 3) of the right camera by yaw about y (down), pitch about x, roll about z."""
+    """Returns the rotation error (3, 3) of the right camera: yaw about y (down), pitch about x and roll about z."""
     roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
     x, y, z = np.eye(3)
     return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
@@ -216,7 +221,7 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the positions (H, W, 2) in the raw image of the frame's pixels, exact for points at `depth_m`."""
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], exact for points at `depth_m`."""
     tangents = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
     points_m = np.concatenate([tangents, np.ones_like(tangents[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
@@ -258,14 +263,14 @@ def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
 
 
 def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the border (columns, rows) that an image needs for splines at these positions [px]."""
+    """Returns the border (columns, rows) [px] that an image needs for spline interpolation at `positions` [px]."""
     last = np.array([rig.width_px - 1, rig.height_px - 1])
     missing = np.maximum(-positions.min(axis=(0, 1)), positions.max(axis=(0, 1)) - last)
     return np.maximum(np.ceil(missing + resample.REACH_PX), 0).astype(np.int64)
 
 
 def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the margin (columns, rows) to render around the frame, so that it covers all raw pixels [px]."""
+    """Returns the margin (columns, rows) [px] around the frame with which the rendered image covers all raw pixels."""
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
     margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX

@@ -36,11 +36,12 @@ SEA_WATER_MEAN_COSINE = 0.924
 
 
 class Medium(NamedTuple):
-    """Optical properties for R, G, B.
+    """Optical properties of the water in the bands R, G, B.
 
     Args:
-        absorption_per_m, scattering_per_m: (3,) absorption a and scattering b [1/m].
-        mean_cosine: g of the phase function.
+        absorption_per_m: (3,) absorption coefficient a [1/m].
+        scattering_per_m: (3,) scattering coefficient b [1/m].
+        mean_cosine: mean cosine g of the scattering angle.
         kept_share: fraction k of the scattered light that is not counted as lost.
     """
 

@@ -21,9 +21,9 @@ class StageTime(NamedTuple):
     Args:
         stage: key of the stage in metrics.json, or `KEYFRAME_WORK`.
         n_calls: number of calls.
-        mean_ms, p95_ms: mean and 95th percentile of one call [ms].
-        total_s: sum over all calls [s].
-        budget_ms: largest allowed mean [ms]; None if the stage has no budget.
+        mean_ms, p95_ms: mean and 95th percentile of the duration of a call [ms].
+        total_s: total duration of all calls [s].
+        budget_ms: largest allowed mean duration [ms]; None if the stage has no budget.
     """
 
     stage: str
@@ -35,7 +35,7 @@ class StageTime(NamedTuple):
 
     @property
     def within_budget(self) -> bool | None:
-        """Returns whether the mean is within the budget; None without a mean or a budget."""
+        """Returns whether the mean duration is within the budget; None without a mean or a budget."""
         return None if self.mean_ms is None or self.budget_ms is None else self.mean_ms <= self.budget_ms
 
 

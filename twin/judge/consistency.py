@@ -28,7 +28,7 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 
 
 def keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
-    """Returns the position errors of the final keyframes and their covariances, both in camera axes.
+    """Returns errors and estimated covariances of the final keyframe positions, both in camera axes.
 
     The first keyframe is left out because it is anchored at the truth. Keyframes without a positive definite
     covariance are left out as well.

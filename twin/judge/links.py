@@ -14,8 +14,8 @@ from twin.core.records import Array, SurveyResult, Truth
 from twin.judge.consistency import nees
 from twin.judge.summary_statistics import mean, rms
 
-#: A link is "along" if it connects a node to one of the two nodes before it, as in the paper. All other links are
-#: "across": to earlier nodes of the same swath, to neighbouring swaths, to the start of a loop.
+#: A link is "along" if it connects a node to one of the two nodes before it (Negahdaripour & Madjidi 2003). All other
+#: links are "across": to earlier nodes of the same swath, to neighbouring swaths, to the start of a loop.
 ALONG_NODES = 2
 
 
@@ -69,9 +69,9 @@ def _motion_errors(true_i, true_j, estimates):
 
 
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
-    """Returns count, RMS errors and mean NEES of links, and the RMS errors of those closed-form motions that exist.
+    """Returns number, RMS errors and mean NEES of links, and the RMS errors of their closed-form motions.
 
-    The mean NEES is 6 for consistent covariances.
+    Links without a closed-form motion do not contribute to the latter. The mean NEES is 6 for consistent covariances.
     """
     errors = motion_errors(links, links.i_from_j, world_from_keyframe)
     has_closed_form, closed_forms = links.by_closed_form

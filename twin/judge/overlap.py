@@ -25,7 +25,7 @@ class Footprints(NamedTuple):
     Args:
         centre_m: (n, 2) position of the camera [m].
         heading, travel: (n, 2) horizontal unit vectors of the vehicle's heading and of the planned motion.
-        width_m, length_m: (n,) size across and along the heading [m].
+        width_m, length_m: (n,) size of the footprint across and along the heading [m].
         swath: (n,) number of the leg or loop; -1 for keyframes between legs.
     """
 

@@ -69,6 +69,6 @@ def _value(metrics: Mapping[str, Any], name: str) -> float | None:
 
 
 def _verdict(name: str, value: float | None, limit: float) -> dict[str, Any]:
-    """Returns value, limit and whether the value meets the limit."""
+    """Returns the value, the limit and whether the value meets the limit."""
     passed = value is not None and (value >= limit if more_is_better(name) else value <= limit)
     return {"value": value, "limit": limit, "passed": passed}

@@ -25,7 +25,7 @@ class StageError(NamedTuple):
     Args:
         stage: one of `STAGES`.
         rmse_m: RMS position error [m].
-        gain: error of the preceding stage / error of this stage; None if there is no preceding stage or either is 0.
+        gain: error of the preceding stage / error of this stage; None without a preceding stage or if an error is 0.
     """
 
     stage: str

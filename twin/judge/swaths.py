@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, Truth
 
-#: A frame belongs to a leg if |cos| of the angle between its travel and the axis of the legs exceeds this (26 deg).
+#: A frame belongs to a leg if |cos| of the angle between its direction of travel and the axis of the legs exceeds
+#: this value (26 deg).
 ON_LEG_COSINE = 0.9
 
 

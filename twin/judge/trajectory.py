@@ -36,7 +36,7 @@ def anchor(first_estimated: Array, first_true: Array) -> Array:
 
 
 def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
-    """Returns the errors of the frames that both trajectories have, after anchoring at the first pose."""
+    """Returns the errors at the frames that both trajectories have, after anchoring at the first of them."""
     n = min(len(estimate), len(truth))
     true = truth.world_from_camera[:n]
     if n == 0:
@@ -54,7 +54,7 @@ def cumulative_length(positions: Array) -> Array:
 
 
 def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:
-    """Returns `trajectory.*` of metrics.json; the drift is the end error in percent of the true path."""
+    """Returns `trajectory.*` of metrics.json; the drift is the end error in percent of the true path length."""
     distance = errors.distance_m
     end, path = (float(distance[-1]), float(errors.travelled_m[-1])) if len(distance) else (None, None)
     x, y, z = errors.position_m.T

@@ -311,7 +311,7 @@ def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None 
     Args:
         heights: (rows, cols) [m], NaN for no data.
         cmap: name of a matplotlib colour map.
-        scale: lowest and highest height of the colour scale [m]; None: of the heights themselves.
+        scale: lowest and highest height of the colour scale [m]; None: the percentiles of `_height_scale`.
     """
     empty = ~np.isfinite(heights)
     low, high = scale or _height_scale(heights)

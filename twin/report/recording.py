@@ -133,7 +133,7 @@ def log_paths(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the elevation map in the mosaic's colours, each part at the snapshot that first observes it.
+    """Logs the elevation map in the mosaic's colours, each part at the first snapshot whose keyframes observe it.
 
     All heights are those of the final map.
     """
@@ -153,7 +153,7 @@ def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
 
 
 def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the rig along the true path (the online estimate without a true path), its cameras and their images."""
+    """Logs the rig and its images along the true path, or along the online estimate if there is no true path."""
     name = "truth" if "truth" in run.trajectories else "online"
     if name not in run.trajectories or not len(run.trajectories[name]):
         return
@@ -265,7 +265,7 @@ def line(positions: Array, role: str) -> rr.LineStrips3D:
 
 
 def segments(pairs: Array, role: str) -> rr.LineStrips3D:
-    """Returns pairs of points (n, 2, 3) as separate lines."""
+    """Returns pairs of points (n, 2, 3) as separate line segments in the colour of their role."""
     return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
 
 

@@ -23,7 +23,7 @@ class FrameTimes(NamedTuple):
 
 
 def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
-    """Yields the number of the last keyframe of each snapshot, with its frame and time [s]."""
+    """Yields the number of the last keyframe of each snapshot, with its frame number and time [s]."""
     path, frames = run.trajectories.get("online"), run.keyframes.frames
     if path is None or not len(frames):
         return

@@ -103,7 +103,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
     """
     folder = Path(folder)
     if not (folder / SCENARIO_FILE).is_file():
-        raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, as `twin run` writes")
+        raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
     return Run(
         folder,
         _read(folder / SCENARIO_FILE, lambda f: tomllib.loads(f.read_text(encoding="utf-8"))),
@@ -174,4 +174,4 @@ def _read(file: Path, reader: Any) -> Any:
     try:
         return reader(file)
     except (OSError, ValueError, KeyError, IndexError, RasterioError) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, as `twin run` writes") from None
+        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None

@@ -35,7 +35,7 @@ class SurveyRecord:
         elevation: elevation map; None if none was built.
         truth: true trajectory and floor, and the reference path.
         grid: cells of the maps.
-        start: (4, 4) world_from_camera of the planned start, whose orientation is used for the reference path.
+        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path.
         n_frames_per_keyframe: planned frames from one keyframe to the next.
         stopwatch: durations of the processing stages.
         metrics: contents of metrics.json.

@@ -72,7 +72,7 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def mosaic_image(run: Run) -> str | None:
-    """Returns the orthomosaic as a JPEG data URI, white where there is no data; None without one."""
+    """Returns the orthomosaic as a JPEG data URI, white where there is no data; None without a mosaic."""
     if "mosaic" not in run.rasters:
         return None
     mosaic = run.rasters["mosaic"].values
@@ -80,7 +80,7 @@ def mosaic_image(run: Run) -> str | None:
 
 
 def surface_image(run: Run) -> str | None:
-    """Returns an oblique view of the map's mesh as a JPEG data URI; None without one."""
+    """Returns an oblique view of the map's mesh as a JPEG data URI; None without a picture."""
     picture = surface_picture(run.folder / "mesh.glb")
     return None if picture is None else jpeg_uri(picture)
 
@@ -93,7 +93,7 @@ def sample_images(run: Run) -> list[tuple[int, str, str | None]]:
 
 
 def _stereo_pair(run: Run, frame: int) -> tuple[str, str | None]:
-    """Returns left and right image of a keyframe as JPEG data URIs; None without a right image."""
+    """Returns left and right image of a keyframe as JPEG data URIs; the right one is None if it does not exist."""
     left, right = (read_rgb(run.image_file(frame, side)) for side in ("left", "right"))
     return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
 

@@ -50,7 +50,7 @@ class KeyFigure(NamedTuple):
     Args:
         label: name of the quantity.
         value: its value with unit.
-        meaning: definition, reference value or related value.
+        meaning: definition of the quantity, its reference value or a related value.
     """
 
     label: str
@@ -133,7 +133,7 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns altitude and water of the survey in words."""
+    """Returns altitude and water of the survey as text."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")
@@ -158,7 +158,7 @@ def _results(metrics: Mapping[str, Any]) -> str:
 
 
 def closed_form_comparison(links: Mapping[str, Any]) -> str:
-    """Returns a sentence that compares the translation error of the links with that of the closed form, eq. (2)."""
+    """Returns a sentence that compares the translation error of the links with that of the closed form."""
     changes = []
     for direction in ("along", "across"):
         error = links[direction]["translation_rmse_m"]
@@ -186,7 +186,7 @@ def _position_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
         KeyFigure("Position error, final", length(final["ate_rmse_m"]), f"RMSE; maximum {length(final['ate_max_m'])}"),
         KeyFigure("Position error, online", length(online["ate_rmse_m"]), "RMSE of the estimate used for control"),
         KeyFigure("Position error, F2F", length(f2f["ate_rmse_m"]), f"RMSE; drift {_drift(f2f)}"),
-        KeyFigure("NEES of positions", nees, "mean; 3 is consistent, more is overconfident"),
+        KeyFigure("NEES of positions", nees, "mean; 3 is consistent, larger is overconfident"),
     ]
 
 

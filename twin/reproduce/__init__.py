@@ -1,1 +1,1 @@
-"""Reproduction of experiments of the paper (Negahdaripour & Madjidi 2003)."""
+"""Reproduction of experiments of Negahdaripour & Madjidi (2003)."""

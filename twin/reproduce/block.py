@@ -33,7 +33,7 @@ def block_on_sand(seed: int) -> Terrain:
 
 
 def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
-    """Returns coordinates (x, y), rows from south to north.
+    """Returns the x and y coordinates of a grid, with rows from south to north.
 
     Args:
         step_m: grid spacing.

@@ -1,4 +1,7 @@
-"""Fig. 8 of the paper with simulated images: one object at five turbidity levels, and contrast versus range."""
+"""Fig. 8 of Negahdaripour & Madjidi (2003) with simulated images: one object at five turbidity levels.
+
+The contrast as a function of range is computed in addition.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     """Returns the contrast of fine detail on a level floor, relative to clear water.
 
     The direct signal carries the detail. Forward scatter (a blur) and backscatter add light without detail, so that
-    C / C0 = direct / (direct + forward + backscatter) (Duntley 1963, here with lamps that move with the camera).
+    C / C0 = direct / (direct + forward + backscatter) (Duntley 1963, here for lamps that are fixed to the camera).
 
     Args:
         scenario: lamps and camera.

@@ -29,7 +29,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
     Args:
         path: a file, or a name in scenes/.
-        overrides: `key=value` each, with a dotted key and a value in TOML; a value that is not TOML is a string.
+        overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is a string.
 
     Raises:
         ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.

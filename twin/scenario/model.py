@@ -113,17 +113,17 @@ class ImagingConfig(Section):
         "error model, about a hundred times faster",
     )
     error_model: str | None = Field(
-        default=None, description="error model of the surrogate, a file of `twin fit-surrogate`; default: the built-in"
+        default=None, description="error model of the surrogate, written by `twin fit-surrogate`; default: built-in"
     )
     gray_level: float = Field(
         default=0.45, gt=0.01, lt=1, description="target of auto-exposure: mean image level, a fraction of full scale"
     )
     noise_sd: float = Field(
-        default=0.008, ge=0, le=0.5, description="read noise, a fraction of full scale; unused with [sensor]"
+        default=0.008, ge=0, le=0.5, description="read noise (1 sigma), a fraction of full scale; unused with [sensor]"
     )
     shot_noise: float = Field(
         default=0.006, ge=0, le=0.5,
-        description="shot noise at full scale, a fraction of it, proportional to the square root of the signal; "
+        description="shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; "
         "unused with [sensor]",
     )  # fmt: skip
     shadows: bool = Field(default=False, description="the sea floor casts shadows in the light of each lamp")
@@ -173,9 +173,10 @@ class SensorConfig(Section):
 
 
 class LensConfig(Section):
-    """True distortion of both lenses (Brown-Conrady as in OpenCV); images are rectified with its calibrated value.
+    """True distortion of both lenses (Brown-Conrady, as in OpenCV); images are rectified with calibrated coefficients.
 
-    The coefficients apply to tangents of field angles: in the air behind a port, in water where there is none.
+    The coefficients apply to tangents of field angles, measured in the air behind the port, or in water if there is no
+    port.
     """
 
     k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, coefficient of r^2")
@@ -186,10 +187,11 @@ class LensConfig(Section):
 
 
 class PortConfig(Section):
-    """Window in front of each lens, which refracts every ray twice.
+    """Window in front of each lens; every ray is refracted at both of its faces.
 
-    The rig's field of view is that of the pinhole in water which matches the image near its centre behind an untilted
-    port, at every distance. The position of a camera is the position of that pinhole.
+    The field of view given for the rig is that of an equivalent pinhole in water: the one that reproduces the image
+    near its centre, at any distance, for a port that is not tilted. The position of a camera is the position of this
+    pinhole.
     """
 
     kind: Literal["none", "flat", "dome"] = Field(
@@ -309,7 +311,7 @@ class SunConfig(Section):
     depth_m: float = Field(
         default=0.0, ge=0, le=500,
         description="depth of the reference plane z = 0 below the surface, where illuminance_lx applies; the water "
-        "attenuates it on the way down; 0: illuminance_lx applies on the sea floor, at every height [m]",
+        "attenuates it on the way down; 0: illuminance_lx applies on the sea floor, whatever its height [m]",
     )  # fmt: skip
     caustics: float = Field(
         default=0.0, ge=0, le=1,
@@ -350,7 +352,7 @@ class NavigationConfig(Section):
     )  # fmt: skip
     dvl_scale_sigma: float = Field(
         default=SensorNoise.dvl_scale, gt=0, le=0.1,
-        description="standard deviation of the relative scale error of that velocity, constant during a survey",
+        description="standard deviation of the relative scale error of the DVL velocity, constant during a survey",
     )  # fmt: skip
     usbl_sigma_m: float = Field(
         default=SensorNoise.usbl_m, gt=0, le=100,
@@ -415,7 +417,7 @@ class ControlConfig(Section):
 
 
 class EstimateConfig(Section):
-    """F2F, F2M, the keyframe network and global alignment (GA)."""
+    """Settings of motion estimation, the keyframe network and global alignment (GA)."""
 
     window_tracks: int = Field(
         default=EstimatorSettings.window_tracks, ge=0, le=1000,

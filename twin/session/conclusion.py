@@ -29,6 +29,9 @@ class Flight(NamedTuple):
     """A survey that has been flown.
 
     Args:
+        mission: the survey as planned.
+        world: the simulated world, with the ground truth.
+        navigator: the estimators, with their estimates.
         stopwatch: durations of the stages.
         reason: why the survey was aborted; "" if it is complete.
     """

@@ -33,7 +33,7 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     Drag is linear v + quadratic v |v| along each axis, so the thrust of each thruster is p v + q v^2.
 
     Args:
-        vehicle: trim, and factors of drag and added mass.
+        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
         direction: (3,) unit vector of the velocity in the body.
     """
     hull = trimmed_hull(vehicle)

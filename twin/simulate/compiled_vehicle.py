@@ -1,7 +1,7 @@
 """Compiled rigid-body simulation of the vehicle without MuJoCo, for surveys that are not rendered.
 
 It integrates as MuJoCo does for a free body without contacts: velocity first, then position with the new velocity, then
-rotation by the body rates. `mujoco_vehicle.MujocoVehicle` and this module agree to rounding.
+rotation by the body rates. `mujoco_vehicle.MujocoVehicle` and this module agree within rounding errors.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class RigidBodyState(NamedTuple):
         pose: (4, 4) true pose, modified in place.
         velocity: (6,) velocity of the free joint, half a timestep before the pose, modified in place.
         acceleration: (6,) acceleration of the last step, modified in place.
-        kick: (1,) timesteps by which the next step advances the velocity: 0.5 in the first step, then 1.
+        kick: (1,) number of timesteps by which the next step advances the velocity: 0.5 in the first step, then 1.
         thrusters: thrusters of the vehicle, modified in place.
         hull: hull of the vehicle.
-        current: (3,) [m/s].
+        current: (3,) velocity of the steady current in the world [m/s].
         timestep_s: physics timestep.
     """
 
@@ -57,8 +57,8 @@ class CompiledVehicle:
     """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
 
     Args:
-        vehicle: trim, and factors of drag and added mass.
-        current_mps: (3,) steady current: east, north, up.
+        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
+        current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
         timestep_s: physics timestep.
     """

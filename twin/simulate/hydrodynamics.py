@@ -25,9 +25,9 @@ class Hull(NamedTuple):
     Args:
         inertia: (6,) moments of inertia [kg m2], then the mass three times [kg].
         added_inertia: (6,) added moments of inertia [kg m2], then added masses [kg].
-        linear_drag: (6,) [N m s/rad], [N s/m], positive.
-        quadratic_drag: (6,) [N m s2/rad2], [N s2/m2], positive.
-        centre_of_buoyancy_m: (3,) in the body.
+        linear_drag: (6,) coefficients of linear drag [N m s/rad, then N s/m], positive.
+        quadratic_drag: (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive.
+        centre_of_buoyancy_m: (3,) position of the centre of buoyancy in the body.
         weight_n, buoyancy_n: weight and buoyancy force.
     """
 
@@ -59,9 +59,9 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
 
     Args:
         hull: parameters of the hull.
-        world_from_body: (3, 3) rotation.
+        world_from_body: (3, 3) rotation from the body to the world.
         twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
-        current_mps: (3,) steady current in the world.
+        current_mps: (3,) velocity of the steady current in the world.
         wrench: (6,) wrench of the thrusters in the body [N m, N].
     """
     flow = np.zeros(6)  # R'v_c
@@ -99,7 +99,7 @@ def free_joint_acceleration(
 
     Args:
         velocity: (6,) velocity of the free joint [m/s, rad/s].
-        hull, world_from_body, current_mps, wrench: same as in `acceleration`.
+        hull, world_from_body, current_mps, wrench: as defined in `acceleration`.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
     body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)
@@ -128,7 +128,7 @@ def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twi
 
     Args:
         hull: parameters of the hull.
-        world_from_body: (3, 3) rotation.
+        world_from_body: (3, 3) rotation from the body to the world.
         position_m: (3,) position of the centre of gravity.
         twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
     """

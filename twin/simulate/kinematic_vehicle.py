@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 class KinematicVehicle:
     """Vehicle that moves horizontally at the commanded velocity, without rotation, thrust, drag or current.
 
-    This is the paper's simulated vehicle: t_Z and all rotation are zero (Negahdaripour & Madjidi 2003, section V-A).
+    This is the simulated vehicle of Negahdaripour & Madjidi (2003, section V-A): t_Z and all rotations are zero.
 
     Args:
         world_from_body: (4, 4) initial pose, at rest.

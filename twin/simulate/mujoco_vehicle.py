@@ -28,8 +28,8 @@ class MujocoVehicle:
 
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        vehicle: trim, and factors of drag and added mass.
-        current_mps: (3,) steady current: east, north, up.
+        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
+        current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
     """
 

@@ -28,7 +28,7 @@ class NavigationSensors:
         noise: standard deviations from the data sheets, and the surveyed positions of the beacons.
         rig: nominal calibration of the stereo rig.
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
-        project: true projection of the left camera: points (n, 3) in the camera to pixels (n, 2). None: `rig.project`.
+        project: projects points (n, 3) in the left camera to pixels (n, 2), with true calibration; None: `rig.project`.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ def read_pressure_and_attitude(
 
     Args:
         world_from_body, body_from_camera: (4, 4) true poses.
-        noise: standard deviations.
+        noise: standard deviations of the sensor errors.
         aiding: names of the sensors used; the readings of the others are None.
         rng: random generator of these two sensors only.
     """
@@ -200,8 +200,8 @@ class AcousticPositioning:
     """Ultra-short baseline (USBL) positioning, triggered by keyframes so that each fix coincides with a stereo pair.
 
     Args:
-        noise: standard deviations.
-        interval_s: shortest time between fixes.
+        noise: standard deviations of the measured position.
+        interval_s: shortest time between two fixes.
         rng: random generator of this sensor only.
     """
 
@@ -237,7 +237,7 @@ def detect_beacons(
         world_from_camera: (4, 4) true pose of the left camera.
         depth_m: (height, width) true depth of the left image.
         project: projects points (n, 3) in the left camera to pixels (n, 2).
-        noise: standard deviations and beacon positions.
+        noise: standard deviations of the beacon measurements, and surveyed positions of the beacons.
         rng: random generator of this sensor only.
     """
     beacons = np.array(noise.beacons_m).reshape(-1, 3)

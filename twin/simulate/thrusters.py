@@ -34,9 +34,9 @@ class ThrusterState(NamedTuple):
     """State and parameters of n thrusters with a linear lag for a fixed timestep; the state is modified in place.
 
     Args:
-        a, b, c: (m, m), (m, 1), (m,) discrete state-space model of the lag: transition, input and output.
+        a, b, c: (m, m), (m, 1), (m,) discrete state-space model of the lag, of order m: transition, input and output.
         configuration: (6, n) wrench [moment, force] in the body per newton of each thruster.
-        coefficients: coefficients of the thrust curve.
+        coefficients: coefficients of the thrust curve, as in `steady_thrust_n`.
         lag_state: (m, n) state of the lag, modified in place.
         steady_n: (n,) steady thrust of the last command, modified in place.
     """

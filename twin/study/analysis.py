@@ -35,7 +35,7 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for text values) and explained rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN for text) and explained fraction of rank variance."""
 
     key: str
     metric: str
@@ -44,7 +44,7 @@ class Sensitivity(NamedTuple):
 
 
 class KeyComparison(NamedTuple):
-    """Median of a key over the surveys that passed and over those that did not.
+    """Medians of a key over the surveys that passed and over the surveys that did not pass.
 
     `superiority`: probability that the value of a survey that did not pass exceeds that of a survey that passed.
     """
@@ -56,7 +56,7 @@ class KeyComparison(NamedTuple):
 
 
 class FailureReason(NamedTuple):
-    """Number of surveys that did not pass for the same reason."""
+    """Reason why surveys did not pass, and the number of surveys with this reason."""
 
     status: str
     reason: str
@@ -64,7 +64,7 @@ class FailureReason(NamedTuple):
 
 
 class StudyAnalysis:
-    """Statistics of the table of a study; boolean and numeric arrays have one element per survey."""
+    """Statistics of the results table of a study; boolean and numeric arrays have one element per survey."""
 
     def __init__(self, rows: pa.Table, study: Study):
         self.rows, self.study, self.required_probability = rows, study, study.probability
@@ -81,7 +81,7 @@ class StudyAnalysis:
         return np.array(["" if value is None else str(value) for value in column], dtype=object)
 
     def numbers(self, name: str) -> Array:
-        """Returns a column of numbers, NaN where a survey has no value."""
+        """Returns a numeric column of the table (n,), with NaN where a survey has no value."""
         if name not in self.rows.column_names:
             return np.full(self.rows.num_rows, np.nan)
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
@@ -130,7 +130,7 @@ class StudyAnalysis:
 
     @property
     def requirement_missed(self) -> bool:
-        """Returns whether the pass probability is below the required one; always False for a study with `seek`."""
+        """Returns whether the pass probability is below the required value; always False for a study with `seek`."""
         required = self.required_probability if self.study.seek is None else None
         return required is not None and not self.pass_probability.value >= required
 
@@ -142,7 +142,7 @@ class StudyAnalysis:
         return None
 
     def key_groups(self, key: str, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[str]]:
-        """Returns the group of each chosen survey by the value of a key, and the names of the groups."""
+        """Groups the chosen surveys by the value of a key; returns the group index of each survey and the names."""
         values = self.key_numbers(key)
         if values is None:
             names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
@@ -204,9 +204,10 @@ class StudyAnalysis:
 
     @cached_property
     def threshold(self) -> tuple[Interval, bool] | None:
-        """Returns the value of the `seek` key at the required pass probability, and whether that probability increases.
+        """Returns the value of the `seek` key at the required pass probability.
 
-        Returns None if the study has no `seek` key, or if no survey could be evaluated.
+        The second value is whether the pass probability increases with the key. Returns None if the study has no
+        `seek` key, or if no survey could be evaluated.
         """
         key = self.study.seek
         x = self.key_numbers(key) if key is not None and key in self.keys else None
@@ -218,7 +219,7 @@ class StudyAnalysis:
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Returns the comparison of each numeric key between surveys that passed and did not, best separation first."""
+        """Compares each numeric key between surveys that passed and surveys that did not; best separation first."""
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)

@@ -17,7 +17,7 @@ from twin.study.engine import Outcome, Result, Task
 from twin.study.worker import Reply, TaskLimits, WorkerPool, describe_exception
 
 _CONNECT_TIMEOUT_S = 20
-_QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all of up to 100,000 tasks at once
+_QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
 _MIN_QUEUED = 64
 _REFRESH_S = 2.0
 _MAX_LOST_WORKERS = 3  # a task that loses more workers than this has failed

@@ -15,7 +15,7 @@ _DESIGN_STREAM = 0x57D1  # separates the random numbers of the design from those
 
 
 class Sample(NamedTuple):
-    """One setting: its number from 0, the index of its design point, and the value of every varied key."""
+    """Sample of the varied keys: its number (from 0), the index of its design point, and the value of every key."""
 
     number: int
     point: int
@@ -23,7 +23,7 @@ class Sample(NamedTuple):
 
 
 def samples(study: Study) -> Iterator[Sample]:
-    """Yields all settings of a study: each design point combined with every cell of the grids.
+    """Yields all samples of a study: each design point combined with every cell of the grids.
 
     With the methods "random" and "sobol", the first samples stay the same if the number of samples is increased.
     """
@@ -41,7 +41,7 @@ def samples(study: Study) -> Iterator[Sample]:
 
 
 def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
-    """Returns the seeds of a sample, which are common to all samples or to those of the same design point."""
+    """Returns the seeds of a sample; all samples, or all samples of one design point, have the same seeds."""
     plan = study.sampling
     first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]
@@ -61,7 +61,7 @@ def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int)
 
 
 def _saltelli(pairs: Array) -> Array:
-    """Returns the Saltelli design: A, B, and for each axis the matrix A with that column taken from B.
+    """Returns the Saltelli design: A, B, and for each axis the matrix A with the column of this axis taken from B.
 
     Saltelli et al. 2010, Comput. Phys. Commun. 181, 259.
 

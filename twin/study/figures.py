@@ -27,7 +27,7 @@ _ROW_IN = 2.7
 
 
 def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
-    """Returns every figure for which the study has data, as data URIs by name."""
+    """Returns the figures for which the study has data, as a dictionary from figure name to data URI."""
     drawings: dict[str, Callable[[], Figure | None]] = {
         "pass_probability": lambda: pass_probability(analysis),
         "histograms": lambda: metric_histograms(analysis, analysis.metric_summaries),
@@ -234,7 +234,7 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
 
 
 def key_histograms(analysis: StudyAnalysis) -> Figure | None:
-    """Draws the histogram of each numeric key, with surveys that passed and that did not stacked."""
+    """Draws a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass."""
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
     keys = [key for key in analysis.keys if analysis.key_numbers(key) is not None]
     if not keys or not good.any() or not bad.any():

@@ -48,7 +48,7 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Removes the files that are not to be kept, and renames the folder to its final name."""
+    """Deletes the files of `scratch` that are not to be kept, and renames the folder to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
     if survey.keep == "none":
         return

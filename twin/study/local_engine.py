@@ -13,7 +13,7 @@ from twin.study.worker import TaskLimits, WorkerPool
 
 
 class LocalEngine:
-    """Engine on worker processes of this machine; one thread of this process waits for each of them."""
+    """Engine on worker processes of this machine; one thread of this process waits for each worker."""
 
     def __init__(self, jobs: int):
         cores = sorted(os.sched_getaffinity(0))

@@ -30,7 +30,7 @@ class Proposal(NamedTuple):
 
 
 class Search:
-    """Search for a plan; its trials are in `optuna.journal`, which other programs may read at the same time."""
+    """Search for the best plans; its trials are in `optuna.journal`, which other programs may read at the same time."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path):
         """Starts a search, or continues the search stored in the folder.
@@ -66,7 +66,7 @@ class Search:
         return [_proposal(self.optuna_study.ask(self.space)) for _ in range(count)]
 
     def finished(self) -> list[tuple[int, dict[str, Any]]]:
-        """Returns number and values of every evaluated candidate."""
+        """Returns the trial number and the values of the searched keys of every evaluated candidate."""
         complete = self.optuna_study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
         return [(trial.number, dict(trial.params)) for trial in complete]
 
@@ -76,7 +76,7 @@ class Search:
         Args:
             proposal: the candidate.
             objectives: value of each objective.
-            shortfall: required minus achieved pass probability; the candidate is feasible if it is at most 0.
+            shortfall: required minus achieved pass probability; at most 0 if the candidate is feasible.
         """
         proposal.trial.set_constraint("shortfall", shortfall)
         self.optuna_study.tell(proposal.trial, list(objectives))

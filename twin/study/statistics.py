@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
 _MIN_CLUSTERS = 5  # smallest number of clusters for a bootstrap interval
-_MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value, others into bins
+_MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value, other keys are grouped in bins
 
 
 class Interval(NamedTuple):
@@ -68,7 +68,7 @@ def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
 def bootstrap_interval(
     values: ArrayLike, statistic: Callable[[Array], Array], clusters: ArrayLike | None = None
 ) -> Interval:
-    """Returns a statistic with its percentile bootstrap interval, resampling whole clusters.
+    """Returns a statistic of the data with its percentile bootstrap interval; whole clusters are resampled.
 
     Args:
         values: (n,) data.
@@ -97,7 +97,7 @@ def bootstrap_interval(
 
 
 def _by_cluster(values: Array, clusters: NDArray) -> Array:
-    """Returns the values as a table with one row per cluster, padded with NaN to the size of the largest."""
+    """Returns the values as a table with one row per cluster, padded with NaN to the size of the largest cluster."""
     _, index = np.unique(clusters, return_inverse=True)
     order = np.argsort(index, kind="stable")
     sizes = np.bincount(index)
@@ -121,7 +121,7 @@ def percentile(values: Array, percent: float) -> Array:
 def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
     """Returns Spearman's rank correlation with its interval, NaN with fewer than five values.
 
-    Interval: Fisher's z with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000, Psychometrika 65, 23).
+    The interval is that of Fisher's z with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000, Psychometrika 65, 23).
     """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) < 5 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -137,7 +137,8 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
     """Returns the fraction of the variance of y's ranks that the groups explain, corrected for chance.
 
     This estimates the first-order Sobol index of the ranks by epsilon squared (Kelley 1935):
-    1 - (within / (n - k)) / (total / (n - 1)). NaN with fewer than five values per group on average.
+    1 - (within / (n - k)) / (total / (n - 1)), with the sums of squares of the ranks within the k groups and in total.
+    Returns NaN if there are fewer than five values per group on average.
 
     Args:
         groups: (n,) group of each value.
@@ -237,7 +238,7 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
 
 
 def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
-    """Returns the probability that a value of x exceeds one of y, with ties counting half; NaN if x or y is empty.
+    """Returns the probability that a value of x exceeds a value of y, with ties counting half; NaN if x or y is empty.
 
     U / (n_x n_y) with U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
     """

@@ -77,7 +77,7 @@ class TuningConfig(Section):
 
 
 class Study(Section):
-    """Surveys of one scenario with varied keys."""
+    """Monte Carlo study: surveys of one scenario with varied keys."""
 
     name: str | None = Field(default=None, min_length=1, max_length=80, description="default: the name of the file")
     scenario: str = Field(description="the scenario to vary: a path relative to this file, or a name in scenes/")
@@ -173,7 +173,7 @@ def find_study(path: str | Path) -> Path:
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields dotted keys and their values; a table that names a distribution is a value."""
+    """Yields dotted keys and their values; a table that defines a distribution counts as a value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")

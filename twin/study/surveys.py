@@ -36,7 +36,7 @@ class SampleSource(Source):
     """Source of a sampled scenario: reports an error at the line of the study file that gives the key."""
 
     sample: int
-    given: dict[str, str]  #: dotted name in the study file that gives a scenario key, by scenario key
+    given: dict[str, str]  #: for each scenario key, its dotted name in the study file
 
     def describe(self, error: TwinError) -> str:
         """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, followed by the number of the sample."""
@@ -110,7 +110,7 @@ def check_samples(study: Study) -> None:
 
 
 def merge_errors(errors: Iterable[str]) -> list[str]:
-    """Returns one error per line and key of the study file, with the number of further samples that have it."""
+    """Returns one error per line and key of the study file, with the number of further samples with this error."""
     by_key: dict[str, list[str]] = {}
     for error in errors:
         by_key.setdefault(": ".join(error.split(": ")[:2]), []).append(error)

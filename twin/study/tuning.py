@@ -50,12 +50,12 @@ class Candidate(NamedTuple):
 
     @property
     def has_metrics(self) -> bool:
-        """Returns whether any of its surveys was completed, so that all objectives have a value."""
+        """Returns whether any survey of the candidate was completed, so that all objectives have a value."""
         return max(abs(value) for value in self.objectives) < _PENALTY
 
 
 class TuningResult(NamedTuple):
-    """Result of a search: all candidates, the finalists as re-evaluated with new seeds, and the recommended plan."""
+    """Result of a search: all candidates, the finalists re-evaluated with new seeds, and the recommended plan."""
 
     candidates: list[Candidate]
     finalists: list[Candidate]
@@ -128,7 +128,7 @@ def tuning_config(study: Study) -> TuningConfig:
     """Returns the section [tune] of a study.
 
     Raises:
-        TwinError: the study has none.
+        TwinError: the study has no section [tune].
     """
     if study.tune is None:
         raise TwinError(str(study.source.path), "has no section [tune]", "a study with a section [tune]")
@@ -214,7 +214,7 @@ class CandidateSurveys:
         return float(np.median(known)) if known else -_PENALTY if more_is_better(name) else _PENALTY
 
     def scenario(self, candidate: Candidate) -> Scenario:
-        """Returns the plan as a scenario, under the conditions of the scenario that the study varies."""
+        """Returns the scenario that the study varies, with the plan of a candidate."""
         return scenario_of_sample(self.study, self.base, Sample(0, 0, candidate.values))
 
 

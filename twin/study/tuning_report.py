@@ -132,7 +132,7 @@ def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: T
 def _groups(
     shown: list[Candidate], result: TuningResult, config: TuningConfig
 ) -> Iterator[tuple[list[Candidate], dict[str, Any]]]:
-    """Yields candidates with their plot style: infeasible, feasible, Pareto-optimal, recommended."""
+    """Yields each group of candidates with its plot style: infeasible, feasible, Pareto-optimal, recommended."""
     front = pareto_front(result.candidates, config)
     chosen = {result.recommended.number} if result.recommended else set()
     dot: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4}

@@ -117,7 +117,7 @@ def _threshold(study: Study, analysis: StudyAnalysis) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the number of surveys with a warning and the first warning, or ""."""
+    """Returns a sentence with the number of surveys that have a warning and the first warning, or "" if none has."""
     warned = analysis.warning[analysis.warning != ""]
     return f" Warning in {len(warned)} of {len(analysis.warning)} surveys: {warned[0]}." if len(warned) else ""
 

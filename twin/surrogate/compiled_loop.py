@@ -20,9 +20,10 @@ from twin.world.world import FastForward, World
 def compiled_loop(
     world: World, vehicle: CompiledVehicle, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
 ) -> FastForward:
-    """Returns a function that runs the loop of `survey.fly` up to the next keyframe, if F2F can track points.
+    """Returns a function that runs the loop of `survey.fly` up to the next keyframe.
 
-    Each frame is computed with the same operations and random numbers as in `survey.fly`.
+    The function simulates no frames if F2F has no points to track. Each frame is computed with the same operations and
+    random numbers as in `survey.fly`.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz

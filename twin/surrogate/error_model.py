@@ -1,6 +1,6 @@
 """Error model of the surrogate: standard errors and success rates of the image measurements of a survey.
 
-All of them are functions of one number, the Cramer-Rao lower bound of a patch's position in an image
+Most of them are functions of one number, the Cramer-Rao lower bound of a patch's position in an image
 (see `matchability`). The parameters are fitted to rendered surveys.
 """
 
@@ -55,8 +55,8 @@ class ErrorModel(NamedTuple):
         bound_range_px: smallest and largest Cramer-Rao bound of the surveys that the model was fitted to.
         point_fraction: number of matched stereo points of a keyframe, as a fraction of `estimate.points`.
         match_sigma_px: reported standard deviation of a patch's position in one image.
-        match_error_ratio: true over reported standard deviation of that position.
-        lamp_error_growth: growth of the match error under lamps that move with the vehicle: the square of
+        match_error_ratio: ratio of the true to the reported standard deviation of a patch's position in one image.
+        lamp_error_growth: growth of the match error in the light of the lamps on the vehicle: the square of
             `match_error_ratio` is multiplied by 1 + (lamp_error_growth * lamp_share)^2, with
             lamp_share the fraction of the reflected light that comes from the lamps.
         match_fraction: fraction of the points in view of another keyframe that are matched there.
@@ -67,24 +67,24 @@ class ErrorModel(NamedTuple):
         distance_growth: growth of the reported match variance with the distance between two keyframes: the variance
             is multiplied by 1 + (distance_growth * distance / depth)^2.
         relief_gain: error of a match due to relief within the patch, per pixel of unevenness (see `matchability`) and
-            per unit of distance / depth. It is the same for all matches of one piece of the floor, so it accumulates
+            per unit of distance / depth. The error is the same for all matches of one patch of floor, so it accumulates
             along a path. With g the image gradient and d the parallax of a pixel relative to the patch's plane, least
             squares matching shifts a patch by (sum g g')^-1 sum g g' d times the baseline. Stereo matching weights d
             by the squared row component of g and thereby explains the column shift due to a baseline along the rows.
             The remainder is a shift across the baseline, of equal gain for both directions, and a row shift due to a
             baseline across the rows, of twice that gain for isotropic texture.
-        common_bias_px: standard deviation of a bias that all points of a link share.
+        common_bias_px: standard deviation of a bias that all points of a link share [px].
         f2f_sigma_px: reported standard deviation of a frame-to-frame flow vector.
-        f2f_error_ratio: true over reported standard deviation of a frame-to-frame motion.
+        f2f_error_ratio: ratio of the true to the reported standard deviation of a frame-to-frame motion.
         f2f_anticorrelation: fraction of a frame's error that the next frame cancels (a moving-average process of order
-            one), because both are measured relative to the same points.
+            one), because both motions are measured relative to the same points.
         mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
             deviation of a flow vector, for as many flow vectors as in F2F.
-        mosaic_error_ratio: true over reported standard deviation of a registration.
+        mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
         depth_sigma_px: reported standard deviation of a pixel's filtered depth [px of disparity].
-        depth_error_ratio: true over reported standard deviation of that depth.
-        lateral_sigma_px: standard deviation of the lateral shift of the surface that is common to all of its views.
-        map_completeness: fraction of the cells in view whose depth is known.
+        depth_error_ratio: ratio of the true to the reported standard deviation of a pixel's filtered depth.
+        lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all views of it.
+        map_completeness: fraction of the map cells in view for which the depth filter provides a depth.
     """
 
     bound_range_px: tuple[float, float] = (0.0, 1.0)

@@ -13,7 +13,7 @@ from twin.core.records import StereoRig
 Depth = NDArray[np.float32]
 
 _MAX_STEPS = 200
-_TOLERANCE_M = 1e-4  # height above the floor at which a ray counts as an intersection
+_TOLERANCE_M = 1e-4  # a ray intersects the floor where its height above the floor is less than this
 
 
 class FloorRayCaster:

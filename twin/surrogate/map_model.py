@@ -22,12 +22,12 @@ Map = NDArray[np.float32]
 
 
 class CellErrors(NamedTuple):
-    """Errors of filtered depth, by grid cell and by depth.
+    """Random numbers and standard deviations of the errors of the filtered depth.
 
     Args:
         lateral_noise: (rows, cols) standard normal numbers of the lateral error that all views of a cell share.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
-        lateral_sigma_px: standard deviation of the lateral error.
+        lateral_sigma_px: standard deviation of the lateral error [px].
         depths_m: (m,) ascending depths at which the arrays below are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth [px of disparity].
@@ -117,7 +117,7 @@ class MapModel:
         return HeightPatch(row, col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral)
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the view's footprint on the lowest floor height."""
+        """Returns (first row, end row, first column, end column) of the view's footprint at the lowest floor height."""
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -177,7 +177,7 @@ def _sample_patch(
     out, variance, systematic, height, slope, geotransform, camera, camera_from_world, is_last, estimated_from_true,
     position, cov, depth_noise, errors, row, col,
 ):  # fmt: skip
-    """Writes heights and variances of a patch to `out`, `variance` and `systematic`; returns the mean depth."""
+    """Writes a patch: heights to `out`, variances to `variance` and `systematic`; returns the mean depth."""
     (west, north, cell), m = geotransform, estimated_from_true
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):

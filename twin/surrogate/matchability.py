@@ -29,12 +29,12 @@ _SAMPLES = 9  # number of height samples along each side of a patch
 
 
 class Matchability:
-    """Cramer-Rao bound and unevenness of a survey, tabulated over the depths that the plan can encounter.
+    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated over the depths of a survey.
 
     Attributes:
-        depths_m: (m,) depths.
-        bounds_px: (m,) Cramer-Rao bound at these depths.
-        unevenness_px: (m,) unevenness of the floor under a patch at these depths.
+        depths_m: (m,) depths of the floor [m].
+        bounds_px: (m,) Cramer-Rao bound at these depths [px].
+        unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
         lamp_share: fraction of the reflected light that comes from the lamps.
     """
 
@@ -50,7 +50,7 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.bounds_px))
 
     def unevenness_at(self, depth_m: float) -> float:
-        """Returns the unevenness at a depth [px]."""
+        """Returns the unevenness at a depth [px per unit of baseline / depth]."""
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
@@ -73,7 +73,10 @@ def lamp_share(scenario: Scenario, illumination: Illumination, terrain: terrains
 
 
 def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
-    """Returns the mean radiance of a white floor at the planned altitude minus that of a black floor [cd/m2]."""
+    """Returns the mean light per colour band that a white floor at the planned altitude reflects to the camera.
+
+    It is the difference between the images of a white and a black floor, in photometric units [cd/m2].
+    """
     scenario = _without_unmodelled_effects(scenario)
     formation = ImageFormation(scenario, illumination, terrain, np.random.default_rng(0))
     depth, camera_pose = _level_floor(scenario, scenario.plan.altitude_m)
@@ -83,7 +86,7 @@ def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain:
 
 
 def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose]:
-    """Returns the depth image of a level floor at a depth, and the camera pose at the planned altitude."""
+    """Returns the depth image of a level floor at the given depth, and the camera pose at the planned altitude."""
     rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
     world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
     return np.full((rig.height_px, rig.width_px), depth_m, np.float32), StampedPose(world_from_left, 0.0)

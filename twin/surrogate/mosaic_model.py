@@ -19,7 +19,7 @@ Cells = NDArray[np.int64]  #: floor cells: column and row packed into one intege
 
 @njit(cache=True, nogil=True)
 def floor_cells(pose, points, baseline):
-    """Returns the floor cells (n,) of points (n, 3), normalised (x, y, disparity) in a camera at `pose` (4, 4)."""
+    """Returns the floor cells (n,) of points (n, 3): normalised (x, y, disparity) in a camera at `pose` (4, 4)."""
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -34,7 +34,7 @@ class MosaicView(NamedTuple):
     """Keyframes that make up the mosaic within a view.
 
     Args:
-        numbers: numbers of the keyframes, ascending.
+        numbers: (n,) numbers of the keyframes, ascending.
         estimated: (n, 4, 4) poses at which they were added to the mosaic.
         fractions: (n,) fraction of the mosaic in view that each of them covers.
     """

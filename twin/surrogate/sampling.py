@@ -17,7 +17,7 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     """Samples the frame-to-frame motion (4, 4) between two true poses (4, 4).
 
     Args:
-        errors: `FrameErrors`.
+        errors: distribution of the errors, a `FrameErrors`.
         normals, previous_normals: (6,) standard normal numbers of this motion and of the one before it.
     """
     error = np.zeros(6)
@@ -36,15 +36,15 @@ def sample_link(
 
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
-        later_noise: (n, 3) standard normal numbers of the later pair's errors at these points.
-        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier pair's biases, over its image.
+        later_noise: (n, 3) standard normal numbers of the later stereo pair's errors at these points.
+        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier stereo pair's biases, over its image.
         relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, repeated every f floor cells.
         normals: (n + 1, 3) standard normal numbers of this link alone: of its points, and of their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
-        cov: (3, 3) reported covariance of a point in each pair.
-        error_root: (3, 3) square root of the true covariance of a point in each pair.
-        bias_fraction: fraction of the earlier pair's standard deviation that is a bias common to all of its links.
+        cov: (3, 3) reported covariance of a point (x, y, disparity) in each stereo pair.
+        error_root: (3, 3) square root of the true covariance of a point in each stereo pair.
+        bias_fraction: fraction of the earlier stereo pair's standard deviation that is common to all of its links.
         relief_sigma: standard deviation of the error due to relief per unit of distance / depth.
         common_bias: true standard deviation of the common bias.
         distance_growth: growth of the reported variance with distance / depth, see `ErrorModel`.
@@ -93,7 +93,7 @@ def sample_link(
 
 @njit(cache=True, nogil=True, inline="always")
 def _floor_cell(pose, point, baseline, cell_m, n):
-    """Returns row and column, modulo n, of the floor cell that contains a point (x, y, disparity) of a camera."""
+    """Returns row and column, modulo n, of the floor cell that contains a point (x, y, disparity) seen from `pose`."""
     depth = baseline / point[2]
     x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
     y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])

@@ -1,4 +1,4 @@
-"""The simulated world without images: the same vehicle and sensors over the same floor."""
+"""Simulated world without images; vehicle, sensors and floor are those of `RenderedWorld`."""
 
 from __future__ import annotations
 

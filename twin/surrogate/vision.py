@@ -1,7 +1,7 @@
 """Visual measurements of a surrogate survey: true values with errors sampled from an error model.
 
 The surrogate is part of the simulated world: it has access to the truth and returns measurements only, each with the
-covariance that the estimators from images would report. A raster of points represents all matched points of a keyframe;
+covariance that the image-based estimators would report. A raster of points represents all matched points of a keyframe;
 its noise is reduced to account for their larger number. Links are computed from these points by the same equations as
 from images. The stereo noise of a keyframe is sampled once and is common to all of its links.
 """
@@ -47,9 +47,9 @@ class _KeyframeTruth(NamedTuple):
     Args:
         pose: (4, 4) true pose.
         points: (n, 3) points of the raster on the floor, normalised (x, y, disparity).
-        raster_indices: (n,) their indices in the raster.
+        raster_indices: (n,) indices of these points in the raster.
         noise: (rows, cols, 3) standard normal numbers of the stereo errors, over the raster.
-        bound_px: Cramer-Rao bound of a patch's position.
+        bound_px: Cramer-Rao bound of a patch's position [px].
         unevenness_px: unevenness of the floor under a patch, see `matchability`.
         n_points: number of matched points that the raster represents.
         unit_cov: (6, 6) covariance of a motion estimated from flow of unit standard deviation and known depth.
@@ -73,8 +73,8 @@ class FrameErrors(NamedTuple):
     """Distribution of the errors of frame-to-frame motions since the last keyframe.
 
     Args:
-        root: (6, 6) square root of the true covariance of the independent part of an error.
-        cov: (6, 6) reported covariance.
+        root: (6, 6) square root of the true covariance of the independent part of a motion's error.
+        cov: (6, 6) reported covariance of a motion.
         anticorrelation: fraction of a frame's error that the next frame cancels.
     """
 
@@ -172,12 +172,12 @@ class SurrogateVision:
 
     @property
     def raster_fraction(self) -> float:
-        """Returns the ratio of raster points to the matched points that they represent, for the last keyframe."""
+        """Returns the number of raster points of the last keyframe per matched point that they represent."""
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
     def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the translation of a motion (4, 4) over the mean depth of the last keyframe."""
+        """Returns the length of a motion's (4, 4) translation, divided by the mean depth of the last keyframe."""
         assert self._latest is not None
         return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._latest.points[:, 2]) / self.rig.baseline_m)
 
@@ -195,7 +195,7 @@ class SurrogateVision:
 
     @property
     def frame_errors(self) -> FrameErrors | None:
-        """Returns the errors of frame-to-frame motions since the last keyframe; None if no points can be tracked."""
+        """Returns the error distribution of F2F motions since the last keyframe; None if no points can be tracked."""
         return self._f2f
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -247,7 +247,7 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns the square root of the covariance, and the covariance (6, 6), of a motion from flow vectors."""
+        """Returns square root and covariance (6, 6) of a motion estimated from flow with a standard deviation [px]."""
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2

@@ -2,7 +2,7 @@
 
 During a rendered survey every measurement is made from the images and also sampled by the surrogate at the same true
 poses. The statistics are ratios of covariances reported from images to those of the surrogate, and errors relative to
-the truth. Both measure the same geometry, so the ratios depend on the error model alone.
+the truth. Images and surrogate measure the same geometry, so the ratios depend on the error model alone.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class ComparisonVision:
         return measured["images"]
 
     def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
-        """Adds the statistics of a link from i to j with true motion (4, 4), by the name of its source.
+        """Adds the statistics of a link from i to j with true motion (4, 4), with one motion per source in `links`.
 
         Errors are normalised by the covariance that the surrogate reports. For two consecutive links along the path,
         the normalised product of their errors is added as well: it is negative if the second cancels the first.
@@ -166,7 +166,7 @@ class ComparisonVision:
         return elevation
 
     def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds the robust variance of height errors and the median reported variance of level and steep cells [m^2]."""
+        """Adds robust variance of height errors and median reported variance [m^2], each for level and steep cells."""
         map_model = self.surrogate.scene.map_model
         error = elevation.height_m - map_model.height_m
         level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE

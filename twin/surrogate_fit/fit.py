@@ -27,7 +27,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
 
     Args:
         surveys: statistics of each survey.
-        compared: error model of the surrogate in these comparisons.
+        compared: error model of the surrogate that the surveys were compared with.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
 
@@ -120,7 +120,7 @@ def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
     """Fits the anticorrelation of consecutive frames to the error of the motion over n frames.
 
-    Where each frame cancels the fraction u of the previous error, the variance over n frames is
+    If each frame cancels the fraction u of the previous error, the variance over n frames is
     (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) of that of n independent frames.
     """
     n = float(np.median(statistics["f2f_interval_frames"]))
@@ -134,10 +134,11 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
 
     Errors due to relief grow with the distance between the keyframes, errors of patch matching do not: the squared
     errors of each survey are averaged over thirds of the links by distance, and the gain of relief is fitted to all
-    thirds of all surveys. Over a smooth floor they do not determine it, so the gain of the compared model enters as one
-    more observation. The bias of a keyframe makes the errors of consecutive links cancel, because the keyframe is the
-    later one of the first link and the earlier one of the second; relief makes them equal. (Loops of three keyframes do
-    not determine the bias, because links from the same keyframe have correlated errors.)
+    thirds of all surveys. Over a smooth floor the errors do not determine this gain, so the gain of the
+    compared model enters as one more observation. The bias of a keyframe makes the errors of consecutive links cancel,
+    because the keyframe is the later one of the first link and the earlier one of the second; relief makes these errors
+    equal. (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated
+    errors.)
 
     Args:
         surveys: statistics of n surveys.
@@ -213,7 +214,7 @@ def _fit_map_variances(statistics: SurveyStatistics, quantity: str) -> np.ndarra
     """Returns the factors (2,) on depth and lateral variance that reproduce the variances of level and steep cells.
 
     Args:
-        quantity: "error" or "sigma".
+        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
     """
     names = [name for name in ("level", "steep") if f"map_{quantity}_{name}_images" in statistics]
     images, pose, depth, lateral = (

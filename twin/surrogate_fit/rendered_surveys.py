@@ -28,7 +28,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
     Args:
         surveys: statistics of each survey; aborted surveys are ignored.
-        compared: error model of the surrogate in these comparisons.
+        compared: error model of the surrogate that the surveys were compared with.
 
     Raises:
         TwinError: too few surveys are complete.
@@ -56,7 +56,7 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
 
 
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Flies a rendered survey and saves its statistics; those of an aborted survey are incomplete."""
+    """Flies a rendered survey and saves its statistics, which are incomplete if the survey was aborted."""
     mission, stopwatch = prepare(scenario), Stopwatch()
     folder.mkdir(parents=True, exist_ok=True)
     with RenderedWorld(mission, stopwatch) as world:

@@ -43,7 +43,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """Consecutive planned frames, a sequence of steps.
+    """Sequence of consecutive planned frames; each item is a `Step`.
 
     Args:
         reference: planned pose and velocity of the left camera at each frame.
@@ -64,7 +64,17 @@ class Course:
 
 @dataclass(frozen=True)
 class Mission:
-    """A survey ready to be flown: scenario, floor, plan, cameras and illumination, all checked."""
+    """A survey that has been checked and is ready to be flown.
+
+    Args:
+        scenario: description of the survey.
+        terrain: sea floor.
+        plan: planned path.
+        rig: calibration that the estimators use.
+        grid: cells of the map.
+        true_cameras: true parameters of the cameras.
+        illumination: water and daylight.
+    """
 
     scenario: Scenario
     terrain: terrains.Terrain
@@ -76,7 +86,7 @@ class Mission:
 
     @property
     def start(self) -> Array:
-        """(4, 4) world_from_camera at the start of the survey, the reference position: level, bow to the east."""
+        """(4, 4) world_from_camera at the start of the survey, with the vehicle level and its bow to the east."""
         return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
 
     @property
@@ -90,7 +100,7 @@ class Mission:
         return Course(self.plan.references(track, times_s), keyframes, holding=False)
 
     def hold(self, track: int) -> Course:
-        """Returns the frames of half of the station-keeping time after a track (from 1)."""
+        """Returns the frames of one half of the station keeping after a track (from 1)."""
         n = self._n_holding
         end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
         return Course(end, np.zeros(n, np.bool_), holding=True)

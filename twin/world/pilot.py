@@ -58,7 +58,7 @@ class PilotState(NamedTuple):
 
 
 class RovPilot:
-    """Pilot of the ROV; its commands are those of the eight thrusters (8,), -1 to 1."""
+    """Pilot of the ROV; a command (8,) holds one value from -1 to 1 for each thruster."""
 
     def __init__(self, mission: Mission):
         rig = mission.rig

@@ -34,11 +34,11 @@ FastForward = Callable[[Course, int], int]
 
 
 class CameraImages(NamedTuple):
-    """Camera images of one instant.
+    """Images of the stereo cameras at one time.
 
     Args:
-        left, right: (H, W, 3) uint8 RGB; the right one at keyframes.
-        depth_m: returns the true depth (H, W) of the left image [m].
+        left, right: (H, W, 3) uint8 RGB images; the right one is None between keyframes.
+        depth_m: function that returns the true depth (H, W) of the left image [m].
     """
 
     left: Image
@@ -90,7 +90,7 @@ class World(ABC):
         return left_camera(self.vehicle, self.mission.rig)
 
     def start_course(self, course: Course, track: int) -> None:
-        """Starts a course: the next frames belong to it. All of its frames follow unless the survey is aborted."""
+        """Starts a course, to which the next frames belong. The course is completed unless the survey is aborted."""
         self._courses.append((course.reference.position, course.holding, track))
 
     def observe(self, step: Step) -> Frame:
@@ -108,7 +108,7 @@ class World(ABC):
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:
-        """Returns the number of frames so far."""
+        """Returns the number of frames recorded so far."""
         return len(self._true_poses)
 
     def record(self, poses: Array) -> None:

@@ -2,7 +2,7 @@
 
 Factorisation is right-looking (Davis 2006, chapter 4): a finished panel subtracts its outer product from the panels
 after it, so no memory is needed in addition to the panels. A finished panel stores L1^-1 above L2, where L1 is the
-lower triangle in its own rows and L2 the rows below.
+lower triangle in the panel's own rows and L2 the rows below it.
 
 Blocks of the inverse follow Takahashi et al. (1973), from the last panel to the first. With W = L2 L1^-1,
 cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. By then, all of cov(below) is stored in
@@ -27,13 +27,18 @@ _MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; below it
 
 
 class CholeskyFactor(NamedTuple):
-    """Cholesky factor: L1^-1 above L2 of each panel, in one long array."""
+    """Cholesky factor of a symmetric block matrix.
+
+    Args:
+        symbolic: sparsity pattern and memory layout.
+        panels: values of all panels in one long array; a panel holds L1^-1 above L2.
+    """
 
     symbolic: SymbolicFactor
     panels: Array
 
     def solve(self, right: Array) -> Array:
-        """Returns the solution (n, 6) for a right-hand side (n, 6)."""
+        """Returns the solution (n, 6) of the linear system with a right-hand side (n, 6)."""
         s = self.symbolic
         x = np.empty_like(right)
         x[s.permutation] = right
@@ -41,7 +46,7 @@ class CholeskyFactor(NamedTuple):
         return x[s.permutation]
 
     def inverse_block(self, node: int) -> Array:
-        """Returns the diagonal block (6, 6) of the inverse at a node.
+        """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node.
 
         The block is y'y with y = L^-1 e, where e is the node's columns of the identity matrix. Only the node's panel
         and its ancestors in the elimination tree contribute.
@@ -73,7 +78,12 @@ class CholeskyFactor(NamedTuple):
 
 
 class BlockMatrix(NamedTuple):
-    """Symmetric block matrix, stored in the panels of its future Cholesky factor. Panels are modified in place."""
+    """Symmetric block matrix, stored with the memory layout of its Cholesky factor.
+
+    Args:
+        symbolic: sparsity pattern and memory layout.
+        panels: values of all panels in one long array, modified in place.
+    """
 
     symbolic: SymbolicFactor
     panels: Array
@@ -165,7 +175,7 @@ def _factorise(s, original, panels):
 
 @njit(cache=True, nogil=True)
 def _invert_root(matrix, original, inverse):
-    """Computes the inverse of the Cholesky root of a dense matrix, row by row. Returns False if it is singular.
+    """Computes the inverse of the Cholesky root of a dense matrix, row by row. Returns False if the matrix is singular.
 
     Args:
         matrix: (n, n), only the lower triangle is read.
@@ -278,7 +288,7 @@ def _invert(s, panels, diagonal):
 
 @njit(cache=True, nogil=True)
 def _solve_in_place(s, panels, x):
-    """Replaces the right-hand side x (6 n,), by position, by the solution: forward and backward substitution."""
+    """Solves for a right-hand side x (6 n,) ordered by position, and overwrites x with the solution."""
     for p in range(len(s.panel_start) - 1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)

@@ -71,7 +71,13 @@ class BinaryFactors(NamedTuple):
 
 
 class FactorGraph(NamedTuple):
-    """Factors of n poses, and the standard deviation of the shared parameter's zero-mean prior; None: no parameter."""
+    """Factor graph of poses and, optionally, one parameter shared by all binary factors.
+
+    Args:
+        n_poses: number of poses.
+        unary, binary: the factors, grouped by kind.
+        shared_sigma: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
+    """
 
     n_poses: int
     unary: Sequence[UnaryFactors]
@@ -93,7 +99,7 @@ class _Evaluation(NamedTuple):
         cost: value of F.
         unary: residuals (m, d) of each kind of unary factors.
         binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
-        chi2: squared whitened residuals (m,) of each kind of binary factors.
+        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors.
     """
 
     state: GraphState
@@ -127,7 +133,7 @@ class Solution(NamedTuple):
     Args:
         state: poses and shared parameter at the minimum.
         cost: F at the minimum.
-        chi2: (m,) squared whitened residuals of each kind of binary factors, without robust weights.
+        chi2: (m,) squared norms of the whitened residuals of each kind of binary factors, without robust weights.
         converged: false if the iterations ended before the minimum was reached.
         cholesky: factor of the normal matrix of the poses, undamped.
         border: (n, 6) derivative of the poses with respect to the shared parameter, and the marginal information of
@@ -153,7 +159,7 @@ class Solution(NamedTuple):
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
     def _add_shared(self, covs: Array, rows: slice) -> Array:
-        """Adds the covariance that the uncertainty of the shared parameter causes."""
+        """Adds to the covariances of the poses `rows` the part due to the uncertainty of the shared parameter."""
         if self.border is None:
             return covs
         by_shared, information = self.border
@@ -192,7 +198,14 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
 
 
 class _Step(NamedTuple):
-    """Increments that solve the damped normal equations; `cholesky` and `border` as in `Solution`."""
+    """Solution of the damped normal equations.
+
+    Args:
+        damping: damping relative to the diagonal.
+        poses: (n, 6) increments of the poses.
+        shared: increment of the shared parameter.
+        cholesky, border: as in `Solution`, but of the damped equations.
+    """
 
     damping: float
     poses: Array
@@ -239,7 +252,7 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns losses (m,) and weights (m,) of squared whitened residuals (m,)."""
+    """Returns losses (m,) and weights (m,), given the squared norms (m,) of the whitened residuals."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)

@@ -32,7 +32,12 @@ MOTION_MIN_SIGMA_PX = 0.03
 
 
 class DepthMap(NamedTuple):
-    """Depth (H, W) float32 [m] in a left camera, NaN where unknown, and its variance (H, W) float32 [m^2]."""
+    """Depth of every pixel of a left image, with its variance.
+
+    Args:
+        depth_m: (H, W) float32 depth [m], NaN where unknown.
+        variance_m2: (H, W) float32 variance of the depth [m^2], NaN where unknown.
+    """
 
     depth_m: Map
     variance_m2: Map
@@ -81,7 +86,7 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
         old: filtered depth of the old keyframe.
         new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new one.
-        step_cov: (6, 6) covariance of that relative pose [rotation, translation], in the new camera (rad, m).
+        step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
         rig: calibration.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
@@ -102,14 +107,14 @@ def motion_depth(
 ) -> DepthMap:
     """Computes depth from the flow between two keyframes (exact two-view form of Negahdaripour & Madjidi 2003, eq. 1).
 
-    The relative pose and the current depth predict the flow. Its residual along the epipolar line is measured with the
-    same window as stereo disparity, and is linear in inverse depth. The covariance of the relative pose adds to the
-    variance of the depth.
+    The relative pose and the current depth predict the flow. The residual of the flow along the epipolar line is
+    measured with the same window as stereo disparity, and is linear in inverse depth. The covariance of the relative
+    pose adds to the variance of the depth.
 
     On rendered strips (noise of 2 grey levels, true poses), the error of motion depth was 0.044 px on a reef and 0.063
-    px on a fractal floor, 0.9 times its sigma on both, with a bias of 0.001 px. It reduced the error of the filter from
-    0.045 to 0.035 px (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is not used: its
-    bias of about 0.1 px is common to the image and would remain in the map.
+    px on a fractal floor, 0.9 times its standard deviation on both, with a bias of 0.001 px. It reduced the error of
+    the filter from 0.045 to 0.035 px (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is
+    not used: its bias of about 0.1 px is common to the image and would remain in the map.
 
     Args:
         gray, old_gray: (H, W) float32 left images.
@@ -212,7 +217,7 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
 
-    Towards a depth discontinuity, inverse depth is taken as constant.
+    The slope of inverse depth is taken as zero across a depth discontinuity.
     """
     height, width = depth.shape
     z = depth[v, u]
@@ -277,7 +282,7 @@ def _quadratic(row, cov):
 
 @njit(cache=True, nogil=True)
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
-    """Returns the variance (H, W) of disparity from motion due to the relative pose: J cov J' [px^2].
+    """Returns the part of the variance (H, W) of disparity from motion that the relative pose causes: J cov J' [px^2].
 
     An error of the pose displaces the image point; its component along the epipolar line appears as a change of depth.
     """

@@ -24,20 +24,21 @@ MIN_CELLS = 12
 class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
-    A cell keeps up to two hypotheses of its height, because a steep cell is measured at its foot in one view and at its
-    edge in another. The height z in a patch updates the best-fitting hypothesis h if the innovation passes the gate
-    (z - h)^2 < GATE (P + R); otherwise z becomes the second hypothesis, or replaces the hypothesis with the larger
-    variance if its own variance is smaller. The lower hypothesis is the result unless the higher one is much more
-    certain, because matching windows extend near surfaces over the floor behind them. Of the cells of the horseshoe
-    reef with two hypotheses, the lower one was right in 82 %, the more certain one in 67 %, and this rule in 84 %.
+    A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
+    at its upper edge in another. The height z in a patch updates the best-fitting hypothesis h if the innovation passes
+    the gate (z - h)^2 < GATE (P + R); otherwise z becomes the second hypothesis, or replaces the hypothesis with the
+    larger variance if the variance of z is smaller. The lower hypothesis is the result unless the higher one is much
+    more certain, because matching windows extend near surfaces over the floor behind them. Of the cells of the
+    horseshoe reef with two hypotheses, the lower one was right in 82 %, the more certain one in 67 %, and this rule in
+    84 %.
 
     The variance has two parts. The part due to depth is independent between patches and decreases with each fusion. The
     part due to the pose and to smoothed slopes is common to all cells of a leg, and mostly to all legs; its weighted
     mean over the patches is kept, so it never averages out. The result adds two terms: the lateral error times the
     relief around the cell, and a fraction of the squared height step for cells that may be on the wrong side of an
     edge. The fraction is the lateral error relative to the cell, for steps larger than a cell. Without this term,
-    sigma was 1.9 times too small over the whole map of a reef, because 1 % of the cells, at the edges, have the height
-    of the wrong side.
+    the standard deviation was 1.9 times too small over the whole map of a reef, because 1 % of the cells, at the edges,
+    have the height of the wrong side.
 
     Args:
         grid: grid of the map.
@@ -61,7 +62,7 @@ class ElevationMapper:
         Args:
             patch: heights of a keyframe.
             successor: heights of the next keyframe; None for the last one.
-            inherited: (H, W) bool, pixels of the next keyframe that contain information of this one
+            inherited: (H, W) bool, pixels of the next keyframe that contain information of this keyframe
                 (`depth_filter.PropagatedDepth`).
         """
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
@@ -132,7 +133,7 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets the cells of `remaining` (rows, cols) to NaN that were propagated to the successor."""
+    """Sets those cells of `remaining` (rows, cols) that were propagated to the successor to NaN."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col

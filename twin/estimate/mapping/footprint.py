@@ -1,4 +1,4 @@
-"""Map grid over the area that the keyframes of a survey show."""
+"""Map grid over the area that the keyframe images of a survey cover."""
 
 from __future__ import annotations
 

@@ -27,7 +27,12 @@ MAX_STEREO_SIGMA_PX = 0.5
 
 
 class KeyframeImages(NamedTuple):
-    """The stereo pair of a keyframe, (H, W, 3) uint8 RGB."""
+    """Stereo pair of a keyframe.
+
+    Args:
+        left: (H, W, 3) uint8 RGB left image.
+        right: (H, W, 3) uint8 RGB right image.
+    """
 
     left: Image
     right: Image
@@ -49,7 +54,13 @@ class KeyframePath(NamedTuple):
 
 
 class _StereoDepth(NamedTuple):
-    """A stereo pair, its grey left image (H, W) and its depth from stereo alone."""
+    """Stereo pair with its depth from stereo alone.
+
+    Args:
+        pair: colour images.
+        gray: (H, W) float32 grey levels of the left image.
+        depth: depth map of the left image.
+    """
 
     pair: KeyframeImages
     gray: Map
@@ -57,7 +68,14 @@ class _StereoDepth(NamedTuple):
 
 
 class _FilterState(NamedTuple):
-    """Depth filter at a keyframe: depth map, grey left image (H, W), pose (4, 4), and its heights on the grid."""
+    """State of the depth filter at a keyframe.
+
+    Args:
+        depth: filtered depth map.
+        gray: (H, W) float32 grey levels of the left image.
+        pose: (4, 4) world_from_camera.
+        patch: heights of the depth map on the grid; None if it does not overlap the grid.
+    """
 
     depth: DepthMap
     gray: Map
@@ -108,7 +126,7 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items, while a second thread computes the next one."""
+    """Yields the items, while a second thread computes the next item."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -117,7 +135,7 @@ def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
 
 
 def _measure_depth(pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig) -> _StereoDepth:
-    """Computes the stereo depth of a pair and updates the search range for the next one."""
+    """Computes the stereo depth of a pair and updates the search range for the next pair."""
     left, right = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in pair)
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
     stereo = stereo.with_sigma_below(MAX_STEREO_SIGMA_PX)
@@ -140,7 +158,7 @@ def _advance(
 
 
 class MeanIllumination:
-    """Mean image of the survey, an estimate of the illumination: lamps move with the camera, the floor does not."""
+    """Mean image of the survey, an estimate of the illumination: lamps are fixed to the camera, the floor is not."""
 
     def __init__(self, rig: StereoRig) -> None:
         self._size = (rig.width_px, rig.height_px)

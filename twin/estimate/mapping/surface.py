@@ -14,7 +14,8 @@ from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-#: Smallest cosine between a triangle's normal and the ray to it; below, it may connect two separate surfaces.
+#: Smallest cosine between the normal of a triangle and the ray to it; below this, the triangle may connect two
+#: separate surfaces.
 MIN_COSINE = 0.05
 #: Lateral error of the surface that fusion does not reduce [px on the floor]: the matching window smooths relief and
 #: displaces edges in similar ways in all views. On a slope s it causes a height error of s times this value.
@@ -22,14 +23,14 @@ LATERAL_SIGMA_PX = 0.35
 
 
 class HeightPatch(NamedTuple):
-    """Heights of one depth map in a window of the grid, whose first cell is (row, col).
+    """Heights computed from one depth map, in a rectangular window of the grid.
 
     Args:
-        row, col: first cell of the window.
+        row, col: grid position of the first (north-west) cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
         variance_m2: (rows, cols) variance due to depth, independent between the depth maps that leave the filter.
         systematic_m2: (rows, cols) variance of errors common to the views, due to the pose and smoothed slopes.
-        pixel: (rows, cols, 2) position (u, v) of the cell in the image.
+        pixel: (rows, cols, 2) position (u, v) of the cell in the image [px].
         lateral_m: lateral error at the mean depth of the depth map [m].
     """
 
@@ -95,9 +96,9 @@ class _ViewGeometry(NamedTuple):
     Args:
         position: (3,) position of the camera relative to the north-west corner of the grid [m].
         axis: (3,) optical axis in the world.
-        cov: (6, 6) covariance of the pose in world axes.
-        cell_m: cell size.
-        focal_px: focal length.
+        cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
+        cell_m: cell size [m].
+        focal_px: focal length [px].
         max_jump: largest difference of inverse depth within a surface [1/m].
     """
 
@@ -219,12 +220,12 @@ def _triangle(
 
 @njit(cache=True, nogil=True, inline="always")
 def pose_variance(px, py, pz, sx, sy, cov):
-    """Returns the variance of a surface's height at a point due to the pose [m^2].
+    """Returns the part of the variance of a surface's height at a point that the pose causes [m^2].
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].
         sx, sy: slope of the surface.
-        cov: (6, 6) covariance of the pose [rotation, translation], in world axes.
+        cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
     """
     row = (-sx, -sy, 1.0)
     full = (py * row[2] - pz * row[1], pz * row[0] - px * row[2], px * row[1] - py * row[0], row[0], row[1], row[2])

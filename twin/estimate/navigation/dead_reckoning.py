@@ -33,7 +33,10 @@ class DeadReckoningState(NamedTuple):
 class FrameAiding(NamedTuple):
     """Error models of the sensors that are read at every frame, and the state of the DVL integration.
 
-    The arrays of `dvl_state` are modified in place.
+    Args:
+        pressure_ahrs: error model of the pressure sensor and the AHRS.
+        dvl: error model of the DVL.
+        dvl_state: state of the DVL integration; its arrays are modified in place.
     """
 
     pressure_ahrs: PressureAhrsModel

@@ -39,7 +39,7 @@ class DvlState(NamedTuple):
         displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
             white noise [m^2].
         path_m: (1,) path length since the node.
-        complete: (1,) whether no reading was missing.
+        complete: (1,) true if no reading since the node was missing.
     """
 
     velocity: Array
@@ -52,7 +52,7 @@ class DvlState(NamedTuple):
 
 
 class DvlIntegrator:
-    """Integrates velocities by the trapezoidal rule, rotated by the attitude since the last node.
+    """Integrates DVL velocities, rotated into the body axes at the last node, by the trapezoidal rule.
 
     Each reading contributes half its noise to two consecutive frames. Frames are treated as independent with the
     variance (sigma dt)^2, which gives the correct variance of the sum.
@@ -126,7 +126,8 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
         velocity: (3,) reading at the end of the frame, in body axes [m/s]; NaN if there is none.
 
     Returns:
-        The fused motion (4, 4) and its covariance (6, 6); the visual motion if a reading at either end is missing.
+        The fused motion (4, 4) and its covariance (6, 6). Equal to the arguments if the reading at either end of the
+        frame interval is missing.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -158,8 +159,8 @@ def _length(step):
 def _step_cov(state, model, step):
     """Computes the covariance (3, 3) of a frame's displacement of length l.
 
-    The scale error s accumulates along the path of length L since the node: the contributions of the frames,
-    s^2 ((L + l)^2 - L^2), sum to s^2 L^2 over the path.
+    The scale error, of standard deviation s, accumulates along the path of length L since the node: the contributions
+    of the frames, s^2 ((L + l)^2 - L^2), sum to s^2 L^2 over the path.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
@@ -216,7 +217,7 @@ def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera):
         body_from_camera: (4, 4) pose of the camera in the body.
 
     Returns:
-        Updated motion and covariance.
+        Motion (4, 4) and covariance (6, 6) after the update.
     """
     expected, by_motion = body_displacement(a_from_b, body_from_camera)
     return kalman_update(a_from_b, cov, step - expected, by_motion, step_cov)

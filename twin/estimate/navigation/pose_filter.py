@@ -1,6 +1,6 @@
 """Extended Kalman filter of the online pose.
 
-Frame-to-frame motion predicts; registration with the mosaic (F2M) and the navigation sensors correct.
+The prediction uses frame-to-frame motion, the correction registration with the mosaic (F2M) and navigation sensors.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class PoseFilter:
                 the covariance of the pose.
 
         Returns:
-            (6, 6) decrease of the covariance; None if the measurement was rejected as an outlier.
+            (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.
         """
         chi2, pose, decrease = _correct(self.world_from_camera, self.cov, measured, cov, motion_cov)
         if chi2 > _GATE:
@@ -54,7 +54,7 @@ class PoseFilter:
         return decrease
 
     def fuse_position_fixes(self, readings: Readings) -> None:
-        """Fuses the readings that constrain the position at keyframes: an acoustic fix and beacons in view."""
+        """Fuses the readings that are taken only at keyframes: an acoustic position fix and the beacons in view."""
         if readings.usbl_m is not None:
             rotation = self.world_from_camera[:3, :3]
             residual = readings.usbl_m - self.world_from_camera[:3, 3]
@@ -126,13 +126,16 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
 
 @njit(cache=True, nogil=True)
 def predict(world_from_camera, cov, a_from_b, motion_cov):
-    """Returns the pose and its covariance after a motion with covariance `motion_cov`, eqs. (3) to (5)."""
+    """Returns the pose and its covariance after a motion with covariance `motion_cov`.
+
+    Equations (3) to (5) of Negahdaripour & Madjidi (2003).
+    """
     return geometry.compose(world_from_camera, a_from_b), transport_covariance(cov, a_from_b) + motion_cov
 
 
 @njit(cache=True, nogil=True)
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
-    """Limits a covariance (n, n) to between `lower` and `upper` times a reference covariance.
+    """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
     The limits apply to the generalised eigenvalues of the two matrices.
     """
@@ -145,7 +148,7 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
 
 @njit(cache=True, nogil=True)
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of pose a expressed in the axes of b, a frame rigidly attached to a."""
+    """Returns the covariance (6, 6) of the pose of b from that of the pose of a, to which b is rigidly attached."""
     return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
@@ -155,7 +158,8 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
     Args:
         world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) of the observation, k <= 3.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) residual of the observation, its Jacobian, and its covariance;
+            k <= 3.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -205,7 +209,7 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
     """Computes the update of `PoseFilter.correct_pose`.
 
     Returns:
-        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the covariance.
+        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the covariance of the pose.
     """
     motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)

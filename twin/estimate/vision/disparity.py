@@ -34,7 +34,12 @@ MAX_SIGMA_PX = 1.0
 
 
 class Disparity(NamedTuple):
-    """Disparity (H, W) float32 [px] and its standard deviation (H, W) float32 [px]; NaN where unknown."""
+    """Disparity of every pixel of a left image, with its standard deviation.
+
+    Args:
+        disparity_px: (H, W) float32 disparity [px], NaN where unknown.
+        sigma_px: (H, W) float32 standard deviation of the disparity [px], NaN where unknown.
+    """
 
     disparity_px: Map
     sigma_px: Map
@@ -50,10 +55,10 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
     """Computes the disparity of every pixel of the left image that is visible in both images.
 
     Semi-global matching (Hirschmueller 2008, three-way), on locally normalised contrast, finds the disparity to the
-    nearest pixel, with a left-right consistency check against occlusions and mismatches. Its sub-pixel interpolation is
-    biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef), so `epipolar.refine`
-    replaces it (bias 0.002 px, standard deviation 0.06 px). Sigma is that of the refinement as an independent
-    measurement, so it increases where texture is weak compared with noise.
+    nearest pixel, with a left-right consistency check against occlusions and mismatches. The sub-pixel interpolation of
+    semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef),
+    so `epipolar.refine` replaces it (bias 0.002 px, standard deviation 0.06 px). The standard deviation is that of the
+    refinement without its prior, so it increases where texture is weak compared with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
@@ -82,7 +87,7 @@ class SearchRange:
         self.max_disparity_px = self._widest_px
 
     def update(self, disparity_px: Map) -> None:
-        """Adapts the range to the disparities (H, W) of the last pair; widens it again if there are too few."""
+        """Adapts the range to the disparities (H, W) of the last pair; uses the widest range if there are too few."""
         known = disparity_px[np.isfinite(disparity_px)]
         if not self._fixed:
             wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px

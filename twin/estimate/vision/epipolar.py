@@ -41,9 +41,11 @@ _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 class TwoView(NamedTuple):
     """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
 
+    The relative pose has rotation R and translation t; f is the focal length, b the baseline of the stereo pair.
+
     Args:
         matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
-        epipole: (3,) K t / (f b) [1/px].
+        epipole: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity.
     """
 
     matrix: Array
@@ -99,11 +101,11 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     another surface are excluded. Brightness and contrast of O are first equalised locally, because backscatter and
     illumination change with the viewpoint.
 
-    The variance is that of least squares with the noise of nearby residuals (dark and uniform parts have less), or of
+    The variance is that of least squares with the noise of nearby residuals (smaller in dark and uniform areas), or of
     the window's own residuals if they are larger. With strong noise, the window of the last iteration is larger. Slopes
     that noise alone can cause do not count as texture. `measurement_sigma_px` agrees with the error to 15 % in clear
-    water; where noise is a fifth of the contrast, the error (mismatches included) is 1.3 times sigma; where it is half
-    of the contrast, 1.7 times.
+    water; where noise is a fifth of the contrast, the error (mismatches included) is 1.3 times this value; where noise
+    is half of the contrast, 1.7 times.
 
     Args:
         reference, other: (H, W) float32 grey images.
@@ -202,7 +204,7 @@ def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float
     """Returns the factor on the variance of a window due to noise that neighbouring pixels share.
 
     It is computed from the autocorrelation of the residuals that remain after the fit. Images behind a Bayer mosaic
-    have interpolated colours: with pixels taken as independent, sigma was 1.6 times too small.
+    have interpolated colours: with pixels taken as independent, the standard deviation was 1.6 times too small.
     """
     noise = np.where(visible, np.clip(remaining, -3 * variance**0.5, 3 * variance**0.5), 0)
     power = float(np.mean(noise * noise)) + 1e-6

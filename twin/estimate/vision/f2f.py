@@ -1,4 +1,4 @@
-"""Frame-to-frame motion at video rate (F2F): tracking of the points of the last keyframe, composed along the path."""
+"""Frame-to-frame motion (F2F) at video rate, by tracking the points of the last keyframe."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ _UNKNOWN_VARIANCE = 1.0  # normalised variance of the disparity, which a single 
 
 
 class _Reference(NamedTuple):
-    """Reference image that frames are matched with, and its stereo points (fields as in `StereoPoints`)."""
+    """Reference image that frames are matched with, and its stereo points.
+
+    Args:
+        image: (height, width) normalised image.
+        pixels: (n, 2) positions of the points in the image [px].
+        measured: (n, 3) normalised (x, y, disparity).
+        cov: (n, 3, 3) covariance of each point in `measured`.
+    """
 
     image: matching.Image
     pixels: matching.Points
@@ -39,7 +46,7 @@ class FrameToFrame:
     (`two_view_motion.pair_motion`); the motion between two frames is the difference of their poses in the keyframe.
     Matching each frame with the previous one and taking depth as exact, as eq. (2) of Negahdaripour & Madjidi (2003)
     does, biases the motion over the 15 frames between two keyframes, because matching errors add up: 1.25 mrad of pitch
-    over fine texture (now 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is noisy (now 0.5 +- 0.7). The
+    over fine texture (0.1 +- 0.1 here) and 4 mrad over coarse texture, where depth is noisy (0.5 +- 0.7 here). The
     standard deviation of the rotation falls from 0.6 to 0.35 mrad.
 
     If a step fails, the last motion is repeated, with a status and a large covariance.
@@ -49,7 +56,7 @@ class FrameToFrame:
         patch_px: side of the tracking window.
 
     Attributes:
-        reference: image that frames are matched with; None before the first keyframe.
+        reference: image that frames are matched with, and its points; None before the first keyframe.
         started: false until the first frame.
         reference_from_current: (4, 4) pose of the last frame in the reference camera.
         last_motion: (4, 4) motion of the last step.
@@ -77,9 +84,9 @@ class FrameToFrame:
             interval_ratio: time since the last frame divided by the time between the two frames before.
 
         Returns:
-            The motion, and "ok" or the reason for a failure. The covariance is that of the pose in the reference
-            camera. Because the errors of successive motions partly cancel, the sum of their covariances is an upper
-            bound.
+            The motion, and "ok" or the reason for a failure. The covariance is that of the pose of this frame in the
+            reference camera. Because the errors of successive motions partly cancel, the sum of their covariances is an
+            upper bound.
         """
         if not self.started:
             self.started = True

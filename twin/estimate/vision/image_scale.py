@@ -1,10 +1,10 @@
 """Choice of the image scale: pixels are binned if the texture of the floor is coarser than the image noise.
 
 Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
-corners of the full image are matched in the right image: the others are noise, and F2F tracking fails within 18 s. With
-pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full image
-resolves, 95 to 99 % are matched without binning. Larger patches alone do not help, because they keep the corners that
-are noise.
+corners of the full image are matched in the right image: the other corners are noise, and F2F tracking fails within 18
+s. With pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full
+image resolves, 95 to 99 % are matched without binning. Larger patches alone do not help, because they keep the corners
+that are noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning with enough corners matched in both images, otherwise the one with the most.
+    """Returns the smallest binning that matches enough corners, or else the one that matches most.
 
     Args:
         left, right: (height, width, 3) images of the first keyframe.

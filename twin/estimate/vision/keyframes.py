@@ -13,7 +13,9 @@ from twin.estimate.vision.stereo import StereoPoints
 
 @dataclass
 class Keyframe:
-    """A stereo pair on the path (the paper's "key point"). Its fields are updated in place during the survey.
+    """Stereo pair on the path ("key point" in Negahdaripour & Madjidi 2003).
+
+    Its fields are updated in place during the survey.
 
     Args:
         number: index of the keyframe, from 0.
@@ -25,8 +27,8 @@ class Keyframe:
         dvl_displacement: displacement since the previous node, measured by the DVL; None without DVL, or if the link
             to the previous node is the F2F motion, which already includes it.
         accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the part that registrations
-            with the mosaic removed; in world axes. The difference between two keyframes is the covariance of the
-            motion between them.
+            with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference between two
+            keyframes is the covariance of the motion between them.
         depth_m: median depth of the matched points [m].
     """
 

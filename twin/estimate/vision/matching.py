@@ -34,7 +34,7 @@ def gray(rgb: Image, binning: int = 1) -> Gray:
     smaller.
 
     Args:
-        rgb: (height, width, 3).
+        rgb: (height, width, 3) image.
         binning: number of pixels that are averaged along each side.
     """
     if binning == 1:
@@ -45,7 +45,7 @@ def gray(rgb: Image, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Normalises local mean and contrast of grey levels, so that the pattern of the lamps is not tracked.
+    """Normalises local mean and contrast of grey levels, so that the light pattern of the lamps is not tracked.
 
     Returns:
         (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
@@ -68,7 +68,7 @@ def contrast(levels: Gray) -> float:
 
 
 def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
-    """Returns mean and mean square in a window around each pixel that is an eighth of the image wide."""
+    """Returns the mean and mean square around each pixel, in a window as wide as an eighth of the image."""
     size = (levels.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
     square = cv2.sqrBoxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
@@ -139,7 +139,7 @@ def track(
 
     Args:
         source, target: normalised images of the same shape.
-        points: (n, 2) [px] in the source.
+        points: (n, 2) positions in the source [px].
         guess: (n, 2) expected positions in the target [px].
         patch_px: side of the window.
         levels: pyramid levels above the full image.
@@ -183,8 +183,8 @@ def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: floa
 def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
     """Returns the factor on a covariance that was computed for independent points (n, 2).
 
-    Overlapping patches share pixels, so their errors are correlated. The variance of a mean is inflated by the mean,
-    over the patches, of the summed overlap of a patch with all patches (design effect, Kish 1965).
+    Overlapping patches share pixels, so their errors are correlated. The variance of a mean is inflated by the
+    summed overlap of a patch with all patches, averaged over the patches (design effect, Kish 1965).
     """
     if len(points) == 0:
         return 1.0

@@ -6,9 +6,9 @@ registered by direct image alignment: textured cells are projected into the fram
 brightness agrees (Gauss-Newton with Huber weights).
 
 The residuals are dominated by errors of height and by uneven illumination rather than by pixel noise, and neighbouring
-cells share them. With cells taken as independent, the standard deviation was 0.4 mrad where the error was 1.4 to 6
-mrad, over a floor of coarse texture. The covariance is therefore that of clustered data (Liang & Zeger 1986), with
-blocks of the image as clusters.
+cells share them. Over a floor of coarse texture, with cells taken as independent, the computed standard deviation of
+the rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore that of clustered data (Liang &
+Zeger 1986), with blocks of the image as clusters.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Registration(NamedTuple):
     Args:
         correction: estimated pose of the frame relative to its predicted pose (predicted_from_true).
         reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells are from this
-            keyframe or older ones.
+            keyframe or older keyframes.
     """
 
     correction: two_view_motion.Motion
@@ -52,8 +52,8 @@ class Mosaic:
     """Raster of brightness, elevation and keyframe number, in tiles: memory does not grow with the area.
 
     Args:
-        cell_m: cell size, about the ground sample distance; cell (0, 0) begins at the origin of the world, rows run
-            north.
+        cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
+            the world, and row numbers increase to the north.
         folder: folder of the tiles on disk.
     """
 
@@ -208,9 +208,11 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
     """Linearises the brightness residuals of the cells that are visible in the frame.
 
     Args:
-        points: (n, 3) cells in the world [m], with brightness (n,).
-        frame, depth: (height, width) brightness and depth of the frame.
-        camera_from_world: (4, 4) pose.
+        points: (n, 3) positions of the cells in the world [m].
+        brightness: (n,) brightness of the cells [grey levels].
+        frame: (height, width) brightness of the frame [grey levels].
+        depth: (height, width) depth of the frame [m].
+        camera_from_world: (4, 4) pose of the world in the camera.
         camera: focal length, column and row of the principal point [px].
         max_residual: largest brightness residual of an inlier [grey levels].
 
@@ -262,8 +264,8 @@ def _normal_equations(jacobian, frame_jacobian, residuals, block):
     mosaic's depth, which would otherwise bias the solution.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), its scatter (6, 6) over the blocks of the image, and the robust
-        standard deviation of the residuals.
+        Normal matrix (6, 6), right-hand side (6,), scatter matrix (6, 6) of the right-hand side over the blocks of the
+        image, and the robust standard deviation of the residuals.
     """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:

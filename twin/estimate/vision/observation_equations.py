@@ -18,11 +18,13 @@ _MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 
 
 class PairMeasurements(NamedTuple):
-    """The same n points measured by two stereo pairs a (earlier) and b (later).
+    """Measurements of the same n points in two stereo pairs, a (earlier) and b (later).
 
     Args:
-        a, b: (n, 3) normalised (x, y, disparity).
-        cov_a, cov_b: (n, 3, 3) covariances of `a` and `b`.
+        a: (n, 3) normalised (x, y, disparity) in pair a.
+        b: (n, 3) normalised (x, y, disparity) in pair b.
+        cov_a: (n, 3, 3) covariance of each point in `a`.
+        cov_b: (n, 3, 3) covariance of each point in `b`.
     """
 
     a: Array
@@ -39,7 +41,7 @@ class LinearisedObservations(NamedTuple):
         jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
         jacobian_motion: (n, 3, 6) derivative of the prediction with respect to the twist of the motion a_from_b.
         information: (n, 3, 3) inverse covariance of the residual.
-        normalised_residual: (n,) root of the squared Mahalanobis distance of the residual per degree of freedom.
+        normalised_residual: (n,) Mahalanobis distance of the residual, divided by sqrt(3).
     """
 
     residual: Array
@@ -218,7 +220,7 @@ def adjust_structure(observations, measured, twist):
 
     Args:
         observations: `LinearisedObservations`.
-        measured: `PairMeasurements` that they were linearised from.
+        measured: `PairMeasurements` that the observations were linearised from.
         twist: (6,) solution of the motion's normal equations.
     """
     b, cov_b = measured.b, measured.cov_b

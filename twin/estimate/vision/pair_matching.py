@@ -34,7 +34,7 @@ class PairMatcher:
         self._workers = ThreadPoolExecutor(2)
 
     def close(self) -> None:
-        """Ends the threads."""
+        """Ends the threads that match points."""
         self._workers.shutdown()
 
     def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[PairMeasurements | None]:
@@ -89,14 +89,18 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns the left pixels (n, 2) of normalised points (n, 3), and (disparity, 0) [px] of each (n, 2)."""
+        """Returns the left pixels (n, 2) of normalised points (n, 3), and the displacements (n, 2) to the right image.
+
+        A displacement is (disparity, 0) [px]; it is subtracted from the left pixel.
+        """
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
     def motion(self, node: Keyframe, other: Keyframe, measured: PairMeasurements) -> two_view_motion.Motion | None:
         """Estimates the pose of `node` in `other` from their matched points, jointly with the structure.
 
-        The estimate starts from the closed form of eq. (2), or from the predicted poses if that fails.
+        The estimate starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the predicted poses if
+        the closed form fails.
 
         Returns:
             The motion, or None if too few of the matched points are inliers.

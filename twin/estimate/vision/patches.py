@@ -12,8 +12,8 @@ Systematic errors of patch matching, measured against the simulated truth, and t
   0.0055 px on waves of 2.5 px and longer, and 0.004 px on slightly smoothed images (`matching.gray`).
 - Images normalised by their surroundings (`matching.normalise`) depend on the position in the image: near the border,
   where the window is cut off, the matching error is 0.015 px over coarse texture, and each leg tilts by 0.3 mrad
-  against the next. Grey levels are therefore matched as they are; brightness and contrast are nuisance parameters
-  anyway.
+  relative to the next leg. Grey levels are therefore matched as they are; brightness and contrast are nuisance
+  parameters anyway.
 
 Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
 fine, with cubic B-spline interpolation (Unser 1999).
@@ -46,10 +46,10 @@ _NUISANCES = 6  # brightness and contrast, and a ramp of each in both directions
 
 
 class PatchTemplates(NamedTuple):
-    """Patches of one image, prepared for matching; m pixels each.
+    """n patches of one image, prepared for matching, with m pixels each.
 
     Args:
-        half: half of the side without the middle pixel [px].
+        half: half the side of a patch without its middle pixel: (side - 1) / 2 [px].
         offset: (n, 2) patch centre minus the point that it represents [px of the full image].
         energy: (n,) sum of squared deviations from the patch's mean; 0 if the patch cannot be matched, because it is
             too uniform or extends beyond the image.
@@ -66,10 +66,10 @@ class PatchTemplates(NamedTuple):
 
 
 class PatchMatches(NamedTuple):
-    """Positions of patches in a target image.
+    """Positions of n patches in a target image.
 
     Args:
-        points: (n, 2) [px] in the target.
+        points: (n, 2) positions in the target [px].
         ok: (n,) bool, true if the match converged and correlates with the template.
         cov: (n, 2, 2) covariance of a patch's position in one image, in pixels of the source [px^2], from the texture
             of the patch and the noise in the difference of both images.
@@ -81,7 +81,7 @@ class PatchMatches(NamedTuple):
 
 
 def pyramid(image: Image, levels: int) -> list[Image]:
-    """Returns the image (height, width), followed by `levels` coarser ones of half the size each."""
+    """Returns the image (height, width), followed by `levels` coarser images, each half the size of the previous."""
     images = [image]
     for _ in range(levels):
         images.append(np.asarray(cv2.pyrDown(images[-1]), np.float32))
@@ -126,7 +126,7 @@ def match_templates(
     Args:
         templates: patches per pyramid level (`extract_templates`).
         target: spline coefficients per pyramid level (`spline_coefficients`).
-        guess: (n, 2) expected positions in the target [px]; at most about two pixels of the coarsest level off.
+        guess: (n, 2) expected positions in the target [px]; correct to about two pixels of the coarsest level.
         warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
     """
     points = guess.astype(np.float64)
@@ -169,7 +169,7 @@ def _slope(disparity, points, half):
         centre = disparity[v0, u0]
         if np.isnan(centre):
             continue
-        limit = 1.0 + 0.4 * half  # beyond this, the pixel belongs to another surface
+        limit = 1.0 + 0.4 * half  # a pixel with a larger difference belongs to another surface
         n = su = sv = sd = suu = suv = svv = sud = svd = 0.0
         for v in range(max(v0 - half, 0), min(v0 + half + 1, disparity.shape[0])):
             for u in range(max(u0 - half, 0), min(u0 + half + 1, disparity.shape[1])):

@@ -13,7 +13,7 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, patches
 
 _EPIPOLAR_PX = 1.0
-_BORDER_PX = 4  # two pixels for interpolation; the other two exceed the matching error
+_BORDER_PX = 4  # two pixels for interpolation, and two that exceed the matching error
 _MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
 
 
@@ -26,7 +26,7 @@ class StereoPoints(NamedTuple):
         mean_disparity_px: (n,) mean disparity around each point [px]. It is free of the point's own noise and predicts
             whether another image shows the point.
         measured: (n, 3) normalised (x, y, disparity).
-        cov: (n, 3, 3) covariance of `measured`.
+        cov: (n, 3, 3) covariance of each point in `measured`.
         xyz: (n, 3) positions in the left camera [m].
     """
 
@@ -48,13 +48,13 @@ class StereoPoints(NamedTuple):
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
 
-    Both positions have covariance `cov`. Disparity is the difference of two columns, one of which is x, so x and
+    Disparity is the difference of two columns, one of which is x, so x and
     disparity are correlated. The difference in row must be zero; this constraint is applied as a Kalman update, which
     also corrects the columns where `cov` correlates them with the rows.
 
     Args:
         left, right: (n, 2) positions [px].
-        cov: (n, 2, 2) covariance of a position in one image [px^2].
+        cov: (n, 2, 2) covariance of a position in either image [px^2].
         rig: calibration.
 
     Returns:

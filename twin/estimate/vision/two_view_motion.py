@@ -1,4 +1,4 @@
-"""Camera motion from flow and known depth (eqs. 1 and 2), and jointly with structure from two stereo pairs.
+"""Camera motion from flow and known depth, and jointly with structure from two stereo pairs.
 
 A motion is the pose of the later camera in the earlier one, or its twist [w, t] (rad, m). Coordinates are normalised as
 in `observation_equations`. Equation numbers are those of Negahdaripour & Madjidi 2003.
@@ -31,11 +31,12 @@ class Motion(NamedTuple):
 
     Args:
         a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
-        cov: (6, 6) covariance of [rotation, translation] in b (rad, m).
+        cov: (6, 6) covariance of the motion [rotation, translation], in the axes of b (rad, m).
         n_points: number of inliers.
         residual: robust scale of the residuals, in the units of the measurements, or relative to their expected
             standard deviation (`pair_motion`).
-        closed_form: (4, 4) motion by eq. (2) that the estimate started from; None if it did not start from one.
+        closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
+            None if it started from another motion.
     """
 
     a_from_b: Array
@@ -67,7 +68,7 @@ _DEFAULT_SETTINGS = PairMotionSettings()
 
 
 def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> tuple[Array, Array]:
-    """Returns the weighted least-squares twist from flow and depth, eq. (2).
+    """Returns the weighted least-squares twist from flow and depth (Negahdaripour & Madjidi 2003, eq. 2).
 
     Args:
         x, y: (n,) normalised image coordinates.
@@ -83,7 +84,9 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
 
 
 def frame_motion(points: Array, observed: Array, guess: Array, iterations: int = 4) -> Motion | None:
-    """Estimates the motion from points and their projections in the next frame: eq. (2), iterated with Huber weights.
+    """Estimates the motion from points and their projections in the next frame.
+
+    Iterates eq. (2) of Negahdaripour & Madjidi 2003 with Huber weights.
 
     Args:
         points: (n, 3) positions in the earlier camera [m].
@@ -114,10 +117,10 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
 
 
 def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
-    """Estimates the motion between two stereo pairs by eq. (2), with the depth of b taken as exact.
+    """Estimates the motion between two stereo pairs with the depth of the later pair b taken as exact.
 
-    This is the closed form of the paper. It is fast, and biased by the noise of the depth; the disparity of a is
-    unused.
+    This is the closed form of Negahdaripour & Madjidi 2003 (eq. 2), iterated with Huber weights. It is fast, but
+    biased by the noise of the depth; the disparity in the earlier pair a is not used.
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
@@ -144,7 +147,8 @@ def pair_motion(
 
     Both pairs measure each point as z = (x, y, disparity); the true point in b is unknown. With e = z_a - g(z_b),
     G = dg/dz_b and A = dg/dmotion, the structure is eliminated: the cost is e' (C_a + G C_b G')^-1 e, linearised at the
-    adjusted structure (mixed adjustment model, Mikhail 1976, as in eqs. 6 and 7). Residuals have Huber weights.
+    adjusted structure (mixed adjustment model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003).
+    Residuals have Huber weights.
 
     Args:
         measured: points in the earlier pair a and the later pair b.
