@@ -261,9 +261,9 @@ class Navigator:
     def _follow_chain(self, node: Keyframe) -> Link | None:
         """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
 
-        Two stereo pairs determine the motion more accurately than the frames between them, and give GA better initial
-        values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by navigation sensors since the last node are
-        kept.
+        Two stereo pairs determine the motion more accurately than the frames between them, and give the global alignment
+        better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by navigation sensors since the
+        last node are kept.
         """
         link = self.network.link_to_last_node(node)
         if link is None:

@@ -188,7 +188,8 @@ def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
 def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: float) -> tuple[float, np.ndarray]:
     """Fits the growth of the reported link covariance with the distance between the keyframes.
 
-    Only the variance of the earlier pair grows, so the link variance is multiplied by 1 + (growth * distance)^2 / 2.
+    A link joins two stereo pairs of equal variance. That of the earlier pair grows with the distance, so the variance
+    of the link is multiplied by 1 + (growth * distance)^2 / 2.
 
     Returns:
         Growth, and for each survey the ratio (n,) of the reported standard deviations at distance zero.
