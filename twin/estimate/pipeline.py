@@ -261,7 +261,7 @@ class Navigator:
     def _follow_chain(self, node: Keyframe) -> Link | None:
         """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
 
-        Two stereo pairs determine the motion more accurately than the frames between them, and give the global alignment
+        Two stereo pairs give the motion more accurately than the frames between them, and give the global alignment
         better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by navigation sensors since the
         last node are kept.
         """
