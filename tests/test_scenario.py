@@ -125,6 +125,14 @@ BAD_FILES = [
         'imaging = { shadows = true, calibration = "x.toml" }',
         ["1: imaging.calibration: renamed to imaging.error_model"],
     ),
+    (
+        "[calibration]\nfocal_error = 0.1\n[plan]\naltitud_m = 2\nspeed_mps = 9",
+        [
+            "1: calibration: renamed to calibration_error",
+            "5: plan.speed_mps: 9: not allowed (allowed: less than or equal to 2)",
+            f"4: plan.altitud_m: unknown key (did you mean altitude_m?) (allowed: {PLAN_KEYS})",
+        ],
+    ),
     ("plan.tracks = 2\nplan.speed_mps = 9", ["2: plan.speed_mps: 9: not allowed (allowed: less than or equal to 2)"]),
     (
         'name = """\nspeed_mps = 1\n[plan]"""\n[plan]\nspeed_mps = 9',
@@ -308,6 +316,14 @@ def test_a_renamed_key_is_reported_in_the_base_file_that_contains_it(tmp_path):
     with pytest.raises(ScenarioError) as raised:
         load_scenario(written(tmp_path, 'extends = "base.toml"', "top.toml"))
     assert raised.value.lines == [f"{base}:2: calibration: renamed to calibration_error"]
+
+
+def test_an_error_in_a_base_file_is_reported_there_even_where_the_file_on_top_has_the_section(tmp_path):
+    base = written(tmp_path, "seed = 1\n\n[plan]\nspeed_mps = 9\ntracks = 0", "base.toml")
+    top = written(tmp_path, 'extends = "base.toml"\n[plan]\ntracks = -1', "top.toml")
+    with pytest.raises(ScenarioError) as raised:
+        load_scenario(top)
+    assert sorted(line.rpartition("/")[2].split(": ")[0] for line in raised.value.lines) == ["base.toml:4", "top.toml:3"]
 
 
 def test_a_renamed_key_is_reported_at_the_line_of_the_study_that_sets_it(tmp_path):

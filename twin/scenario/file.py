@@ -22,6 +22,7 @@ Model = TypeVar("Model", bound=BaseModel)
 _PATH_KEYS = ("imaging.error_model", "terrain.height_file", "terrain.texture_file", "water.spectrum_file")
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {"calibration": "calibration_error", "imaging.calibration": "imaging.error_model"}
+_ABSENT = object()
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
@@ -34,19 +35,32 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     Raises:
         ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
-    file = find_scene(path)
-    tree, lines = _read_with_base(file, including_files=())
-    source = Source(path=file, lines=lines, overrides=tuple(overrides))
+    tree, source, errors = _read_with_base(find_scene(path), including_files=())
+    source = source.model_copy(update={"overrides": tuple(overrides)})
     for override in overrides:
-        _apply_override(tree, override)
-    scenario = validated(tree, Scenario, source)
+        try:
+            _apply_override(tree, override)
+        except ScenarioError as error:
+            errors += error.lines
+    try:
+        scenario = validated(tree, Scenario, source)
+    except ScenarioError as error:
+        raise ScenarioError([*errors, *error.lines]) from None
+    if errors:
+        raise ScenarioError(errors)
     scenario._source = source
     return scenario
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
-    """Returns the keys and values of a scenario (file or name in scenes/) merged with its base file, without checks."""
-    return _read_with_base(find_scene(path), including_files=())[0]
+    """Returns the keys and values of a scenario (file or name in scenes/) merged with its base file.
+
+    Values are not checked. Raises ScenarioError where a file cannot be read or contains a renamed key.
+    """
+    tree, _, errors = _read_with_base(find_scene(path), including_files=())
+    if errors:
+        raise ScenarioError(errors)
+    return tree
 
 
 def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
@@ -136,30 +150,40 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     return tree, key_lines(text)
 
 
-def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, int]]:
+def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict[str, Any], Source, list[str]]:
     """Reads a file and merges it over its base file.
 
     Args:
         including_files: absolute paths of the files that extend this one, directly or indirectly.
 
     Returns:
-        Keys and values, with absolute file paths, and the line of each key of `file` itself.
+        Keys and values without the renamed keys, with absolute file paths; their files and lines; and an error for
+        each renamed key.
     """
     if file.resolve() in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
     tree, lines = read_toml(file)
-    old_keys = [key for key in _RENAMED_KEYS if key in lines]
-    if old_keys:
-        raise ScenarioError([f"{file}:{lines[key]}: {key}: renamed to {_RENAMED_KEYS[key]}" for key in old_keys])
+    errors = [
+        f"{file}:{lines[old]}: {old}: renamed to {new}" for old, new in _RENAMED_KEYS.items() if _remove(tree, old)
+    ]
     _resolve_paths(tree, file.parent)
     base = tree.pop("extends", None)
     if base is None:
-        return tree, lines
+        return tree, Source(path=file, lines=lines), errors
     base_file = (file.parent / str(base)).resolve()
     if not base_file.is_file():
-        raise ScenarioError([f"{file}:{lines.get('extends', 1)}: extends: no such file {str(base)!r}"])
-    base_tree, _ = _read_with_base(base_file, (*including_files, file.resolve()))
-    return _merge(base_tree, tree), lines
+        raise ScenarioError([*errors, f"{file}:{lines.get('extends', 1)}: extends: no such file {str(base)!r}"])
+    base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, file.resolve()))
+    return _merge(base_tree, tree), Source(path=file, lines=lines, base=base_source), errors + base_errors
+
+
+def _remove(tree: dict[str, Any], key: str) -> bool:
+    """Removes a dotted key from the tree; returns whether it was there."""
+    *sections, leaf = key.split(".")
+    node: Any = tree
+    for section in sections:
+        node = node.get(section) if isinstance(node, dict) else None
+    return isinstance(node, dict) and node.pop(leaf, _ABSENT) is not _ABSENT
 
 
 def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:

@@ -461,11 +461,13 @@ class Source(BaseModel):
     Args:
         path: file of the scenario.
         lines: line number of each dotted key of that file.
+        base: the same for the file that it extends.
         overrides: `key=value` of the command line.
     """
 
     path: Path
     lines: dict[str, int] = {}
+    base: Source | None = None
     overrides: tuple[str, ...] = ()
 
     def describe(self, error: TwinError) -> str:
@@ -480,9 +482,14 @@ class Source(BaseModel):
         if error.field in overridden or in_overridden_section:
             return f"--set: {error}"
         key = error.field
-        while key not in self.lines and "." in key:
+        while "." in key and not any(key in file.lines for file in self._files()):
             key = key.rpartition(".")[0]
-        return f"{self.path}:{self.lines.get(key, 1)}: {error}"
+        file = next((file for file in self._files() if key in file.lines), self)
+        return f"{file.path}:{file.lines.get(key, 1)}: {error}"
+
+    def _files(self) -> list[Source]:
+        """Returns the file and those that it extends."""
+        return [self, *(self.base._files() if self.base else [])]
 
 
 class Scenario(Section):
