@@ -1,4 +1,4 @@
-"""Thrust allocation: from a wrench on the body to thruster commands."""
+"""Thrust allocation: converts a wrench on the body to thruster commands."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Array = NDArray[np.float64]
 
 
 class ThrustAllocation(NamedTuple):
-    """Thrust allocation: distributes a wrench [moment, force] over n thrusters.
+    """Thrust allocation: distributes a wrench [moment, force] among n thrusters.
 
     Args:
         thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrust configuration matrix.
-        command_table: (k,) increasing commands, over the range in which thrust increases with the command.
-        thrust_table_n: (k,) steady thrust at these commands [N].
+        command_table: (k,) increasing commands within the range in which thrust increases with the command.
+        thrust_table_n: (k,) steady thrust at the commands of `command_table` [N].
     """
 
     thrusts_from_wrench: Array
@@ -62,7 +62,8 @@ def pseudo_inverse_allocation(
 
     Args:
         configuration: thrust configuration matrix B (6, n): wrench [moment, force] in the body per newton of thrust.
-        thrust_of_command: steady thrust [N] of commands in [-1, 1], increasing around 0.
+        thrust_of_command: returns the steady thrust [N] at commands in [-1, 1]; it must increase with the command
+            around 0.
         weights: diagonal of W (n,); a thruster with a greater weight is used less. None: equal weights.
     """
     weighted = configuration / (np.ones(configuration.shape[1]) if weights is None else weights)

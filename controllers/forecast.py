@@ -85,8 +85,8 @@ class Clearance(NamedTuple):
     """Clearance of a planned path above the floor.
 
     Args:
-        least_m: least height of the camera above the floor in view; infinite if no floor is in view.
-        x_m, y_m: position of the highest point of the floor in view.
+        least_m: least height of the camera above the checked floor; infinite if no floor was found.
+        x_m, y_m: position of the highest point of the checked floor.
         inside: whether the whole path lies above the terrain.
     """
 
@@ -97,12 +97,12 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """Computes the clearance of the planned path above the floor in the camera's footprint and between swaths.
+    """Computes the clearance of the planned path above the floor in the footprints along the path and between them.
 
     Args:
         plan: the survey plan.
-        height_at: height of the floor [m] at arrays of x and y [m]; NaN outside the terrain. The terrain is a
-            rectangle, so the path lies inside it if all waypoints do.
+        height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain. The terrain must
+            be a rectangle: the path is taken to lie inside if all its waypoints do.
         sample_m: sampling distance of the heights.
     """
     path = plan.outline()[:, :2]

@@ -1,6 +1,6 @@
 """Lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
 
-The bow always points east and every second leg is flown backwards, so the top of the image always points east:
+The bow always points east, and every second leg is flown backwards. The top of the image therefore always points east:
 consecutive keyframes are displaced along the image height, neighbouring swaths along the image width.
 """
 
@@ -17,7 +17,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     """Plans a lawnmower survey of an area (Negahdaripour & Madjidi 2003, section III-A).
 
     The legs run along x, at most (1 - overlap_across) ImgSize Altitude / FocalLength apart (ImgSize is the image
-    width). They divide the area into an even number of equal strips; the first leg is the southernmost.
+    width). They are the centre lines of an even number of equal strips of the area; the first leg is the southernmost.
 
     Args:
         request: requirements of the survey.
@@ -49,7 +49,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
 
 
 def _track(request: SurveyRequest, spacing_m: float, track: int, last: bool) -> tuple[Segment, ...]:
-    """Returns a track (from 1): leg, cross segment, return leg and, unless it is the last, a segment to the next."""
+    """Returns the segments of a track (from 1): leg, cross segment, return leg, segment to the next track if any."""
     half_x, half_y = request.area_m[0] / 2, request.area_m[1] / 2
     south = (2 * track - 1.5) * spacing_m - half_y
     out = [(-half_x, south), (half_x, south)]

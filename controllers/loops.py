@@ -18,7 +18,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     """Plans a loop survey of the disc inscribed in the area; each loop is a track.
 
     The distance between neighbouring loops is at most (1 - overlap_across) times the shorter side of the image on the
-    reference plane, because loops run in every direction. Small loops are flown below the cruise speed.
+    reference plane, because loops run in every direction. On small loops, the greatest acceleration limits the speed.
 
     Args:
         request: requirements of the survey.
@@ -51,8 +51,8 @@ def plan(request: SurveyRequest) -> SurveyPlan:
 def loop_spacing_m(loop_diameter_m: float, n_loops: int) -> float:
     """Returns the greatest distance between neighbouring loops [m]: a sin(pi / n) for n loops of diameter a.
 
-    This is the distance between the centres of the two circles, which lie at a / 2 from the start and 2 pi / n apart:
-    equal circles are farthest apart along the line through their centres.
+    Equal circles are farthest apart along the line through their centres, where they are as far apart as the centres.
+    The centres of neighbouring loops lie at a / 2 from the start, at directions that differ by 2 pi / n.
     """
     return loop_diameter_m * math.sin(math.pi / n_loops)
 
@@ -64,7 +64,7 @@ def n_loops_to_fill(loop_diameter_m: float, max_spacing_m: float) -> int:
 
 
 def _loop(request: SurveyRequest, diameter_m: float, angle: float) -> Circle:
-    """Returns the loop whose farthest point lies at this angle [rad], counter-clockwise from east."""
+    """Returns the loop whose centre lies in the direction `angle` from the start [rad, counter-clockwise from east]."""
     x, y, z = diameter_m / 2 * math.cos(angle), diameter_m / 2 * math.sin(angle), request.altitude_m
     return circle((0.0, 0.0, z), (x, y, z), request.speed_mps, request.acceleration_mps2)
 

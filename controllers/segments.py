@@ -1,4 +1,4 @@
-"""Segments of a planned path, each from rest to rest: straight lines and full circles."""
+"""Segments of a planned path: straight lines and full circles, each flown from rest to rest."""
 
 from __future__ import annotations
 
@@ -101,8 +101,8 @@ def line(start: Point, end: Point, cruise_mps: float, acceleration_mps2: float) 
 def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: float) -> Circle:
     """Returns the circle from a start point about a centre [m] whose total acceleration stays within a limit.
 
-    The cruise speed is limited to `max_circle_speed_mps`. The tangential acceleration is the part of the limit that
-    the centripetal acceleration at cruise speed leaves.
+    The cruise speed is limited to `max_circle_speed_mps`. The tangential acceleration is chosen so that the total
+    acceleration equals the limit when the cruise speed is reached.
     """
     radius_m = math.dist(start, centre)
     cruise_mps = min(cruise_mps, max_circle_speed_mps(radius_m, acceleration_mps2))
@@ -112,8 +112,8 @@ def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: fl
 
 
 def max_circle_speed_mps(radius_m: float, acceleration_mps2: float) -> float:
-    """Returns the speed limit on a circle [m/s].
+    """Returns the greatest cruise speed v on a circle of radius r for a limit a of the total acceleration [m/s].
 
-    It satisfies v^2 / r = a / sqrt(2), so the centripetal and the available tangential acceleration are equal.
+    It satisfies v^2 / r = a / sqrt(2), so centripetal and tangential acceleration are equal at the limit.
     """
     return math.sqrt(radius_m * acceleration_mps2 / math.sqrt(2))

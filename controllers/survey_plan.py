@@ -1,4 +1,4 @@
-"""Survey plan: requirements, parameters and the path of every track, independent of the pattern."""
+"""Survey requirements, and the plan that meets them: parameters and the path of every track, for any pattern."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ class SurveyRequest(NamedTuple):
         area_m: extent along x and y, centred at the origin.
         altitude_m: height of the left camera above the reference plane z = 0.
         speed_mps: cruise speed.
-        overlap_along: required overlap of consecutive keyframes, as a fraction.
+        overlap_along: required overlap of consecutive keyframes, as a fraction of the image width (see
+            `frames_per_keyframe`).
         overlap_across: required sidelap of neighbouring swaths, as a fraction.
-        tracks: number of tracks to fly, starting with the first; 0 flies all tracks that fill the area.
+        tracks: number of tracks to fly, starting with the first; 0: all tracks that fill the area.
         image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
-        acceleration_mps2: greatest acceleration.
+        acceleration_mps2: greatest acceleration of the camera.
     """
 
     area_m: tuple[float, float]
@@ -50,7 +51,7 @@ class SurveyRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """Planned path of the left camera, bow to the east, in tracks that each end with station keeping.
+    """Planned path of the left camera, with the bow to the east. The vehicle keeps station after each track.
 
     Args:
         paths: segments of each track; every segment starts and ends at rest.
@@ -65,7 +66,7 @@ class SurveyPlan:
         side_along_m: side of the footprint along which consecutive keyframes are displaced.
         side_across_m: side of the footprint along which neighbouring swaths are displaced.
         focal_px: focal length of the cameras.
-        acceleration_mps2: greatest acceleration.
+        acceleration_mps2: greatest acceleration of the camera.
     """
 
     paths: tuple[tuple[Segment, ...], ...]
@@ -155,7 +156,7 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
     """Returns the number of tracks to fly.
 
     Args:
-        request: the requirements; `tracks` = 0 flies all.
+        request: the requirements; `tracks` = 0 means all tracks.
         n_filling: number of tracks that fill the area.
     Raises:
         TwinError: more tracks are requested than fill the area.

@@ -1,4 +1,4 @@
-"""Trajectory tracking and station keeping: from the estimated pose and velocity to thruster commands."""
+"""Trajectory tracking and station keeping: computes thruster commands from the estimated pose and velocity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from controllers.segments import Reference
 
 Array = NDArray[np.float64]
 
-ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: the inner loop must be faster
+ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: attitude, the inner loop, must be faster
 INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action divided by the natural frequency
 INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: more than any survey current requires
 
@@ -38,8 +38,8 @@ class HullModel(NamedTuple):
 def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
     """Returns the wrench (6,) that sustains a body velocity (3,) in still water against drag and the Munk moment.
 
-    The Munk moment -v x M_A v turns a hull broadside. At survey speed it exceeds the righting moment in
-    pitch of the BlueROV2.
+    The Munk moment -v x M_A v (v body velocity, M_A added mass) turns a hull broadside to the flow. At survey speed it
+    exceeds the righting moment of the BlueROV2 in pitch.
     """
     u, v, w = velocity
     x, y, z = hull.added_mass
@@ -48,7 +48,7 @@ def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
 
 
 class Gains(NamedTuple):
-    """Proportional, derivative and integral gain of the pose error, each (6,) [1/s2, 1/s, 1/s3]."""
+    """Proportional, derivative and integral gains of the pose controller, each (6,) [1/s2, 1/s, 1/s3]."""
 
     proportional: Array
     derivative: Array
@@ -56,14 +56,17 @@ class Gains(NamedTuple):
 
 
 def pole_placement_gains(natural_frequency_radps: float) -> Gains:
-    """Returns the gains that give a free mass the poles (s + w)^2 (s + a), a = INTEGRAL_BANDWIDTH w, on each axis."""
+    """Returns the gains that give a free mass on each axis the characteristic polynomial (s + w)^2 (s + a).
+
+    w is the natural frequency, ATTITUDE_BANDWIDTH times greater for rotation, and a = INTEGRAL_BANDWIDTH w.
+    """
     w = natural_frequency_radps * np.array([ATTITUDE_BANDWIDTH] * 3 + [1.0] * 3)
     a = INTEGRAL_BANDWIDTH * w
     return Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w**2)
 
 
 def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Converts the reference of the camera to the reference of the level body that carries it.
+    """Converts the reference of the camera to the reference of the level body that carries the camera.
 
     Args:
         camera: reference of the camera.
@@ -81,18 +84,18 @@ def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
-    """Returns the velocity command (3,) [m/s]: reference velocity plus w times the position error.
+    """Returns the velocity command (3,) [m/s]: reference velocity plus w (reference position - position).
 
     Args:
         position: (3,) estimated position [m].
-        reference: reference of the point whose position is given.
+        reference: reference of the same point.
         natural_frequency_radps: natural frequency w of the closed loop.
     """
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
 class ControllerState(NamedTuple):
-    """Parameters and integral of the pose controller; `integral` is modified in place.
+    """Parameters and integral action of the pose controller; `integral` is modified in place.
 
     Args:
         hull: hull model.
@@ -151,7 +154,10 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
 
 @njit(cache=True, nogil=True)
 def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, integral):
-    """Returns the wrench [moment, force] in the body (6,) and the error [rotation in body, position in world] (6,)."""
+    """Returns the wrench (6,) [moment, force] in the body, and the pose error (6,) that is integrated.
+
+    The error is [rotation in the body, position in the world] [rad, m].
+    """
     error = _pose_error(pose, position, yaw)
     velocity_body = _rotate_to_body(pose, velocity)
     feedforward = _rotate_to_body(pose, integral[3:] + acceleration)
@@ -168,7 +174,7 @@ def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, int
 
 @njit(cache=True, nogil=True)
 def _integrate(integral, gain, error, saturated):
-    """Updates the integral in place within its limits; while thrusters saturate, it can only shrink (anti-windup)."""
+    """Updates the integral in place within INTEGRAL_LIMIT; while a thruster saturates, it cannot grow (anti-windup)."""
     for k in range(6):
         updated = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
         if not (saturated and abs(updated) > abs(integral[k])):
@@ -187,7 +193,7 @@ def _rotate_to_body(pose, vector):
 
 @njit(cache=True, nogil=True)
 def _pose_error(pose, position, yaw):
-    """Returns the error (6,) from the pose to a level reference, [rotation, translation] in the body [rad, m]."""
+    """Returns the motion (6,) from the pose to a level reference, [rotation, translation] in the body [rad, m]."""
     c, s = np.cos(yaw), np.sin(yaw)
     # columns of body_from_reference
     x, y = _rotate_to_body(pose, np.array([c, s, 0.0])), _rotate_to_body(pose, np.array([-s, c, 0.0]))

@@ -44,7 +44,7 @@ class VehicleParameters:
     """Rigid body, hydrodynamics and thrusters of a vehicle; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
 
     Args:
-        mass_kg, displaced_volume_m3: dry mass, and volume of displaced water.
+        mass_kg, displaced_volume_m3: dry mass, and volume of the displaced water.
         inertia_kgm2: (3,) principal moments of inertia about the centre of gravity, along the body axes.
         centre_of_buoyancy_m: (3,) position of the centre of buoyancy relative to the centre of gravity, in the body.
         added_mass: (6,) diagonal of the added mass matrix M_A [kg, kg m2].

@@ -41,10 +41,10 @@ class SceneModel:
     """Compiled MuJoCo model and the ids of its parts.
 
     Args:
-        model: MuJoCo model, without any MjData.
-        terrain: the terrain that the floor was built from.
+        model: compiled model; its users create their own MjData.
+        terrain: the terrain from which the floor was built.
         tile_geom_ids: (n,) geom ids of the floor tiles.
-        tile_low_m, tile_high_m: (n, 3) lowest and highest corners of the tiles' bounding boxes in the world.
+        tile_low_m, tile_high_m: (n, 3) minimum and maximum corners of the tiles' bounding boxes in the world.
         body_id: id of the vehicle's body; its free joint is qpos[0:7] (position, quaternion wxyz) and qvel[0:6].
         camera_ids: ids of the left and the right camera.
         thruster_site_ids: (8,) site ids in the order of `VehicleParameters`; thrust acts along the z axis of a site.
@@ -99,13 +99,13 @@ def build(
 
 
 def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -> MjSpec:
-    """Returns a model specification without bodies, lights or multisampling."""
+    """Returns a model specification without bodies; lights, shadows and multisampling are off."""
     spec = mujoco.MjSpec()
     spec.modelname = "seabed"
     spec.option.timestep = timestep_s
     spec.stat.extent = 1.0  # MuJoCo multiplies the clipping distances by the extent
     spec.visual.headlight.active = 0
-    spec.visual.quality.offsamples = 0  # multisampling would shift depth by a fraction of a pixel
+    spec.visual.quality.offsamples = 0  # with multisampling, depth would be displaced by a fraction of a pixel
     spec.visual.quality.shadowsize = 0
     spec.visual.global_.offwidth, spec.visual.global_.offheight = image_width_px, image_height_px
     return spec
@@ -127,7 +127,7 @@ def _add_vehicle(spec: MjSpec, vehicle: VehicleParameters) -> MjsBody:
 
 
 def _add_hull(body: MjsBody, vehicle: VehicleParameters) -> None:
-    """Adds float and frame as two boxes, blue above black; they are massless because the body has its own inertia."""
+    """Adds a blue box (float) above a black box (frame); both are massless, as the body defines mass and inertia."""
     length, width, height = vehicle.size_m / 2
     common = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
     body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **common)

@@ -1,7 +1,7 @@
 """Seafloor as textured mesh tiles in a MuJoCo model, so that only the tiles in view have to be rendered.
 
-A tile is a mesh and not a height field: MuJoCo renders it twice as fast (shared vertices), maps its texture exactly
-(explicit texture coordinates) and adds no side walls.
+The tiles are meshes instead of MuJoCo height fields: a mesh is rendered twice as fast because triangles share vertices,
+its texture is mapped exactly by explicit texture coordinates, and it has no side walls.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from twin.core.grid_triangles import grid_triangles
 
 TILE_CELLS = 48  #: side of a tile; smaller tiles need more OpenGL state changes, larger ones more vertices out of view
 MAX_TILES = 900  #: MuJoCo supports at most 1000 textures
-MARGIN_TEXELS = 16  #: margin of neighbouring texture around each tile: enough to filter 4 mip-map levels
+MARGIN_TEXELS = 16  #: margin of the neighbouring tiles' texture around each tile: enough for 4 mip-map levels
 FLOOR_GROUP = 0
 
 
 class Tile(NamedTuple):
-    """One tile of the floor: geom name, lowest and highest corner (3,) of its bounding box in the world [m]."""
+    """One tile of the floor: geom name, minimum and maximum corner (3,) of its bounding box in the world [m]."""
 
     name: str
     low_m: NDArray[np.float64]
@@ -43,7 +43,7 @@ def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
 
 
 def tile_cells(n_rows: int, n_cols: int) -> int:
-    """Returns the number of cells along a tile's side: TILE_CELLS, or more if that would give over MAX_TILES tiles."""
+    """Returns the number of cells along a tile's side: TILE_CELLS, or more to stay within MAX_TILES tiles."""
     cells = TILE_CELLS
     while -(-n_rows // cells) * -(-n_cols // cells) > MAX_TILES:
         cells += 16
@@ -57,7 +57,7 @@ def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
     image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)
     image.height, image.width = texture.shape[:2]
     image.data = texture.tobytes()
-    # emission only: without a light in the scene the rendered colour is the texture's
+    # Emission only: the scene has no light, so the rendered colour is the colour of the texture.
     material = spec.add_material(name=name, emission=1.0, specular=0.0, shininess=0.0, reflectance=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     vertices = _add_mesh(spec, name, terrain, rows, cols, texcoord)
@@ -86,7 +86,7 @@ def _add_mesh(
     mesh.uservert = vertices.ravel()
     mesh.userface = _faces(*heights.shape).ravel()
     mesh.usertexcoord = texcoord.ravel()
-    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit: equal normals let the driver share vertices
+    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit; with equal normals the driver shares vertices
     return vertices
 
 
@@ -99,12 +99,12 @@ def _faces(n_rows: int, n_cols: int) -> NDArray[np.int32]:
 def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Returns the texture of a tile with margins, and the texture coordinates of its nodes.
 
-    The margins repeat the texture of the neighbouring tiles: filtering reads the same texels on both sides of a border,
-    so no seam is visible. The cutout starts and ends at multiples of 16 texels, which aligns the mip-map levels of
-    adjacent tiles.
+    The margins repeat the texture of the neighbouring tiles. Filtering therefore reads the same texels on both sides of
+    a border, and no seam is visible. The tile's texture starts and ends at multiples of 16 texels of the terrain's
+    texture, which aligns the mip-map levels of adjacent tiles.
 
     Returns:
-        (h, w, 3) uint8 texture; (nodes, 2) texture coordinates, 0 to 1, from the cutout's north-west corner.
+        (h, w, 3) uint8 texture; (nodes, 2) texture coordinates, 0 to 1, from the north-west corner of this texture.
     """
     ny, nx = terrain.height_m.shape
     h, w = terrain.texture.shape[:2]
@@ -120,6 +120,6 @@ def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[n
 
 
 def _aligned(low: float, high: float) -> tuple[int, int]:
-    """Returns the interval, rounded outwards to multiples of MARGIN_TEXELS and extended by one margin on each side."""
+    """Returns the interval [low, high] rounded outwards to multiples of MARGIN_TEXELS, plus one margin on each side."""
     step = MARGIN_TEXELS
     return int(np.floor(low / step) - 1) * step, int(np.ceil(high / step) + 1) * step

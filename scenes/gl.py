@@ -1,6 +1,6 @@
 """MuJoCo, configured for offscreen rendering. All modules import it from here: ``from scenes.gl import mujoco``.
 
-MuJoCo imports PyOpenGL when it is imported itself, so the OpenGL backend must be chosen before that.
+MuJoCo imports PyOpenGL, so the OpenGL backend must be chosen before MuJoCo is imported.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ INSTALL_LINE = "apt-get install -y libegl1 libgl1 libgl1-mesa-dri"
 def _configure_egl() -> str:
     """Selects EGL unless MUJOCO_GL is set, and patches old PyOpenGL versions.
 
-    PyOpenGL 3.1.0, which pyrender pins, lacks the type EGLDeviceEXT that MuJoCo needs; it is an opaque pointer.
+    MuJoCo needs the type EGLDeviceEXT, an opaque pointer. PyOpenGL 3.1.0, which pyrender pins, lacks this type.
 
     Returns:
-        Reason why EGL cannot be loaded; "" if it can, or if another backend is selected.
+        Reason why EGL cannot be loaded; "" if EGL was loaded or another backend is selected.
     """
     if sys.platform != "linux" or os.environ.setdefault("MUJOCO_GL", "egl").strip().lower() != "egl":
         return ""
@@ -40,7 +40,7 @@ _egl_error = _configure_egl()
 
 import mujoco as _mujoco  # noqa: E402
 
-mujoco: Any = _mujoco  #: typed as Any: its names come from compiled modules, which type checkers cannot read
+mujoco: Any = _mujoco  #: Any: type checkers cannot read the compiled modules of MuJoCo
 #: Type aliases for signatures: compiled model, model specification, body of a specification, renderable scene.
 MjModel: TypeAlias = Any
 MjSpec: TypeAlias = Any
@@ -58,7 +58,7 @@ def offscreen_context(width_px: int, height_px: int) -> Any:
         raise _opengl_missing(_egl_error)
     try:
         if os.environ.get("MUJOCO_GL", "").strip().lower() == "egl":
-            from mujoco.egl import GLContext  # also correct if mujoco was imported before this module
+            from mujoco.egl import GLContext  # works even if mujoco was imported before this module
         else:
             GLContext = mujoco.GLContext
         context = GLContext(width_px, height_px)

@@ -14,7 +14,7 @@ from terrains.textures import generate_texture
 from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
-MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: greatest slope of generated reefs, exceeded by at most one cell in 200
+MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: rise over run that at most one node in 200 of a reef exceeds
 
 
 def generate(
@@ -28,7 +28,7 @@ def generate(
 ) -> Terrain:
     """Generates a terrain centred at the origin, with heights from base_m to base_m + relief_m.
 
-    The kind "flat" has the height base_m everywhere.
+    A terrain of kind "flat" has the height base_m everywhere.
 
     Args:
         kind: a key of KINDS.
@@ -37,7 +37,7 @@ def generate(
         base_m: least height.
         grid_m: distance between grid nodes.
         texture_px_m: side of a texel.
-        seed: seed of shape and texture.
+        seed: seed of the heights and the texture.
     Raises:
         TwinError: the kind is unknown, or the terrain is too large for memory.
     """
@@ -66,7 +66,7 @@ def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
 
 
 def _ripples(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates asymmetric ripples with meandering crests and heights up to 0.1 wavelength, on broad undulations."""
+    """Generates asymmetric ripples with meandering crests, up to 0.1 wavelength high, on broad undulations."""
     length_m = max(0.35, 8 * grid_m)
     crest_m = min(0.1 * length_m, 0.6 * relief_m)
     row, col = np.indices(shape, dtype=np.float32)
@@ -85,7 +85,7 @@ def _fractal(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
 
 
 def _reef(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates a reef: a rough base with ledges and coral heads (bommies), slopes up to about 60 deg."""
+    """Generates a reef: rough ground with ledges and coral heads (bommies), and slopes up to about 60 deg."""
     base = 0.14 * relief_m * fractal_field(shape, 4.0 / grid_m, 0.5, rng)
     ledge_m = 0.25 * relief_m
     height = base + 0.6 * ledge_m * _staircase(base / ledge_m)
@@ -95,14 +95,18 @@ def _reef(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
 
 
 def _staircase(level: Heights) -> Heights:
-    """Returns terraces: levels rounded down to integers, with smooth transitions between them."""
+    """Returns terraces: levels rounded to the nearest integer, with smooth transitions halfway between integers."""
     step = np.floor(level)
     t = np.clip((level - step - 0.35) / 0.3, 0, 1)
     return (step + t * t * (3 - 2 * t)).astype(np.float32)
 
 
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates domes with steep, lobed flanks, radius 0.25 to 0.9 m, one per 3 square metres; -relief_m elsewhere."""
+    """Generates domes with steep, lobed flanks.
+
+    The domes are 0.25 to 0.9 m in radius, one per 3 square metres (at least three). Between them the height is
+    -relief_m.
+    """
     result = np.full(shape, -relief_m, np.float32)
     ny, nx = shape
     lobes = fractal_field(shape, 0.5 / grid_m, 0.6, rng)
@@ -123,7 +127,10 @@ def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
 
 
 def _limit_slope(height: Heights, relief_m: float, grid_m: float) -> Heights:
-    """Smooths the floor until, at the given relief, the 99.5th percentile of its slope is at most MAX_SLOPE."""
+    """Smooths the heights until the 99.5th percentile of the slope is at most MAX_SLOPE; 12 times at most.
+
+    The slope is that of the floor scaled to the relief `relief_m`.
+    """
     sigma_px = 0.5
     for _ in range(12):
         north, east = np.gradient(scale_to_relief(height, relief_m, 0.0), grid_m)

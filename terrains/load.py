@@ -29,16 +29,16 @@ def load(
     height_range_m: float,
     seed: int | np.random.SeedSequence,
 ) -> Terrain:
-    """Reads a terrain, centres it at the origin, moves its lowest point to z = 0 and fills its holes.
+    """Reads a terrain, fills its holes, centres it at the origin and moves its lowest point to z = 0.
 
     Args:
-        height_file: heights, row 0 = north. A height belongs to the centre of its cell, so the terrain is one cell
-            smaller than the raster.
+        height_file: heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain is one
+            cell smaller than the raster in both directions.
         texture_file: image that is repeated as tiles; None: the texture is generated.
-        texture_px_m: side of a texel, and of a pixel of the image.
+        texture_px_m: side of a texel, and of a pixel of the texture image on the floor.
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.
-        seed: seed of a generated texture.
+        seed: seed of the texture if it is generated.
     Raises:
         TwinError: a file is missing or invalid.
     """
@@ -57,7 +57,7 @@ def load(
 
 
 def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> tuple[NDArray[np.float64], float]:
-    """Reads a height file; returns heights (ny, nx) [m], row 0 = north, NaN in holes, and the grid spacing [m].
+    """Returns the heights (ny, nx) of a file [m], row 0 = north, NaN in holes, and their grid spacing [m].
 
     Args:
         file: GeoTIFF, 16-bit PNG or .npy.
@@ -82,7 +82,7 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
 
 
 def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Replaces every NaN by the nearest height; returns the heights and the number of replaced values."""
+    """Replaces NaN and infinite values by the nearest height; returns the heights and the number of replaced values."""
     holes = ~np.isfinite(height_m)
     if not holes.any():
         return height_m, 0
@@ -94,7 +94,7 @@ def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]
 
 
 def _read_tiff(file: Path, height_spacing_m: float) -> tuple[NDArray[np.float64], float]:
-    """Reads the heights of a GeoTIFF, NaN where it has no data, and their spacing [m]."""
+    """Returns the heights of a GeoTIFF, NaN where it has no data, and their grid spacing [m]."""
     import rasterio  # imported here: it takes 20 MB, and most terrains do not need it
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
@@ -112,7 +112,11 @@ def _read_tiff(file: Path, height_spacing_m: float) -> tuple[NDArray[np.float64]
 
 
 def _spacing(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> float:
-    """Returns the grid spacing of a GeoTIFF [m]; the grid must be projected or local, north up, with square cells."""
+    """Returns the grid spacing of a GeoTIFF [m].
+
+    Raises:
+        TwinError: the grid is in degrees, is not north up, or its cells are not square.
+    """
     t = source.transform
     if t.is_identity:
         return height_spacing_m
@@ -149,7 +153,7 @@ def _read_npy(file: Path) -> NDArray[np.float64]:
 
 
 def _check(height_m: NDArray[np.float64], file: Path) -> None:
-    """Raises TwinError if the heights are fewer than 2 x 2 or all NaN."""
+    """Raises TwinError if there are fewer than 2 x 2 heights, or none is finite."""
     rows, cols = height_m.shape
     if rows < 2 or cols < 2:
         raise TwinError(FIELD, f"{file.name!r} has {rows} row(s) and {cols} column(s)", "at least 2 x 2 heights")

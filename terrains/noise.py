@@ -1,4 +1,4 @@
-"""Random fields with detail at every scale: sums of octaves of noise."""
+"""Random fields with detail at every scale, as sums of octaves of noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def fractal_field(
 
     Args:
         shape: (rows, cols) of the field.
-        coarsest_px: wavelength of the coarsest octave [cells].
+        coarsest_px: wavelength of the coarsest octave [cells], at least 2.
         gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
         rng: random generator.
     Returns:
@@ -31,7 +31,7 @@ def fractal_field(
 
 
 def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: float) -> NDArray[np.float32]:
-    """Upsamples noise so that each of its cells covers scale_px cells, by cubic interpolation."""
+    """Upsamples noise by the factor scale_px with cubic interpolation; returns a field of the given shape."""
     affine = np.array([[1 / scale_px, 0, 1], [0, 1 / scale_px, 1]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     upsampled = cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
@@ -39,14 +39,15 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 
 
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Generates 8-bit pink noise: equal contrast in every octave, so that images have texture at any range.
+    """Generates 8-bit pink noise.
 
-    Starting with the coarsest octave, the field is repeatedly doubled in size and the next octave is added. The total
-    cost is 4/3 of that of the finest octave.
+    Every octave has the same contrast, so images of the floor show texture at any distance. Starting with the coarsest
+    octave, the field is repeatedly doubled in size and the next octave is added. The total cost is 4/3 of the cost of
+    the finest octave.
 
     Args:
         shape: (rows, cols) of the result.
-        octaves: number of octaves; the cells of the finest are single texels.
+        octaves: number of octaves; the finest one has one random value per cell of the result.
         contrast: standard deviation of one octave [grey levels].
         rng: random generator.
     Returns:

@@ -19,12 +19,13 @@ class Terrain:
     """Seafloor over a rectangle whose south-west corner is (west_m, south_m); x east, y north, z up [m].
 
     Args:
-        height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west, outer nodes on the edge.
+        height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west. The outermost nodes lie on
+            the edges of the rectangle.
         spacing_m: distance between neighbouring nodes along x and y.
         west_m, south_m: position of node (0, 0).
-        texture: (h, w, 3) uint8 RGB albedo that covers exactly the extent; row 0 = NORTH.
+        texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
         texture_px_m: side of a texel.
-        n_filled: number of nodes without a height in the source, filled by their nearest neighbour.
+        n_filled: number of nodes without a height in the source, filled with the nearest height.
     """
 
     height_m: NDArray[np.float32]
@@ -65,7 +66,7 @@ class Terrain:
         """Returns the height of the floor at points (x, y) [m]; NaN outside the terrain.
 
         The height is linear on the two triangles of each cell, split along the diagonal from node (r, c) to
-        (r + 1, c + 1). This is the same surface that is rendered and that rays intersect.
+        (r + 1, c + 1). Rendering and ray intersection use the same surface.
 
         Args:
             x_m, y_m: coordinates of any shape, the same for both.

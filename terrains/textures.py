@@ -34,8 +34,8 @@ def generate_texture(
 ) -> NDArray[np.uint8]:
     """Generates the texture of a height grid.
 
-    A palette of four materials with 64 tones each is indexed by material (from height and slope, plus noise) and by
-    tone (pink noise down to single texels).
+    The palette has four materials with 64 tones each. Height, slope and noise determine the material of a texel; pink
+    noise down to single texels determines its tone.
 
     Args:
         kind: kind of floor, a key of MATERIALS.
@@ -58,7 +58,7 @@ def generate_texture(
 def _material_level(
     height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the material level (rows, cols), 0 (low, flat) to 255 (high, steep), patchy at scales up to 1 m."""
+    """Returns the material level (rows, cols), 0 (low, flat) to 255 (high, steep), with patches up to 1 m in size."""
     north_up = np.ascontiguousarray(height_m[::-1])
     relief_m = max(float(np.ptp(north_up)), 1e-6)
     spacing_px = shape[1] / (height_m.shape[1] - 1)
@@ -103,7 +103,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
 def tile_image(
     image: NDArray[np.uint8], image_px_m: float, shape: tuple[int, int], extent_m: tuple[float, float]
 ) -> NDArray[np.uint8]:
-    """Repeats an image from the north-west corner, with nearest-neighbour sampling.
+    """Returns a texture of repeated copies of an image from the north-west corner, sampled at the nearest pixel.
 
     Args:
         image: (h, w, 3) image.
@@ -119,6 +119,13 @@ def tile_image(
 
 
 def _tiled_index(n: int, extent_m: float, image_px_m: float, period: int) -> NDArray[np.int64]:
-    """Returns the image row or column (n,) at each texel centre along one axis."""
+    """Returns the image row or column (n,) at each of n texel centres along one axis.
+
+    Args:
+        n: number of texels.
+        extent_m: extent of the texture.
+        image_px_m: side of an image pixel on the floor.
+        period: rows or columns of the image.
+    """
     centres_m = (np.arange(n) + 0.5) * (extent_m / n)
     return np.floor(centres_m / image_px_m).astype(np.int64) % period

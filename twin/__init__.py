@@ -1,4 +1,4 @@
-"""Simulation-first digital twin of an underwater stereo survey."""
+"""Digital twin of an underwater stereo survey: simulation, estimators, and evaluation against the truth."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ if TYPE_CHECKING:
 
 __all__ = ["load_scenario", "run"]
 
-# OpenBLAS reads this when numpy is imported. Threads slow down small matrices: with two threads, the final alignment
-# of 25 tracks takes more than twice as long.
+# OpenBLAS reads this variable when numpy is imported. Multithreading slows down operations on small matrices: with two
+# threads, the final alignment of 25 tracks takes more than twice as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario.
+    """Reads and validates a scenario.
 
     Args:
-        path: a TOML file, or a name in scenes/.
+        path: a TOML file, or the name of a scenario in scenes/.
         overrides: strings `key=value` that replace values of the file, for example `plan.tracks=2`.
 
     Raises:
-        ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
+        ScenarioError: the scenario is invalid; the message lists every error as
+            `FILE:LINE: key: problem (allowed: ...)`.
     """
     from twin.scenario.file import load_scenario
 
@@ -38,10 +39,10 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
 
     Args:
         scenario: the survey, from `load_scenario`.
-        out: folder to write.
+        out: run folder to write.
 
     Returns:
-        Status and metrics of the survey.
+        Status, metrics and run folder of the survey.
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.

@@ -1,4 +1,4 @@
-"""Entry point of `python -m twin`, which runs the command line `twin`."""
+"""Entry point of `python -m twin`, which is equivalent to the command `twin`."""
 
 from twin.cli import main
 

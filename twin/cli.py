@@ -1,6 +1,7 @@
-"""Command line `twin`: reads arguments and calls the function of each command.
+"""Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 the survey failed or missed a requirement; 2 bad usage or scenario; 130 interrupted.
+Exit status: 0 success; 1 the survey failed or missed a requirement; 2 invalid input or missing system library;
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics
 
 
 def main() -> None:
-    """Runs the command line; a TwinError is printed and ends it with exit status 2."""
+    """Runs the command line; prints a TwinError and exits with status 2 if one is raised."""
     try:
         app()
     except TwinError as error:
@@ -91,7 +92,7 @@ def main() -> None:
 
 @app.command()
 def demo(out: OutOption = None) -> None:
-    """Run a small complete survey (under 2 minutes) and print its errors."""
+    """Run a small complete survey (under 2 minutes) and print its key figures."""
     result = _run_survey("quickstart", [], out, live=False)
     console.print_metrics(result.metrics)
     console.print_outputs(result.folder)
@@ -123,7 +124,7 @@ def plan(
     overrides: SetOption = [],  # noqa: B006 (typer copies it)
     out: PictureOption = None,
 ) -> None:
-    """Print the numbers of a survey plan and draw it, without simulation."""
+    """Print the predicted properties of a survey plan and draw the plan, without simulation."""
     from twin.app import plan as planning
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
@@ -141,7 +142,7 @@ def look(
     out: SheetOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Render the stereo pair at one position, with the layers of light and the image quality, as one sheet."""
+    """Render the stereo pair at one position, draw its light components as one sheet, and print the image quality."""
     from twin.app import look as viewing
     from twin.app import look_sheet
     from twin.scenario.file import load_scenario

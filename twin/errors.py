@@ -18,7 +18,7 @@ class TwinError(Exception):
 
 
 class ScenarioError(TwinError):
-    """All errors of one scenario together, one line each with file and line number."""
+    """All errors of one scenario; the message has one line per error, with file and line number."""
 
     def __init__(self, lines: list[str]):
         self.lines = lines

@@ -26,13 +26,13 @@ def run(
     live: bool = False,
     outputs: Collection[str] | None = PICTURES,
 ) -> RunResult:
-    """Flies a scenario and writes a run folder; an aborted survey keeps its partial results.
+    """Flies a scenario and writes a run folder; if the survey is aborted, the folder contains its partial results.
 
     Args:
         out: run folder.
         progress: function called with the progress after every frame.
         live: whether to show the survey in Rerun while it runs.
-        outputs: outputs to write at the end ("report", "recording"); None: metrics only.
+        outputs: what to produce at the end, "report" or "recording" or both; None: write the metrics only.
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
@@ -54,10 +54,13 @@ def run(
 
 
 def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[[Estimate, Frame], None]) -> None:
-    """Runs the closed loop: the pilot steers by the estimates, and its commands move the true vehicle.
+    """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the true vehicle.
 
     Args:
-        observe: function called with every estimate and its frame.
+        mission: the survey to fly.
+        world: executes the commands and returns the frames.
+        navigator: estimates the pose from the frames.
+        observe: called with the estimate and its frame after every update of the navigator.
     """
     pilot = make_pilot(mission)
     fast_forward = world.fast_forward(navigator, pilot)

@@ -1,1 +1,1 @@
-"""User-facing parts of the command line: terminal output, machine check, survey plan, camera view."""
+"""Implementation of commands of `twin`: terminal output, machine check, survey plan, camera view, studies, fit."""

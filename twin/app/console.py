@@ -36,7 +36,10 @@ def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
 
 
 def progress_note(now: SurveyProgress) -> str:
-    """Returns simulated time, real-time factor and position uncertainty as text; after the flight, the wall time."""
+    """Returns the progress of a survey as text.
+
+    The text gives simulated time, real-time factor and position uncertainty; after the flight, only the wall time.
+    """
     if not now.simulated_s:
         return f"{now.wall_s:.0f} s"
     factor = now.simulated_s / max(now.wall_s, 1e-3)
@@ -44,7 +47,7 @@ def progress_note(now: SurveyProgress) -> str:
 
 
 def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
-    """Prints a table on stdout; 120 columns wide if stdout is not a terminal, so that rows are not wrapped."""
+    """Prints a table on stdout, 120 characters wide if stdout is not a terminal, to avoid wrapped rows."""
     console = Console(width=None if sys.stdout.isatty() else 120)
     grid = Table(title=title, title_justify="left", show_header=False)
     for row in rows:
@@ -53,7 +56,7 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """Prints the key figures of a survey and its requirements."""
+    """Prints the key figures of a survey and whether it meets each requirement."""
     from twin.report.wording import key_figures, plain
 
     print_table(
@@ -68,7 +71,7 @@ def print_metrics(metrics: dict[str, Any]) -> None:
 
 
 def print_outputs(folder: Path) -> None:
-    """Prints where the report and the recording of a run are, if they exist."""
+    """Prints the path of a run's report and the command that opens its recording, each only if the file exists."""
     if (folder / "report.html").is_file():
         print(f"Report: {folder / 'report.html'}")
     if (folder / "run.rrd").is_file():

@@ -1,6 +1,7 @@
-"""Checks of this machine: Python, packages, rendering and disk, each with the command that fixes a failure.
+"""Checks of this machine (Python, packages, rendering, disk space), each with a remedy if it fails.
 
-`python -m twin.app.doctor` renders one image. It runs in a separate process because a broken driver can crash it.
+`python -m twin.app.doctor` renders a test image. `check_rendering` runs this command in a separate process, because a
+faulty graphics driver can crash the process that renders.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def check_machine(folder: Path) -> list[Check]:
 
 
 def check_rendering() -> Check:
-    """Checks whether OpenGL renders an image without a screen."""
+    """Returns whether OpenGL can render an image without a display."""
     try:
         command = [sys.executable, "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)
@@ -98,7 +99,7 @@ def render_test_image() -> str:
     """Renders a white sphere and checks that the image is not black.
 
     Returns:
-        The name of the OpenGL renderer and of the back end.
+        The name of the OpenGL renderer and the value of MUJOCO_GL.
 
     Raises:
         TwinError: OpenGL is missing.
@@ -125,7 +126,7 @@ def render_test_image() -> str:
 def _probe() -> int:
     try:
         print(render_test_image())
-    except Exception as error:  # the parent process reports it, whatever it is
+    except Exception as error:  # the parent process reports every kind of failure
         print(getattr(error, "problem", error), file=sys.stderr)
         return 1
     return 0

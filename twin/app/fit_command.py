@@ -17,12 +17,12 @@ DEFAULT_STUDIES = ("fit_reef", "fit_sun", "fit_paper")
 
 
 def run(files: Sequence[str], out: Path, runs: Path) -> int:
-    """Flies the rendered surveys of the studies, fits the error model to them and writes it.
+    """Runs the rendered surveys of the studies, fits the error model to their statistics and writes the model.
 
     Args:
-        files: study files; the built-in studies if empty.
-        out: error model to write (TOML).
-        runs: folder of the rendered surveys; finished ones are reused.
+        files: study files; if empty, `DEFAULT_STUDIES`.
+        out: TOML file to which the error model is written.
+        runs: folder of the rendered surveys; finished surveys are reused.
 
     Returns:
         The exit status.

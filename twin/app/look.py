@@ -1,4 +1,4 @@
-"""Stereo pair at one position without a survey, with the layers of light and the quality of the left image."""
+"""Rendering of a single stereo pair without a survey, with light components and quality of the left image."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from twin.world.rendered_world import RenderedWorld
 
 #: Side of the window in which contrast is computed, as a fraction of the image width.
 WINDOW_SHARE = 1 / 20
-#: A channel is saturated at this value or above [grey levels, 0 to 255].
+#: Grey level at which a channel of a pixel is saturated.
 SATURATED = 255
 
 _LABELS = {
@@ -33,12 +33,12 @@ _LABELS = {
 
 
 class ViewLayers(NamedTuple):
-    """Stereo pair at one pose, and the layers of the left image.
+    """Stereo pair at one pose, with the light components of the left image.
 
     Args:
         world_from_left: (4, 4) pose of the left camera.
         stereo_pair: the stereo pair, with noise.
-        decomposed: the left image without noise, and its components of light.
+        decomposed: the left image without noise, with albedo, depth, exposure and light components.
     """
 
     world_from_left: Array
@@ -47,13 +47,16 @@ class ViewLayers(NamedTuple):
 
 
 def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None) -> ViewLayers:
-    """Renders the stereo pair and its layers, with the cameras looking straight down and the bow to the east.
+    """Renders a stereo pair and the light components of its left image.
+
+    The cameras look straight down and the bow points east.
 
     Args:
-        at_m: position of the left camera in the world [m]; default: above the centre of the survey at its altitude.
+        at_m: position of the left camera in the world [m]; None: above the centre of the survey, at the planned
+            altitude.
 
     Raises:
-        TwinError: a camera or a lamp is outside the terrain, or not above the sea floor.
+        TwinError: a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor.
     """
     position_m = (0.0, 0.0, mission.scenario.plan.altitude_m) if at_m is None else at_m
     world_from_left = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(position_m))
@@ -64,7 +67,7 @@ def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None
 
 
 def parse_position(text: str) -> tuple[float, float, float]:
-    """Returns the position [m] written as X,Y,Z. Raises TwinError if it is not three finite numbers."""
+    """Returns the position (x, y, z) [m] of a text X,Y,Z. Raises TwinError unless it is three finite numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -75,7 +78,7 @@ def parse_position(text: str) -> tuple[float, float, float]:
 
 
 def _check_rig(mission: Mission, world_from_left: Array) -> None:
-    """Raises TwinError unless both cameras and all lamps are inside the terrain and above the sea floor."""
+    """Raises TwinError unless both cameras and all lamps are over the terrain and `NEAR_M` above the sea floor."""
     rig = mission.rig
     world_from_body = world_from_left @ geometry.inverse(rig.body_from_camera)
     cameras = [world_from_left[:3, 3], (world_from_left @ rig.left_from_right)[:3, 3]]
@@ -87,7 +90,7 @@ def _check_rig(mission: Mission, world_from_left: Array) -> None:
 
 
 def _check_above(mission: Mission, field: str, name: str, position: Array, world_from_left: Array) -> None:
-    """Raises TwinError unless the position is inside the terrain and above the sea floor."""
+    """Raises TwinError unless a position (3,) is over the terrain and at least `NEAR_M` above the sea floor."""
     terrain = mission.terrain
     x, y, z = position
     floor_m = float(terrain.height_at(x, y))
@@ -104,14 +107,15 @@ def _check_above(mission: Mission, field: str, name: str, position: Array, world
 
 
 def image_quality(view: ViewLayers) -> dict[str, Any]:
-    """Computes measures of image quality, each for R, G, B.
+    """Computes measures of the quality of the left image.
 
     Returns:
-        Position of the left camera and median range; exposure of a physical sensor; and `gray_level`: mean;
-        `contrast`: median over the image of local standard deviation / local mean, without noise; `veil_share`:
-        backscattered fraction of the light; `saturated_share`: fraction of saturated pixels; `snr`: mean / standard
-        deviation of the noise; `texture_snr`: median local standard deviation / that of the noise, which limits
-        matching. None stands for an undefined value.
+        Position of the left camera in the world [m] and median depth [m]; exposure time [ms] and gain of a physical
+        sensor; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean, as a
+        fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
+        noise. `veil_share`: backscattered fraction of the light. `saturated_share`: fraction of saturated pixels.
+        `snr`: mean / standard deviation of the noise. `texture_snr`: median local standard deviation of the image
+        without noise / standard deviation of the noise; a low value limits matching.
     """
     a = view.decomposed
     signal = a.components.total.astype(np.float64) * a.gain
@@ -135,14 +139,14 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
 
 
 def _exposure(decomposed: DecomposedImage) -> dict[str, float]:
-    """Returns exposure time and analogue gain of a physical sensor; empty without a [sensor] section."""
+    """Returns exposure time [ms] and analogue gain of a physical sensor; empty without a [sensor] section."""
     if decomposed.raw is None:
         return {}
     return {"exposure_ms": 1000 * decomposed.setting.exposure_s, "analogue_gain": decomposed.setting.analogue_gain}
 
 
 def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Returns the values of `image_quality` as the rows of a table: label, red, green, blue."""
+    """Returns the R, G, B values of `image_quality` as the rows of a table: label, red, green, blue."""
     percent_of = {"gray_level", "veil_share", "saturated_share"}
     rows = [
         (label, *(DASH if v is None else percent(v) if name in percent_of else f"{v:.3g}" for v in quality[name]))

@@ -1,4 +1,4 @@
-"""Contact sheet of `twin look`: the stereo pair and the layers of the left image, each with unit and value range."""
+"""Contact sheet of `twin look`: stereo pair and light components of the left image, with units and value ranges."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from twin.report.wording import DASH
 from twin.scenario.model import Scenario
 
 PANEL_IN = 3.5
-#: Percentile of a layer that is shown as white.
+#: Percentile of a light component that is displayed as white.
 SHOWN_PERCENTILE = 99.5
 _SHADOW = {"facecolor": "#00000088", "edgecolor": "none", "pad": 2.0}
 
 
 class Panel(NamedTuple):
-    """One picture of the sheet.
+    """One panel of the contact sheet.
 
     Args:
-        title: name of the layer.
+        title: name of the displayed quantity.
         unit: unit of the values.
         values: values whose minimum, median and maximum are printed; NaN is ignored.
         picture: (H, W, 3) colours from 0 to 1, or (H, W) values for the colour map.
         note: text in the corner of the picture.
-        colours: name of the colour map, and the values at its ends.
+        colours: name of the colour map, and the values at its lower and upper end.
     """
 
     title: str
@@ -45,7 +45,7 @@ class Panel(NamedTuple):
 
 
 def draw(scenario: Scenario, view: ViewLayers, file: Path) -> Path:
-    """Writes the sheet as PNG and returns the file."""
+    """Writes the contact sheet as a PNG file and returns the path of the file."""
     panels = _panels(scenario, view)
     columns = 4 if len(panels) <= 8 else 5
     rows = -(-len(panels) // columns)
@@ -104,12 +104,16 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
 def _light(
     title: str, unit: str, layer: NDArray[np.float32], gain: float, percentile: float = SHOWN_PERCENTILE
 ) -> Panel:
-    """Returns the panel of one layer of the image formation, shown in colour.
+    """Returns the panel of one light component in colour.
+
+    A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
+    Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
+    or for gain 0 the value that is displayed as white.
 
     Args:
-        gain: gain of the image. The panel is as bright as in the image, or scaled by the factor in the note.
-            If 0, the layer is not part of the image, and the note gives the value shown as white.
-        percentile: percentile of the layer that is shown as white.
+        layer: (H, W, 3) values of the component.
+        gain: image brightness (fraction of full scale) per unit of the component; 0 if it is no part of the image.
+        percentile: percentile of the values that determines the scale.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:

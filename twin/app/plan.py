@@ -1,4 +1,4 @@
-"""Prediction of a survey from its plan, without simulation: a table of numbers and a picture."""
+"""Properties of a survey predicted from its plan, without simulation: a table and a drawing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
 def numbers(mission: Mission) -> list[tuple[str, str]]:
-    """Returns the numbers of a plan as (name, value) pairs; each comes after the numbers from which it is computed."""
+    """Returns the predicted properties of a survey as text: pairs (name, value with unit)."""
     f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     width_m, height_m = f.footprint_m
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]
@@ -49,7 +49,7 @@ def numbers(mission: Mission) -> list[tuple[str, str]]:
 
 
 def draw(mission: Mission, file: Path) -> Path:
-    """Writes a PNG of the plan from above: sea floor, path, footprint of an image, area. Returns the file."""
+    """Writes a PNG of sea floor, planned path, image footprint and survey area from above; returns its path."""
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(7.5, 6.5))
         axes = figure.add_subplot()
@@ -77,7 +77,7 @@ def _draw_floor(axes: Axes, mission: Mission) -> None:
 
 
 def _draw_path(axes: Axes, mission: Mission) -> None:
-    """Draws the planned path, the footprint of the first image and the area."""
+    """Draws the planned path, the footprint of the first image and the survey area."""
     path = mission.plan.outline()
     axes.plot(path[:, 0], path[:, 1], color=COLOURS["online"], label=f"{LABELS['reference']} path")
     axes.plot(*path[0, :2], "o", color=COLOURS["final"], label="start")

@@ -38,10 +38,10 @@ class StudyOptions(NamedTuple):
 
 @contextmanager
 def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """Yields an engine; stops the workers that it started when the context ends.
+    """Yields an engine that runs surveys in parallel; the workers that it started are stopped when the context ends.
 
     Args:
-        jobs: number of local processes or SLURM jobs; one per core if not given.
+        jobs: number of local processes or SLURM jobs; None: one per core.
         scheduler: None for processes on this machine; "slurm" for SLURM jobs; else the address of a running Dask
             scheduler, e.g. tcp://host:8786, whose workers must have this package installed.
 
@@ -72,7 +72,7 @@ def run(file: str, options: StudyOptions) -> int:
         TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load_study(file)
-    folder = (options.out or Path("runs") / f"study-{study.name}").absolute()  # workers have other working folders
+    folder = (options.out or Path("runs") / f"study-{study.name}").absolute()  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
         result = run_study(study, folder, options.resume, engine, progress)
     for error in result.write_errors:
@@ -86,7 +86,10 @@ def run(file: str, options: StudyOptions) -> int:
 
 
 def tune(file: str, options: StudyOptions) -> int:
-    """Runs the search of a study file and prints the recommended plan; returns the exit status.
+    """Optimises the plan as a study file defines it, and prints the result.
+
+    Returns:
+        The exit status: 130 if interrupted; 1 if no plan is recommended; 0 otherwise.
 
     Raises:
         TwinError: the study file or an option is invalid; no survey was run.
@@ -125,7 +128,11 @@ def _print_result(study: Study, result: StudyResult) -> None:
 
 
 def exit_status(result: StudyResult) -> int:
-    """Returns the exit status: 130 interrupted; 1 too few surveys passed or results were not written; 0 otherwise."""
+    """Returns the exit status of a study.
+
+    130 if interrupted; 1 if too few surveys passed, none could be evaluated, or results could not be written;
+    0 otherwise.
+    """
     if result.interrupted:
         return 130
     analysis = result.analysis

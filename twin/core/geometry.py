@@ -1,7 +1,7 @@
 """Rigid motions: all rotation, quaternion and axis conventions are defined here.
 
 A pose is a 4x4 homogeneous matrix named ``world_from_camera``; in products, adjacent inner names cancel. A small motion
-is a twist ``[rotation, translation]`` (rad, m), applied on the right, ``pose @ exp(motion)``, in the order of GTSAM.
+is a twist ``[rotation, translation]`` (rad, m), ordered as in GTSAM and applied on the right: ``pose @ exp(motion)``.
 
 World: x east, y north, z up. Body: x forward, y left, z up. Camera: x right, y down, z forward. Pixel (0, 0) is the
 centre of the top-left pixel.
@@ -23,8 +23,8 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 def copy_into(target: Array, values: Array) -> None:
     """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
-    Numba's own slice assignment compiles an error message for unequal shapes into every caller, which was a
-    third of all compiled code.
+    Numba's own slice assignment compiles a check for unequal shapes, with its error message, into every caller; these
+    checks were a third of all compiled code.
     """
     for i in range(target.shape[0]):
         if target.ndim == 1:
@@ -52,7 +52,7 @@ def pose(rotation: Array, position: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def inverse(a_from_b: Array) -> Array:
-    """Returns b_from_a (4, 4), with the transposed rotation."""
+    """Returns b_from_a (4, 4). The rotation is inverted by transposition."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(3):
@@ -78,7 +78,7 @@ def compose(a_from_b: Array, b_from_c: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def transform_covariance(matrix: Array, cov: Array) -> Array:
-    """Returns matrix @ cov @ matrix.T (6, 6) of a symmetric cov, symmetric to the last bit."""
+    """Returns matrix @ cov @ matrix.T (6, 6), exactly symmetric, of a matrix (6, 6) and a symmetric cov (6, 6)."""
     half, result = np.empty((6, 6)), np.empty((6, 6))
     for i in range(6):
         for k in range(6):
@@ -109,7 +109,8 @@ def product(a: Array, b: Array) -> Array:
 def nearest_rigid(matrices: Array) -> Array:
     """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    Removes rounding errors from long products of motions: `inverse` doubles an orthogonality error.
+    Removes the rounding errors of long products of motions. `inverse` assumes an orthogonal rotation and would double
+    its deviation from orthogonality.
     """
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
@@ -136,7 +137,7 @@ def _nearest_rigid(matrices):
 def so3_exp(w: Array) -> Array:
     """Returns the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula.
 
-    Near the identity the coefficients are computed by their Taylor series.
+    Near the identity, the coefficients are computed from their Taylor series.
     """
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
@@ -226,10 +227,11 @@ def log(a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def log_derivative(motion: Array) -> Array:
-    """Returns the inverse right Jacobian (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
+    """Returns the inverse right Jacobian J (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
-    For the rotation alone it is I + K / 2 + c K^2 with K = skew(w). A motion is a rotation by the dual vector w + e v,
-    so the lower left block (translation from rotation) is the derivative of that matrix along v (Selig 2005).
+    With motion = [w, v], K = skew(w) and c from `_inverse_jacobian_coefficient`, both diagonal blocks are the inverse
+    right Jacobian of SO(3), I + K / 2 + c K^2. The lower left block (translation from rotation) is the derivative of
+    this matrix with respect to w in the direction v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
     c, slope = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -249,7 +251,7 @@ def log_derivative(motion: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
-    """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and dc/d(a^2), given the squared angle a^2."""
+    """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and dc/d(a^2), given the squared rotation angle a^2 [rad^2]."""
     if angle2 < 1e-2:
         return (
             1 / 12 + angle2 * (1 / 720 + angle2 * (1 / 30240 + angle2 / 1209600)),
@@ -263,7 +265,7 @@ def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
 
 @njit(cache=True, nogil=True)
 def adjoint(a_from_b: Array) -> Array:
-    """Returns the adjoint Ad (6, 6) of a pose: a_from_b exp(m) = exp(Ad m) a_from_b for motions m in b."""
+    """Returns the adjoint Ad (6, 6) of a pose: a_from_b exp(m) = exp(Ad m) a_from_b for a twist m (6,) in frame b."""
     result = np.zeros((6, 6))
     x, y, z = a_from_b[0, 3], a_from_b[1, 3], a_from_b[2, 3]
     for k in range(3):
@@ -276,7 +278,7 @@ def adjoint(a_from_b: Array) -> Array:
 
 
 def transform(a_from_b: Array, points_b: Array) -> Array:
-    """Transforms points (n, 3) from b to a."""
+    """Returns points (n, 3) transformed from frame b to frame a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
@@ -298,7 +300,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 def rpy_from_rotation(rotation: Array) -> Array:
     """Returns roll, pitch, yaw (3,) [rad] of the rotation world_from_body (3, 3), the inverse of `rotation_from_rpy`.
 
-    At a pitch of +-90 deg, where only a combination of roll and yaw is defined, roll is zero.
+    At a pitch of +-90 deg, where only a combination of roll and yaw is defined, roll is set to zero.
     """
     horizontal = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], horizontal)

@@ -22,13 +22,13 @@ def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
 
 
 def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Returns the triangles between the valid cells of a raster, counter-clockwise as seen from above.
+    """Returns the triangles that connect the centres of valid raster cells, counter-clockwise as seen from above.
 
     Args:
         valid: (rows, cols) bool; row 0 is the northernmost.
 
     Returns:
-        (n, 3) numbers of the cells in row-major order.
+        (n, 3) indices of the cells at the corners, in the flattened (row-major) raster.
     """
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])

@@ -13,8 +13,8 @@ _INITIAL_CAPACITY = 2**17
 class GrowingArray:
     """Contiguous array of rows of one shape; its capacity doubles when it is full.
 
-    The initial capacity covers most surveys. Pages that are never written take no memory, so a large buffer is cheaper
-    than the copies of a growing one.
+    The initial capacity is sufficient for most surveys. Memory pages that are never written occupy no RAM, so a large
+    initial buffer costs less than repeated copies of a small one.
 
     Args:
         shape: shape of one row; omitted for scalars.

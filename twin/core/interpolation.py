@@ -11,7 +11,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, inline="always")
 def bilinear(image, row, col, row_fraction, col_fraction):
-    """Returns the bilinear value between pixel (row, col) and the next row and column."""
+    """Returns the image value interpolated bilinearly between pixels (row, col) and (row + 1, col + 1)."""
     top = image[row, col] * (1 - col_fraction) + image[row, col + 1] * col_fraction
     bottom = image[row + 1, col] * (1 - col_fraction) + image[row + 1, col + 1] * col_fraction
     return top * (1 - row_fraction) + bottom * row_fraction
@@ -21,7 +21,7 @@ def bilinear(image, row, col, row_fraction, col_fraction):
 def catmull_rom(a, b, c, e, t):
     """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
 
-    This is cubic convolution with a parameter of -1/2 (Keys 1981).
+    This is cubic convolution with the parameter a = -1/2 of Keys (1981).
     """
     c1 = 0.5 * (c - a)
     c2 = a - 2.5 * b + 2 * c - 0.5 * e
@@ -31,10 +31,11 @@ def catmull_rom(a, b, c, e, t):
 
 @njit(cache=True, nogil=True, inline="always")
 def bicubic_with_gradient(image, x, y):
-    """Returns the Catmull-Rom value of an image at (x, y) and its derivatives with respect to x and y.
+    """Returns the value of an image at column x and row y, and its derivatives with respect to x and y.
 
-    (x, y) lies inside the image; samples beyond the border repeat the border pixel. On an exact row, as in rectified
-    stereo, the derivative with respect to y is the central difference.
+    The interpolation is bicubic (Catmull-Rom). (x, y) must lie inside the image; samples beyond the border repeat the
+    border pixel. If y is an integer, as in rectified stereo, the derivative with respect to y is the central
+    difference.
     """
     height, width = image.shape
     i, j = int(x), int(y)
@@ -53,7 +54,7 @@ def bicubic_with_gradient(image, x, y):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def bspline_weights(s):
-    """Returns the weights of four cubic B-spline coefficients at a fraction s (float32) between the two middle ones."""
+    """Returns the weights of four cubic B-spline coefficients at the fraction s (float32) between the middle two."""
     one, sixth = np.float32(1), np.float32(1 / 6)
     left, right = (one - s) * (one - s) * (one - s) * sixth, s * s * s * sixth
     middle = np.float32(2 / 3) - s * s * (one - s * np.float32(0.5))

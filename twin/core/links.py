@@ -19,10 +19,10 @@ class Link(NamedTuple):
         i, j: keyframe numbers, i < j.
         i_from_j: (4, 4) pose of camera j in camera i.
         cov: (6, 6) covariance of [rotation, translation] (rad, m) in camera j, as used by the alignment.
-        overlap: fraction of image j that is visible in image i (0 to 1).
+        overlap: fraction of the matched points of node j that project into image i (0 to 1).
         n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
-        shared_by: number of links that share the stereo observation of node j. Their errors are correlated, which `cov`
-            accounts for: it is the covariance of the single measurement times this number.
+        shared_by: number of links that share the stereo observation of node j, this link included. Their errors are
+            correlated; to account for this, `cov` is the covariance of the single measurement times this number.
         closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
             exact; None: not computed.
     """
@@ -38,7 +38,7 @@ class Link(NamedTuple):
 
     @property
     def own_cov(self) -> Array:
-        """Returns the covariance (6, 6) of this measurement by itself, without the other links of its node."""
+        """Returns the covariance (6, 6) of the single measurement, without the factor `shared_by`."""
         return self.cov / self.shared_by
 
 
@@ -68,7 +68,7 @@ class Links(Sequence[Link]):
         self._pending += links
 
     def select(self, mask: NDArray[np.bool_]) -> Links:
-        """Returns the links where the mask (n,) is true; this object itself if it is true everywhere."""
+        """Returns the links where the mask (n,) is true; this object itself if the mask is true for all links."""
         if mask.all():
             return self
         selected = Links()
@@ -95,12 +95,12 @@ class Links(Sequence[Link]):
 
     @property
     def i(self) -> NDArray[np.int64]:
-        """Returns the numbers (n,) of the earlier keyframes."""
+        """Returns the number (n,) of the earlier keyframe of each link."""
         return self._table["i"]
 
     @property
     def j(self) -> NDArray[np.int64]:
-        """Returns the numbers (n,) of the later keyframes."""
+        """Returns the number (n,) of the later keyframe of each link."""
         return self._table["j"]
 
     @property
@@ -125,12 +125,12 @@ class Links(Sequence[Link]):
 
     @property
     def n_points(self) -> NDArray[np.int64]:
-        """Returns the numbers (n,) of matched points; 0 for frame-to-frame motion."""
+        """Returns the number (n,) of matched points of each link; 0 for frame-to-frame motion."""
         return self._table["n_points"]
 
     @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
-        """Returns a mask (n,) of the links with a closed-form motion, and these motions (m, 4, 4)."""
+        """Returns a mask (n,) of the links that have a closed-form motion, and these m motions (m, 4, 4)."""
         self._convert_pending()
         motions = [form for form in self._closed_forms if form is not None]
         return np.array([form is not None for form in self._closed_forms], bool), np.array(motions).reshape(-1, 4, 4)
@@ -154,7 +154,7 @@ class Links(Sequence[Link]):
 
 
 def symmetric_inverses(matrices: Array) -> Array:
-    """Returns the inverses (m, d, d) of symmetric matrices (m, d, d), symmetric to the last bit."""
+    """Returns the inverses (m, d, d), exactly symmetric, of symmetric matrices (m, d, d)."""
     inverse = np.asarray(np.linalg.inv(matrices), np.float64)
     inverse = inverse + inverse.transpose(0, 2, 1)
     inverse /= 2

@@ -18,16 +18,17 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class StereoRig:
-    """Believed calibration of a rectified stereo pair: two equal pinhole cameras, the right one at +x of the left one.
+    """Believed calibration of a rectified stereo pair.
 
-    The cameras may look in any direction.
+    Both are pinhole cameras with the same intrinsics and parallel axes; the right camera is displaced along +x of the
+    left one. The pair may look in any direction.
 
     Args:
         width_px, height_px: image size.
         focal_px: focal length along the rows of the image (fx).
         baseline_m: distance between the cameras.
         frame_rate_hz: nominal number of frames per second; the times of the frames take precedence.
-        body_from_camera: (4, 4) pose of the left camera in the vehicle's body.
+        body_from_camera: (4, 4) pose of the left camera in the body frame of the vehicle.
         focal_y_px: focal length along the columns of the image (fy); equal to `focal_px` by default.
         principal_point_px: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
     """
@@ -77,7 +78,7 @@ class StereoRig:
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
-        """Returns the rig of images whose pixels are blocks of `by` x `by` pixels of this rig."""
+        """Returns the calibration of images in which blocks of `by` x `by` pixels are averaged to one pixel."""
         if by == 1:
             return self
         centre = self.principal_point_px
@@ -91,7 +92,7 @@ class StereoRig:
         )
 
     def with_square_pixels(self) -> StereoRig:
-        """Returns the rig of images resampled along their columns so that fy equals fx."""
+        """Returns the calibration of images that are resampled along their columns so that fy equals fx."""
         scale = self.fx_px / self.fy_px
         if scale == 1:
             return self
@@ -100,12 +101,12 @@ class StereoRig:
         return replace(self, height_px=height, focal_y_px=None, principal_point_px=centre)
 
     def project(self, points: Array) -> Array:
-        """Returns the pixels (n, 2) of points (n, 3) in the left camera [m]; NaN behind the camera."""
+        """Returns the projections (n, 2) [px] of points (n, 3) [m] in the left camera; NaN for points behind it."""
         depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
         return points[:, :2] / depth_m * self.focals_px + [self.cx_px, self.cy_px]
 
     def normalised(self, pixels: NDArray[np.floating]) -> Array:
-        """Returns (x, y) = (pixel - principal point) / focal length, (n, 2), of pixels (n, 2)."""
+        """Returns normalised coordinates (n, 2) = (pixel - principal point) / focal length of pixels (n, 2)."""
         return (pixels.astype(np.float64) - [self.cx_px, self.cy_px]) / self.focals_px
 
 
@@ -118,8 +119,8 @@ class SensorNoise:
         attitude_rad: standard deviation of roll and of pitch from the AHRS [rad].
         heading_rad: standard deviation of the heading from the AHRS [rad].
         dvl_mps: standard deviation of the white noise of each axis of the DVL velocity [m/s].
-        dvl_scale: standard deviation of the relative scale error of the DVL, which is constant over a survey (speed of
-            sound, beam angles).
+        dvl_scale: standard deviation of the relative scale error of the DVL, which is constant over a survey (due to
+            errors of speed of sound and beam angles).
         usbl_m: standard deviation of each axis of an acoustic position fix [m].
         beacon_px: standard deviation of column and of row of a beacon in the image [px].
         beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
@@ -170,9 +171,9 @@ class Displacement(NamedTuple):
     """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node.
 
     Args:
-        since: number of that node.
-        displacement_m: (3,) measured displacement [m]: 1 + s times the true one, with the scale error s, which is
-            constant over the survey.
+        since: number of the node.
+        displacement_m: (3,) measured displacement [m]: 1 + s times the true displacement, plus noise. The scale error s
+            is constant over the survey.
         cov: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node,
             without the scale error.
     """
@@ -210,7 +211,7 @@ class Estimate(NamedTuple):
         world_from_camera: (4, 4) pose of the left camera, online.
         f2f_from_start: (4, 4) pose of the left camera from frame-to-frame motion alone.
         camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
-        sigma_m: standard deviation of the online position, the root of the summed variances of x, y and z [m].
+        sigma_m: standard deviation of the online position: root of the sum of the variances of x, y and z [m].
         status: "ok", or the reason why vision failed at this frame.
     """
 
@@ -260,13 +261,13 @@ class Trajectory:
 
 
 class Alignment(NamedTuple):
-    """Size and cost of one global alignment.
+    """Size and wall time of one global alignment.
 
     Args:
         track: last track of the window.
         ms: wall time [ms].
-        nodes, edges: nodes and links of the window.
-        dropped: links rejected as outliers.
+        nodes, edges: number of nodes (including fixed ones) and of links.
+        dropped: number of links rejected as outliers.
     """
 
     track: int
@@ -277,12 +278,12 @@ class Alignment(NamedTuple):
 
 
 class StereoObservation(NamedTuple):
-    """Image quality of one stereo pair, whether it became a keyframe or not.
+    """Image quality of one stereo pair, including pairs that did not become keyframes.
 
     Args:
-        row: row of its frame in the trajectories.
-        n_points: matched points; with the surrogate, the number of points that it represents.
-        contrast: RMS contrast of the left image (`matching.contrast`); None without an image.
+        row: row of the pair's frame in the trajectories.
+        n_points: number of matched points; with the surrogate, the number predicted by its error model.
+        contrast: local RMS contrast of the left image (`matching.contrast`); None without an image.
     """
 
     row: int
@@ -298,16 +299,16 @@ class SurveyResult:
         f2f: trajectory from frame-to-frame motion alone.
         online: trajectory of the online estimates.
         final: trajectory after the last global alignment.
-        keyframe_rows: (n_keyframes,) rows of the trajectories that are keyframes.
+        keyframe_rows: (n_keyframes,) row of each keyframe in the trajectories.
         track_of_keyframe: (n_keyframes,) track number of each keyframe, from 1.
         node_cov: (n_keyframes, 6, 6) marginal covariance of each final keyframe pose, [rotation, translation] (rad, m)
             in camera axes.
         keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
         links: measured motions of the network.
-        alignments: size and cost of each global alignment.
-        before_ga, after_ga: positions (n, 3) of the keyframes just before and after the global alignment at the end of
-            each track [m].
-        stereo_observations: image quality of all stereo pairs, also of those with too few points for a keyframe.
+        alignments: size and wall time of each global alignment.
+        before_ga, after_ga: per track, positions (n, 3) of the keyframes so far, just before and just after the global
+            alignment at the end of the track [m].
+        stereo_observations: image quality of all stereo pairs, including those with too few points for a keyframe.
     """
 
     f2f: Trajectory
@@ -325,7 +326,7 @@ class SurveyResult:
 
     @property
     def step_cov(self) -> Array:
-        """(n_keyframes, 6, 6) covariance of each keyframe relative to the one before; zero without a link."""
+        """(n_keyframes, 6, 6) covariance of the motion from the previous keyframe to each one; zeros without a link."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))
         chain = self.links.j == self.links.i + 1
         cov[self.links.j[chain]] = self.links.own_cov[chain]
@@ -334,12 +335,12 @@ class SurveyResult:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """Regular grid of the cells of a map.
+    """Regular grid of map cells.
 
     Args:
-        west_m, north_m: x and y of the outer corner of cell (0, 0) [m].
+        west_m, north_m: x and y of the north-west corner of cell (0, 0) [m].
         cell_m: side of a cell [m].
-        rows, cols: number of rows, of which row 0 is the northernmost, and of columns.
+        rows, cols: numbers of rows and columns; row 0 is the northernmost.
     """
 
     west_m: float
@@ -358,13 +359,15 @@ class MapGrid:
 
 @dataclass
 class ElevationMap:
-    """Digital elevation model with its uncertainty and orthomosaic; NaN (black) in cells without a measurement.
+    """Digital elevation model with its uncertainty and orthomosaic.
+
+    Cells without a measurement are NaN, and black in the mosaic.
 
     Args:
-        grid: cells in x and y of the map's axes.
+        grid: cells in x and y of the map frame.
         height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m].
         mosaic: (rows, cols, 3) uint8 RGB.
-        map_from_world: (4, 4) pose of the world in the map's axes; the identity for a rig that looks down.
+        map_from_world: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     """
 
     grid: MapGrid
@@ -376,14 +379,14 @@ class ElevationMap:
 
 @dataclass
 class Truth:
-    """Ground truth of a survey; it is compared with the estimate in `judge` and nowhere else.
+    """Ground truth of a survey; only `judge` compares it with the estimates.
 
     Args:
         trajectory: true poses of the left camera, one per frame.
         reference: (n_frames, 3) planned positions of the left camera [m].
         holding: (n_frames,) bool, true during station keeping.
         track: (n_frames,) number of the track, from 1.
-        height_m: (rows, cols) float32, true height at the cell centres of the survey's grid.
+        height_m: (rows, cols) float32, true height at the cell centres of the map grid [m].
         seen: (rows, cols) bool, cells that both cameras observed in at least one keyframe.
     """
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from twin.errors import TwinError
 
-#: Smallest fraction of the matched points of a link that have to be inliers of its motion.
+#: A link is rejected if fewer than this fraction of its matched points are inliers of the estimated motion.
 MIN_INLIER_SHARE = 0.3
-#: Standard deviation of the interpolation bias that all points of a link share [px].
+#: Standard deviation of the interpolation bias, an error common to all points of a link [px].
 COMMON_BIAS_PX = 0.005
 
 
@@ -17,16 +17,17 @@ class EstimatorSettings:
     """Settings of motion estimation, the keyframe network and global alignment.
 
     Args:
-        window_tracks: previous tracks in the window of a global alignment at the end of a track.
+        window_tracks: number of previous tracks that the global alignment at the end of a track includes.
         node_stride: every n-th keyframe is a node of the network.
-        min_overlap: smallest overlap of linked nodes, a fraction of the node's matched points.
+        min_overlap: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's
+            matched points that project into the earlier image. The link to the last node is measured at any overlap.
         max_links: largest number of links from a node to earlier nodes.
         use_f2m: whether to register keyframes with the mosaic (F2M).
         use_ga: whether to align the network globally (GA) at the end of each track and of the survey.
         points: largest number of matched points of a keyframe.
         patch_px: side of the matching window, the same for stereo and for motion [px]; odd.
-        keyframe_overlap: a frame becomes a keyframe where its overlap with the last keyframe falls below this fraction;
-            used only where the caller does not choose the keyframes.
+        keyframe_overlap: a frame becomes a keyframe if its overlap with the last keyframe is below this fraction; used
+            only if the caller does not choose the keyframes.
 
     Raises:
         TwinError: a value is out of range.

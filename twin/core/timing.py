@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 
-#: Function, such as a `Stopwatch`, that returns a context manager which times the stage of the given name.
+#: Function of the name of a stage that returns a context manager which times the stage, such as a `Stopwatch`.
 StageTimer = Callable[[str], AbstractContextManager[None]]
 #: Stages of a survey, in processing order.
 STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map")

@@ -1,4 +1,4 @@
-"""Estimators as a library: the path of a stereo camera and the elevation map, computed from frames alone.
+"""Estimators as a library: trajectory of a stereo camera and elevation map, computed from frames alone.
 
 `Navigator` processes frames one by one and builds the map at the end; see docs/estimators.md. Nothing here depends on
 the simulator, its scenarios or its missions.

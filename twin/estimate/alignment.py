@@ -23,7 +23,7 @@ from twin.estimate.vision.keyframes import Keyframe
 
 Mask = NDArray[np.bool_]
 
-_OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; exceeded by one inlier in 2 million
+_OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; one inlier in 2 million exceeds it
 _MIN_SHARE_OF_WORST = 0.01  # links with a chi2 below this fraction of the largest are not removed in the same round
 _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
@@ -58,9 +58,10 @@ def align(
     Args:
         nodes: nodes of the window; their poses are the initial values.
         links: motions between nodes of the window.
-        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node (rad, m), by node number.
-        rig: nominal calibration of the stereo camera.
-        noise: nominal noise of the navigation sensors.
+        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node (rad, m), by node number; the
+            prior mean is the node's initial pose.
+        rig: believed calibration of the stereo camera.
+        noise: believed noise of the navigation sensors.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
@@ -100,14 +101,14 @@ class _Window(NamedTuple):
     graph: FactorGraph
 
     def optimise(self, start: GraphState, max_iterations: int) -> Solution:
-        """Returns the optimum reached from `start`."""
+        """Returns the local minimum of the cost that is reached from `start`."""
         return adjustment.optimise(self.graph, start, max_iterations)
 
     def outliers(self, chi2: Array) -> Mask:
-        """Returns a mask (n,) of the links to remove, given the chi2 (n,) of all links.
+        """Returns a mask (n,) of the links to remove, given the squared norms chi2 (n,) of all whitened residuals.
 
-        If the chi2 of a link is large but far below the largest, the worst link may be the cause; such a link stays
-        until the next round. Links between consecutive keyframes are never removed.
+        If the chi2 of a link is large but far below the largest, the link with the largest chi2 may have distorted it;
+        such a link is kept until the next round. Links between consecutive keyframes are never removed.
         """
         chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
@@ -139,7 +140,7 @@ def _factor_graph(
 
 
 def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the nodes with these numbers (all if None), zeros for others."""
+    """Returns the marginal covariances (n, 6, 6) of the nodes with the given numbers (None: all); zeros for others."""
     if numbers is None:
         return solution.marginals_in_place()
     covs = np.zeros((len(index_of), 6, 6))

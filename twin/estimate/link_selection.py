@@ -1,4 +1,4 @@
-"""Selection of links: which earlier nodes a new node is linked to, by predicted overlap."""
+"""Selection of the earlier nodes to which a new node is linked, by predicted overlap."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from twin.core.records import StereoRig
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
-_SAME_SWATH = 2  # number of linked previous nodes on the same swath, as in Negahdaripour & Madjidi 2003
+_SAME_SWATH = 2  # number of immediately preceding nodes to link, as in Negahdaripour & Madjidi 2003
 _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
@@ -41,8 +41,8 @@ class _View(NamedTuple):
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Returns the overlap (n,) of a node with the left image at each of the poses (n, 4, 4), 0 to 1.
 
-    The overlap is the fraction of the node's matched points that project into the other image. It is predicted from
-    poses and depth, and does not assume a flat floor.
+    The overlap is the fraction of the node's matched points that project into the other image, at least half a patch
+    from its border. It is predicted from poses and depths, without the assumption of a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -61,23 +61,23 @@ def choose_links(
     max_links: int,
     patch_px: int,
 ) -> list[tuple[Keyframe, float]]:
-    """Selects the earlier nodes that a new node is linked to.
+    """Selects the earlier nodes to which a new node is linked.
 
-    The selected nodes are the two previous nodes, the farthest node of the same swath, and nodes of other swaths in the
-    order of their overlap. The farthest node of a swath gives the longest baseline; links to other swaths connect the
-    legs, and the oldest of these nodes closes loops.
+    Of the candidates with enough overlap, these are selected until there are `max_links`: the two previous nodes; the
+    farthest node of the same swath, for the longest baseline; the oldest node of other swaths, to close loops; then
+    nodes of other swaths by decreasing overlap, where neighbours of a selected node come last.
 
     Args:
         node: the new node.
-        earlier: candidate nodes in the order of time.
+        earlier: candidate nodes in chronological order.
         poses: (n, 4, 4) world_from_camera of the candidates.
         rig: believed calibration.
         min_overlap: smallest overlap of a link, 0 to 1.
         max_links: largest number of links.
-        patch_px: side of the matching window.
+        patch_px: side of the matching window [px].
 
     Returns:
-        The nodes with their overlaps.
+        The selected nodes with their overlaps (0 to 1).
     """
     shares = overlaps(node, poses, rig, patch_px)
     linked = np.flatnonzero(shares >= min_overlap)[::-1].tolist()
@@ -92,22 +92,26 @@ def choose_links(
 
 
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
-    """Returns the links of one new node with inflated covariances, because their errors are correlated.
+    """Returns the links of one new node with covariances inflated to account for their correlated errors.
 
-    All n links use the same stereo points of the node, whose noise dominates the errors of the links. If the
-    links were treated as independent, one stereo observation would count n times, and the variance of the positions
-    would be underestimated by a factor of about 5. The covariance of each link is multiplied by n.
+    All n links use the same stereo points of the node, and the noise of these points dominates the errors of the links.
+    If the links were treated as independent, one stereo observation would count n times, and the variances of the
+    positions would be underestimated. Therefore the covariance of each link is multiplied by n.
     """
     return [link._replace(cov=link.cov * len(links), shared_by=len(links)) for link in links]
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the consecutive linked nodes from node `newest` backwards: the rest of the swath of the new node."""
+    """Returns the indices of `linked` that descend from `newest` without a gap: nodes of the new node's swath."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """Returns up to `count` nodes of other swaths, the largest overlap first; neighbours of a chosen node come last."""
+    """Returns up to `count` of the indices `others`, in their order; only neighbours of chosen nodes come last.
+
+    Args:
+        others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
+    """
     chosen: list[int] = []
     for k in others:
         if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
@@ -116,13 +120,22 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the distance beyond which no camera sees the points (n, 3): the image diagonal at the largest depth."""
+    """Returns the camera displacement [m] at which the overlap is taken as zero.
+
+    It is the diagonal of the image footprint at the largest depth of the points (n, 3) [m].
+    """
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
 @njit(cache=True, nogil=True)
 def _overlaps(world, position, poses, reach, view):
-    """Compiled kernel of `overlaps`; `world` (m, 3) are points in the world, `position` (3,) is the node's camera."""
+    """Compiled kernel of `overlaps`.
+
+    Args:
+        world: (m, 3) matched points of the node in the world [m].
+        position: (3,) position of the node's camera in the world [m].
+        reach: distance between the cameras at which the overlap is taken as zero [m].
+    """
     shares = np.zeros(len(poses))
     for k in range(len(poses)):
         pose, count = poses[k], 0
@@ -142,7 +155,7 @@ def _overlaps(world, position, poses, reach, view):
 
 
 def to_link(node: Keyframe, other: Keyframe, overlap: float, result: Motion) -> Link:
-    """Returns the link of a measured motion from an earlier node to a new one."""
+    """Returns the link from the earlier node `other` to the new `node`, given the measured motion."""
     return Link(
         other.number, node.number, result.a_from_b, result.cov, overlap, result.n_points, closed_form=result.closed_form
     )

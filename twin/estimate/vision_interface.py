@@ -1,7 +1,7 @@
 """Interface between the estimation pipeline and the source of visual measurements.
 
-`pipeline.Navigator` uses this interface only, so that measurements can come from images (`stereo_vision.StereoVision`)
-or from an error model without images.
+`pipeline.Navigator` uses only this interface, so its measurements can come from images (`stereo_vision.StereoVision`)
+or be sampled from an error model.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Vision(Protocol):
     """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
 
     Attributes:
-        stereo_observations: image quality of every stereo pair so far.
+        stereo_observations: number of matched points and contrast of every stereo pair so far.
         runs_in_background: whether `measure_motions` takes long enough to justify a separate thread.
     """
 
@@ -40,24 +40,24 @@ class Vision(Protocol):
             row: index of the frame in the trajectories.
 
         Returns:
-            The matched points, or None where there are too few for a keyframe.
+            The matched points, or None if there are too few for a keyframe.
         """
         ...
 
     def restart_tracking(self) -> None:
-        """Restarts F2F tracking from the keyframe that was observed last."""
+        """Restarts F2F tracking from the latest keyframe."""
         ...
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        """F2M: returns the correction of the keyframe's predicted pose, or None where the mosaic gives none."""
+        """F2M: returns the correction of the latest keyframe's predicted pose, or None if registration fails."""
         ...
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        """Adds the last keyframe to the mosaic under its number."""
+        """Adds the latest keyframe to the mosaic under its number, at the given pose."""
         ...
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
-        """Rebuilds the mosaic from these keyframes alone, the last ones of the path, at their current poses."""
+        """Clears the mosaic and rebuilds it from these keyframes, the latest of the path, at their current poses."""
         ...
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
@@ -68,7 +68,7 @@ class Vision(Protocol):
         ...
 
     def discard(self, numbers: range) -> None:
-        """Releases the memory of the keyframes with these numbers, which no further link will use."""
+        """Releases the data kept in memory for the keyframes with these numbers; no later link uses these keyframes."""
         ...
 
     def build_map(

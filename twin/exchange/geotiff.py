@@ -1,4 +1,4 @@
-"""GeoTIFF files in local metric coordinates. Row 0 is the northernmost; NaN means "no data"."""
+"""GeoTIFF files in local metric coordinates. Row 0 is the northernmost row; "no data" is NaN in float layers."""
 
 from __future__ import annotations
 

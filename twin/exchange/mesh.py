@@ -13,21 +13,22 @@ from twin.core.records import ElevationMap
 
 #: glTF is y-up: east is x, up is y, north is -z.
 GLB_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-#: Larger maps are subsampled to about this many vertices, which common viewers display smoothly.
+#: Maps with more cells are subsampled to about this number of vertices, which common viewers display smoothly.
 MAX_VERTICES = 400_000
 
 
 def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> None:
-    """Writes the mapped cells as a surface in the orthomosaic's colours; a map without cells gives an empty scene."""
+    """Writes the mapped cells as a surface with the orthomosaic's colours; without triangles the scene is empty."""
     mesh = map_mesh(elevation_map, max_vertices)
     scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
     path.write_bytes(export_glb(scene))
 
 
 def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
-    """Returns the mesh of a map in the axes of glTF.
+    """Returns the triangle mesh of a map in the axes of glTF.
 
-    Each mapped cell gives a vertex at its centre; triangles connect neighbouring cells and face upwards.
+    Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
+    vertices and face upwards; cells that belong to no triangle are omitted.
     """
     stride = max(1, int(np.ceil(np.sqrt(elevation_map.height_m.size / max_vertices))))
     x, y = elevation_map.grid.centres()

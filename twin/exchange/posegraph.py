@@ -1,7 +1,8 @@
 """Pose graph files: writing the keyframe network as g2o, reading g2o and TORO files as links.
 
-The information of a rotation refers to the rotation vector [1/rad^2], as in GTSAM's reader of g2o files. g2o itself
-defines it for the vector part of the quaternion (half the angle), which gives four times the value.
+In g2o files, as read and written here and by GTSAM, the information of a rotation refers to the rotation vector
+[1/rad^2]. g2o itself refers it to the vector part of the quaternion (half the rotation vector), so its values are four
+times as large.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class PoseGraph(NamedTuple):
 
     Args:
         poses: pose (4, 4) of each vertex, by its number; empty if the file has only edges.
-        links: motion of each edge, with overlap NaN and 0 matched points because the formats have neither.
+        links: one link per edge; its overlap is NaN and its number of matched points 0, as the formats have neither.
     """
 
     poses: dict[int, Array]
@@ -57,7 +58,7 @@ def read(path: Path) -> PoseGraph:
     Lines with other tags are skipped.
 
     Raises:
-        TwinError: a line has the wrong number of values, or a value that is not a number.
+        TwinError: a line has the wrong number of values, or one of them is not a number.
     """
     poses, links = {}, []
     for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
@@ -78,7 +79,7 @@ def read(path: Path) -> PoseGraph:
 
 
 def _floats(words: Sequence[str], size: int) -> Array:
-    """Returns the words as (size,) floats. Raises ValueError if their number differs."""
+    """Returns the words as floats (size,). Raises ValueError if there are not `size` words."""
     if len(words) != size:
         raise ValueError(f"has {len(words)} values instead of {size}")
     return np.array([float(word) for word in words])
@@ -108,7 +109,7 @@ def _pose_of_quaternion(values: Array) -> tuple[Array, Array]:
 def _pose_of_euler_angles(values: Array) -> tuple[Array, Array]:
     """Returns the pose of x y z roll pitch yaw, and the Jacobian of the angles with respect to the rotation vector."""
     roll, pitch = values[3:5]
-    # rotation vector in the body from the rates of roll, pitch and yaw (Goldstein, Classical Mechanics)
+    # derivative of the rotation vector in the body axes by roll, pitch and yaw (Goldstein, Classical Mechanics)
     rates = np.array(
         [
             [1, 0, -np.sin(pitch)],
@@ -119,7 +120,7 @@ def _pose_of_euler_angles(values: Array) -> tuple[Array, Array]:
     return geometry.pose(geometry.rotation_from_rpy(*values[3:]), values[:3]), np.linalg.inv(rates)
 
 
-#: Number of values of the pose in a line, and the function that parses them, by tag.
+#: By tag: number of values that describe the pose, and the function that converts them.
 _POSE_FORMATS = {
     "VERTEX_SE3:QUAT": (7, _pose_of_quaternion),
     "EDGE_SE3:QUAT": (7, _pose_of_quaternion),

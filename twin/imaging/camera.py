@@ -1,4 +1,4 @@
-"""Stereo camera of the simulation: renders, illuminates and exposes the images at a pose."""
+"""Stereo camera of the simulation: computes the images at a pose, from rendering and illumination to exposure."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ AT_REST: Array = np.zeros(6)
 
 
 class StereoCapture(NamedTuple):
-    """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depth (H, W) [m] for the evaluation.
+    """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depths (H, W) [m] for the evaluation.
 
-    The right image and its depth are None where only the left camera was used.
+    The right image and its depth are None if only the left camera was used.
     """
 
     left: Image
@@ -40,16 +40,16 @@ class StereoCapture(NamedTuple):
 
 
 class DecomposedImage(NamedTuple):
-    """Left image with the quantities from which it is computed.
+    """Intermediate results in the computation of a left image.
 
     Args:
         albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
         depth: (H, W) depth along the optical axis [m].
-        components: radiance, separated by origin.
-        setting: exposure, metered on this image.
+        components: direct signal, backscatter and other components of the radiance.
+        setting: exposure, metered on this image itself.
         noise_free: (H, W, 3) image without noise.
-        raw: digital numbers of the physical sensor with the noise of the next capture: (H, W) with a Bayer filter,
-            otherwise (H, W, 3); None for the plain sensor.
+        raw: digital numbers of the physical sensor, with the noise that the next capture will have: (H, W) with a Bayer
+            filter, otherwise (H, W, 3); None for the plain sensor.
     """
 
     albedo: Image
@@ -61,7 +61,7 @@ class DecomposedImage(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Image signal per unit of light on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
+        """Image signal per unit of radiance on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
         return self.setting.gain
 
 
@@ -71,10 +71,10 @@ class StereoCamera:
     Args:
         renderer: renderer of albedo and depth of the floor.
         image_formation: model of the radiance that reaches the cameras through the water.
-        scenario: sensor settings.
+        scenario: settings of the cameras and the sensor.
         left_rng, right_rng: random streams of the image noise.
-        stopwatch: timer of the stages rendering and optics.
-        true_cameras: geometry of the true cameras; None = the geometry that the scenario defines.
+        stopwatch: timer of the stages "render" and "optics".
+        true_cameras: geometry of the true cameras; None = as defined by the scenario.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class StereoCamera:
     def _expose(
         self, pose: StampedPose, camera: int, twist_body: Array, setting: ExposureSetting | None
     ) -> tuple[Image, Depth, ExposureSetting]:
-        """Returns image, true depth and exposure of a camera; meters the exposure if `setting` is None."""
+        """Returns image, true depth and exposure of one camera; meters the exposure if `setting` is None."""
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
         with self._stopwatch("render"):
             albedo, depth = self._renderer.render(world_from_camera)

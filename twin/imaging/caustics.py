@@ -1,10 +1,10 @@
-"""Caustics: bright moving lines on the floor where the waves of the surface focus the sunlight.
+"""Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
 
 The surface is a sum of waves that are periodic in a square tile. A vertical ray that meets the surface at a small slope
 s is refracted by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a floor at depth D with a
-horizontal displacement of (1 - 1/n) s D. No ray leaves the periodic tile, so that the mean of the pattern is 1. The
-pattern is blurred by the angular size of the sun and by scattering in the water (small-angle theory of Wells, as in
-`forward_scatter`), so that it fades with depth.
+horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite side, so the mean of the
+pattern is 1. The angular size of the sun and scattering in the water (small-angle theory of Wells, as in
+`forward_scatter`) blur the pattern, so its contrast decreases with depth.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ Array = NDArray[np.float64]
 
 TILE_M, CELLS = 4.0, 128  # side of the tile [m]; number of cells per side, a power of two
 RAYS = 2  # number of rays per side of a cell
-WAVELENGTHS_M = (0.3, 3.0)
-SLOPE_RMS = 0.08  # RMS slope of a surface under a light breeze
+WAVELENGTHS_M = (0.3, 3.0)  # shortest and longest water wave
+SLOPE_RMS = 0.08  # RMS slope of the water surface in a light breeze
 WATER_INDEX, GRAVITY_MPS2 = 1.339, 9.81
 SUN_RAD = 0.0047 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
 STREAM = 1 << 16  # key of the random stream for the waves
 
 
 class Caustics:
-    """Caustics of one survey, on a horizontal plane at the depth of the reference plane.
+    """Caustics of one survey, computed on the reference plane.
 
     Args:
-        illumination: water, depth of the reference plane, and the fraction of the daylight that is focused; the rest of
-            the daylight is diffuse and uniform.
+        illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
+            that the waves focus; the rest of the daylight is diffuse and uniform.
         seed: seed of the scenario.
     """
 
@@ -61,16 +61,16 @@ class Caustics:
         self._cached: tuple[float, NDArray[np.float32]] | None = None
 
     def pattern(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the illuminance (CELLS, CELLS) relative to its mean of 1; rows run north, columns east.
+        """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west.
 
-        The last pattern is cached, because both cameras use it.
+        The latest pattern is cached, because both cameras use it.
         """
         if self._cached is None or self._cached[0] != time_s:
             self._cached = time_s, self._compute(time_s)
         return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Returns the slopes (CELLS, CELLS) of the surface along east and along north."""
+        """Returns the slopes of the water surface towards east and towards north, each (CELLS, CELLS)."""
         phase = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # deep-water dispersion
         size = CELLS, CELLS
         east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
@@ -84,14 +84,14 @@ class Caustics:
 
 
 def _blur(k: Array, depth_m: float, water: Medium) -> Array:
-    """Returns the modulation transfer function of the blur by the solar disc and by the scattering of green light.
+    """Returns the modulation transfer function of the blur by the solar disc and by forward scattering of green light.
 
     With t the optical thickness of forward scattering, the fraction exp(-t) of the light is not scattered; the rest is
-    scattered n = t / (1 - exp(-t)) times on average.
+    scattered t / (1 - exp(-t)) times on average.
 
     Args:
-        k: wave numbers [rad/m].
-        depth_m: depth below the surface.
+        k: wave numbers of the pattern, of any shape [rad/m].
+        depth_m: depth of the plane below the surface.
         water: optical properties of the water.
     """
     lobe = forward_scattering(water.mean_cosine)
@@ -104,7 +104,13 @@ def _blur(k: Array, depth_m: float, water: Medium) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces evenly spaced rays through the surface; adds each to four cells of `light` (n, n), bilinearly weighted."""
+    """Traces evenly spaced vertical rays through the surface; adds each to four cells of `light` with bilinear weights.
+
+    Args:
+        east, north: (n, n) slopes of the surface.
+        cells_per_slope: displacement of a ray on the floor per unit of slope [cells].
+        light: (n, n) illuminance relative to its mean, modified in place.
+    """
     n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
     for i in range(n):
         i1 = (i + 1) & (n - 1)

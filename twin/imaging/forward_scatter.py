@@ -1,17 +1,16 @@
-"""Forward scatter: light from the floor that the water scatters by small angles blurs the image, more with range.
+"""Forward scatter: light from the floor, scattered by small angles, blurs the image; the blur increases with range.
 
-Scattering by angles below a limit, with coefficient b_f < b, does not remove light from the image. The radiance L of a
+Light scattered by angles below a limit, with coefficient b_f < b, is not lost from the image. The radiance L of a
 floor at range r then arrives as L exp(-(c - b_f) r): the fraction exp(-b_f r) of this is the direct signal,
 L exp(-c r), and the fraction 1 - exp(-b_f r) is blurred. This is the form of McGlamery (1979) and Jaffe (1990),
 direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f, which is a + 0.26 b here.
 
 The width of the blur follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly
 distributed position along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance
-s^2 / 3. The number of scatterings is Poisson distributed with mean b_f r; its mean over the scattered light is n =
-b_f r / (1 - exp(-b_f r)). The point spread function is a Gaussian of variance n s^2 / 3. The fraction
-`water.kept_share` of b does not count as lost in c; it is subtracted from b_f, so that it is not counted twice. The
-image is mirrored at its borders, so that no light is lost there. On the path from the lamps to the floor all scattered
-light counts as lost.
+s^2 / 3. The number of scatterings is Poisson distributed with mean b_f r; the mean for light scattered at least once
+is n = b_f r / (1 - exp(-b_f r)). The point spread function is a Gaussian of variance n s^2 / 3. If c already excludes
+the fraction `water.kept_share` of b, this fraction is subtracted from b_f, so that it is not counted twice. The image
+is mirrored at its borders, so no light is lost there. Forward scatter between lamps and floor is not modelled.
 """
 
 from __future__ import annotations
@@ -33,27 +32,32 @@ from twin.imaging.water import SEA_WATER_MEAN_COSINE, Medium, phase_function
 Array = NDArray[np.float64]
 
 FORWARD_DEG = 15.0  # light scattered by a larger angle is lost from the image
-LEVELS = 4  # of the blur variance: 1, 2, 4, 8 times the smallest; light in between is split between two levels
+LEVELS = 4  # number of blur levels, of 1, 2, 4, 8 times the smallest variance; light in between is split between two
 STEP_M = 0.02  # range step of the table of levels
 MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
 
 
 class ForwardScattering(NamedTuple):
-    """Forward scattering: fraction of b below the limiting angle; variance of its angle along one axis [rad2]."""
+    """Scattering by angles below `FORWARD_DEG`.
+
+    Args:
+        share: fraction of the scattering coefficient b.
+        variance_rad2: variance of the scattering angle along one axis [rad^2].
+    """
 
     share: float
     variance_rad2: float
 
 
 def forward_scattering(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> ForwardScattering:
-    """Returns the scattering by angles below `FORWARD_DEG`, from numerical integration of the phase function."""
+    """Returns fraction and variance of scattering by angles below `FORWARD_DEG`, integrated from the phase function."""
     angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
     density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
     return ForwardScattering(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
 
 
 class ForwardScatter:
-    """Model of the forward-scattered radiance of the floor, computed from its direct signal.
+    """Model of the forward-scattered light from the floor, computed from the direct signal.
 
     Args:
         rig: the rendered cameras.
@@ -76,19 +80,19 @@ class ForwardScatter:
         """Returns the forward-scattered light (H, W, 3) per colour band in photometric units [cd/m2].
 
         Args:
-            direct: (H, W, 3) light of the floor that arrives without being scattered [cd/m2].
+            direct: (H, W, 3) direct signal: light from the floor that reaches the camera without scattering [cd/m2].
             depth: (H, W) depth along the optical axis [m].
         """
         return self._blur(direct, depth).copy()
 
     def add(self, direct: Radiance, depth: Depth, light: Radiance) -> None:
-        """Adds the direct signal and the forward-scattered radiance of the floor to `light` (H, W, 3), in place."""
+        """Adds the direct signal and the forward-scattered light from the floor to `light` (H, W, 3), in place."""
         spread = self._blur(direct, depth)
         parts = light.reshape(len(light), -1), spread.reshape(len(light), -1), direct.reshape(len(light), -1)
         in_row_bands(lambda first, end: _add(*parts, first, end), len(light))
 
     def _blur(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Same as `spread`, but the next call overwrites the array: allocation takes as long as the computation."""
+        """Same as `spread`, but returns a buffer that the next call overwrites; a new array would double the time."""
         size, (height, width) = self._bin_px, depth.shape
         bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
         scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
@@ -105,13 +109,13 @@ class ForwardScatter:
 
 
 def _level_of(ratio: Array) -> Array:
-    """Returns fractional blur levels for variances `ratio` times the smallest; linear between factors of two."""
+    """Returns the fractional blur level for variances of `ratio` times the smallest; linear between powers of two."""
     below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
     return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 
 
 def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
-    """Returns the bin side [px]: the largest of 8, 4, 2 that divides the image and is below 0.8 sigma, or 1."""
+    """Returns the bin side [px]: the largest of 8, 4, 2 that divides width and height and is below 0.8 sigma, or 1."""
     sides = [n for n in (8, 4, 2) if width_px % n == height_px % n == 0 and n < 0.8 * sigma_px]
     return sides[0] if sides else 1
 

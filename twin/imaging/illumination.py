@@ -1,4 +1,4 @@
-"""Optical properties of the water, and the daylight in it, computed once per scenario."""
+"""Optical properties of the water and daylight in the water, computed once per scenario."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Daylight(NamedTuple):
     """Daylight from the zenith in the bands R, G, B.
 
     Args:
-        surface_lx: (3,) illuminance just below the water surface; without a surface, illuminance of the floor.
-        illuminance_lx: (3,) illuminance of a horizontal plane at the planned altitude.
+        surface_lx: (3,) illuminance just below the water surface, or of the floor if there is no surface.
+        illuminance_lx: (3,) illuminance on a horizontal plane at the planned altitude.
         attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
         camera_depth_m: depth of the planned altitude below the surface; 0 where there is no surface.
@@ -35,14 +35,14 @@ class Daylight(NamedTuple):
 
 
 class Illumination(NamedTuple):
-    """Optical properties of the water, and the daylight in it."""
+    """Optical properties of the water, and daylight in the water."""
 
     water: Medium
     daylight: Daylight
 
 
 def illumination_of(scenario: Scenario) -> Illumination:
-    """Returns the optical properties of the water, and the daylight, of a scenario.
+    """Returns the optical properties of a scenario's water, and the daylight in the water.
 
     Raises:
         TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or

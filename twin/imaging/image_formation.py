@@ -27,15 +27,15 @@ class StampedPose(NamedTuple):
 
 
 class RadianceComponents(NamedTuple):
-    """Light that reaches a camera, separated by origin, per colour band in photometric units; (H, W, 3) float32 each.
+    """Components of the light that reaches a camera, per colour band in photometric units; (H, W, 3) float32 each.
 
     Args:
-        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where no measurable light of it returns.
-        direct: light of the floor that was not scattered on its path to the camera [cd/m2].
-        forward: light of the floor that was scattered forward [cd/m2]; None where forward scatter is disabled.
-        backscatter: light of lamps and daylight that the water scatters to the camera [cd/m2].
-        snow: change of the light due to marine snow [cd/m2]; None where marine snow is disabled.
-        total: sum of all components [cd/m2].
+        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where too little of it reaches the camera.
+        direct: light from the floor that was not scattered on its path to the camera [cd/m2].
+        forward: light from the floor that was scattered by small angles [cd/m2]; None if forward scatter is disabled.
+        backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
+        snow: change of the radiance by marine snow [cd/m2], negative where it hides light; None if it is disabled.
+        total: sum of direct, forward, backscatter and snow [cd/m2].
     """
 
     floor_lx: Radiance
@@ -50,9 +50,9 @@ class ImageFormation:
     """Model of the light that reaches each camera of the stereo camera, given albedo and depth of the floor.
 
     Args:
-        scenario: lamps, marine snow, current and enabled effects.
-        illumination: water and daylight of the scenario.
-        floor: heights of the floor that casts shadows.
+        scenario: settings of lamps, marine snow and current, and which effects are enabled.
+        illumination: optical properties of the water, and daylight.
+        floor: heights of the floor, which casts shadows.
         snow_rng: random stream of the particle positions.
         rig: the rendered cameras; None = the believed rig.
     """
@@ -99,7 +99,7 @@ class ImageFormation:
         return light
 
     def components(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> RadianceComponents:
-        """Returns the light that reaches a camera, separated by origin; takes the same arguments as `radiance`."""
+        """Returns the components of the light that reaches a camera; the arguments are those of `radiance`."""
         lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
         direct, backscatter = self._optics.split(albedo, depth, camera, lit, surface)
         forward = None if self._forward is None else self._forward.spread(direct, depth)
@@ -119,7 +119,7 @@ class ImageFormation:
         return self._shadows.lit(depth, self._world_from_camera(camera, pose), camera)
 
     def _water_surface(self, camera: int, pose: StampedPose) -> WaterSurface | None:
-        """Returns the water surface above a camera; None where there is no surface and daylight is uniform."""
+        """Returns the water surface above a camera, or None if the scenario has none; daylight is then uniform."""
         if not self._reference_depth_m:
             return None
         east, north, up = self._world_from_camera(camera, pose)[:3]

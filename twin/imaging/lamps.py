@@ -16,20 +16,20 @@ from twin.scenario.model import LampConfig
 
 Array = NDArray[np.float64]
 
-#: Measured beam of an LED lamp: intensity relative to the axis, by angle from the axis [deg] (Song et al. 2021).
+#: Measured beam of an LED lamp: angle from the axis [deg], intensity relative to the axis (Song et al. 2021).
 LED_BEAM = (
     (0.0, 1.0), (10.0, 0.96), (20.0, 0.87), (30.0, 0.75), (35.0, 0.63), (40.0, 0.5), (45.0, 0.28), (50.0, 0.2),
     (60.0, 0.12), (90.0, 0.0),
 )  # fmt: skip
 
-WHITE_K = 6500.0  # temperature of the black body that counts as white
+WHITE_K = 6500.0  # colour temperature of white light
 WAVELENGTHS_M = np.array([650e-9, 550e-9, 450e-9])  # centres of the bands R, G, B
 LUMINANCE_SHARES = np.array([0.2126, 0.7152, 0.0722])  # fractions of R, G, B in the luminance of white (ITU-R BT.709)
 _HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
 
 
 class LightSources(NamedTuple):
-    """Light sources of one camera: lamps in its axes, and daylight that propagates along its optical axis.
+    """Light sources as seen by one camera: lamps in the camera's axes, and daylight.
 
     Args:
         position_m: (n, 3) positions of the lamps [m].
@@ -54,7 +54,7 @@ def light_sources_in_camera(
     """Returns the lamps, which are fixed to the body, in the axes of a camera (0 left, 1 right).
 
     Raises:
-        TwinError: the angles of a beam do not increase from 0.
+        TwinError: the angles of a beam do not start at 0 and increase.
     """
     camera_from_body = geometry.inverse(rig.body_from_camera @ (rig.left_from_right if camera else np.eye(4)))
     position = np.array([lamp.position_m for lamp in lamps]).reshape(-1, 3)
@@ -70,13 +70,13 @@ def light_sources_in_camera(
 
 
 def _beam_axis(lamp: LampConfig) -> Array:
-    """Returns the unit vector of a lamp's beam in the body: straight down, tilted towards the bow, panned to port."""
+    """Returns the unit vector (3,) of a beam axis in the body: straight down, tilted to the bow and panned to port."""
     tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
     return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
 
 
 def _beam(number: int, lamp: LampConfig) -> Array:
-    """Returns the beam table of a lamp; raises TwinError where its angles do not increase from 0."""
+    """Returns the beam table (m, 2) of a lamp. Raises TwinError if its angles do not start at 0 and increase."""
     table = np.array(lamp.beam or LED_BEAM)
     if table[0, 0] != 0 or not (np.diff(table[:, 0]) > 0).all():
         raise TwinError(f"lamps.{number}.beam", "angles do not increase from 0", "as in [[0, 1], [30, 0.7], [60, 0]]")
@@ -94,9 +94,9 @@ def beam_share(cos_angle: Array, table: Array) -> Array:
 
 
 def colour(temperature_k: float) -> Array:
-    """Returns the intensity factors (3,) of a black body for R, G, B, relative to one at 6500 K with equal luminance.
+    """Returns the intensities (3,) of a black body in R, G, B, relative to a black body at 6500 K of equal luminance.
 
-    Planck (1901): radiance at wavelength l is proportional to 1 / (exp(h c / (l k T)) - 1).
+    Planck (1901): at wavelength l, radiance varies with temperature T as 1 / (exp(h c / (l k T)) - 1).
     """
     against_white = np.expm1(_HC_PER_K / (WAVELENGTHS_M * WHITE_K)) / np.expm1(
         _HC_PER_K / (WAVELENGTHS_M * temperature_k)

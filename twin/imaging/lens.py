@@ -1,7 +1,7 @@
 """Lens distortion by Brown and Conrady, in the form and order of OpenCV (Brown 1971, Close-range calibration).
 
-A ray in front of the lens has the tangents x = X / Z, y = Y / Z. With r^2 = x^2 + y^2, its distorted image coordinates,
-in units of the focal length, are
+A ray in front of the lens with direction (X, Y, Z) has the tangents x = X / Z, y = Y / Z. With r^2 = x^2 + y^2, its
+distorted image coordinates, in units of the focal length, are
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -18,7 +18,7 @@ from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
-STEPS, TOLERANCE = 30, 1e-12  # of Newton's method; the tolerance is a tangent (1e-9 corresponds to 1e-6 px)
+STEPS, TOLERANCE = 30, 1e-12  # Newton's method: maximum number of steps, tolerance of tangents (1e-9 is about 1e-6 px)
 
 
 class Distortion(NamedTuple):
@@ -37,7 +37,7 @@ def true_lens(lens: LensConfig) -> Distortion:
 
 
 def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Distortion:
-    """Returns the distortion with which frames are rectified: the true one minus the calibration errors."""
+    """Returns the calibrated distortion, used to rectify frames: the true distortion minus the calibration errors."""
     return true_lens(lens)._replace(k1=lens.k1 - calibration.k1_error, k2=lens.k2 - calibration.k2_error)
 
 
@@ -56,7 +56,7 @@ def distort(tangents: Array, lens: Distortion) -> Array:
 
 
 def undistort(distorted: Array, lens: Distortion) -> Array:
-    """Returns the tangents (..., 2) of the rays imaged at distorted coordinates (..., 2); NaN where none exists.
+    """Returns the tangents (..., 2) of the rays imaged at distorted coordinates (..., 2); NaN if no such ray exists.
 
     Inverse of `distort` by Newton's method.
     """
@@ -72,9 +72,9 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
 
 def fold(lens: Distortion) -> float:
-    """Returns the tangent of the angle from the axis at which the radial distortion stops increasing; inf if never."""
+    """Returns the tangent of the off-axis angle beyond which the distorted radius decreases; inf if it never does."""
     # The derivative of r (1 + k1 r^2 + ...), divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1,
-    # so that coefficients of zero cause no division by zero.
+    # so distortion coefficients of zero cause no division by zero.
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(real.max())) if real.size else np.inf

@@ -6,9 +6,10 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera an
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_sun) * exp(-c r)  +  B(r)
     B(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds, summed over lamps and the sun
 
-with d_i the distance to lamp i, psi_i the scattering angle and c the effective attenuation (`water.Medium`). The model
-has no free factors. Shadows, caustics and forward scatter are computed in other modules. Multiple scattering within the
-backscatter is neglected.
+with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
+of the angle of incidence, E_sun the illuminance by daylight, psi_i the scattering angle, p the phase function, b the
+scattering coefficient and c the effective attenuation (`water.Medium`). The model has no free factors. Shadows,
+caustics and forward scatter are computed in other modules. Multiple scattering is neglected in the backscatter.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ Depth = NDArray[np.float32]
 Lit = NDArray[np.uint8]
 
 LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
-LEAST_TRANSMISSION = 1e-25  # below this, single precision does not resolve the light of the floor
+LEAST_TRANSMISSION = 1e-25  # below this, single precision cannot represent the direct signal
 BACKSCATTER_GRID, BACKSCATTER_RANGES, BACKSCATTER_SUBSTEPS = (16, 20), 48, 8
-BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)), from 0 to 1: nearly even in the angle
+BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
 
 class WaterSurface(NamedTuple):
@@ -44,7 +45,7 @@ class WaterSurface(NamedTuple):
 
     Args:
         caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
-            first row and column. None where daylight is uniform.
+            first row and column. None if daylight is uniform.
         from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics` and depth below the
             surface [m].
     """
@@ -54,12 +55,12 @@ class WaterSurface(NamedTuple):
 
 
 class _Tables(NamedTuple):
-    """Lookup tables of the kernel for one camera.
+    """Lookup tables of the shading kernel (`shading.shade`) for one camera.
 
     Args:
         beams: (lamps, n) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)) in [0, 1].
         transmission: (3, n) exp(-c s) at even steps of the path length s.
-        backscatter: (rows, cols, 3, ranges) radiance on a coarse grid of pixels and at even steps of r / (r + scale).
+        backscatter: (rows, cols, 3, ranges) radiance on a coarse pixel grid; even steps of r / (r + scale), r = range.
     """
 
     beams: NDArray[np.float32]
@@ -73,7 +74,7 @@ class Optics:
     Args:
         rig: the rendered cameras.
         illumination: water and daylight.
-        lamps: lamps on the body.
+        lamps: lamps on the vehicle.
 
     Attributes:
         light_sources: lamps and daylight in the axes of the left and of the right camera.
@@ -100,7 +101,7 @@ class Optics:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
             lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; None = no shadows.
-            surface: the water surface; None = a calm surface, and a camera that points straight down at the planned
+            surface: the water surface; None = a calm surface above a camera that points straight down from the planned
                 altitude.
         """
         out = np.empty(albedo.shape, np.float32)
@@ -130,9 +131,9 @@ class Optics:
     def floor_lx(
         self, depth: Depth, camera: int, lit: Lit | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where no measurable light returns from the floor.
+        """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where the transmission to the camera is too small.
 
-        It is computed from the direct signal of a white floor, divided by the transmission to the camera.
+        It is computed from the direct signal of a white floor, divided by the transmission from floor to camera.
         """
         white, _ = self.split(np.full((*depth.shape, 3), 255, np.uint8), depth, camera, lit, surface)
         back = np.exp(-self._medium.attenuation_per_m * range_of(depth, self._rig)[..., None])
@@ -148,7 +149,7 @@ class Optics:
         surface: WaterSurface | None,
         out: tuple[Radiance, Radiance | None],
     ) -> None:
-        """Fills `out`: (radiance, None), or (direct signal, backscatter)."""
+        """Fills `out`: (radiance, None) or (direct signal, backscatter), arrays (H, W, 3) [cd/m2]."""
         sources, focal = self.light_sources[camera], np.float32(self._rig.focal_px)
         caustics, from_camera = self._calm_surface if surface is None else surface
         sky = self._surface_lx.astype(np.float32), self._loss_per_m, caustics, np.asarray(from_camera, np.float32)
@@ -159,7 +160,7 @@ class Optics:
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:
-    """Returns the distance (H, W) of the floor from the camera [m], from its depth along the optical axis."""
+    """Returns the distance (H, W) from the camera to the floor [m], given the depth along the optical axis [m]."""
     x = (np.arange(rig.width_px) - rig.cx_px) / rig.focal_px
     y = (np.arange(rig.height_px) - rig.cy_px) / rig.focal_px
     return depth.astype(np.float64) * np.sqrt(1 + x**2 + y[:, None] ** 2)
@@ -175,11 +176,11 @@ def backscatter_per_m(sources: LightSources, water: Medium, ray: Array, range_m:
         range_m: (..., n) distances along the ray [m].
 
     Returns:
-        (..., n, 3) light per metre of range and colour band, in photometric units [cd/m3].
+        (..., n, 3) radiance per metre of range, per colour band in photometric units [cd/m3].
     """
     scattering, attenuation = water.scattering_per_m, water.attenuation_per_m
     points = ray[..., None, :] * range_m[..., None]
-    # Daylight comes from above and decreases along the optical axis.
+    # Daylight is assumed to propagate along the optical axis, which points down.
     phase = phase_function(-ray[..., 2], water.mean_cosine)[..., None, None]
     day = sources.daylight.illuminance_lx * np.exp(-sources.daylight.attenuation_per_m * points[..., 2:])
     total = day * phase * scattering * np.exp(-attenuation * range_m[..., None])
@@ -203,7 +204,7 @@ def _tables(rig: StereoRig, water: Medium, sources: LightSources) -> _Tables:
 
 
 def _transmission(per_m: Array) -> NDArray[np.float32]:
-    """Returns the transmission (3, n) at even steps of path length."""
+    """Returns the transmission (3, n) at even steps of path length, for attenuation coefficients `per_m` (3,)."""
     return np.exp(-per_m[:, None] * np.arange(0.0, PATH_MAX_M, PATH_STEP_M)).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Physical sensor (section [sensor] of a scenario): photons, electrons, digital numbers, exposure and read-out time."""
+"""Physical sensor (section [sensor] of a scenario): from photons to digital numbers; exposure and read-out time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BLACK_SHARE = 1 / 64  # black level as a fraction of full scale, so that dark no
 
 
 class Sensor(Protocol):
-    """Interface of the sensor that both cameras of a stereo camera share."""
+    """Interface of the sensor model that both cameras share."""
 
     def meter(self, light: Radiance) -> ExposureSetting: ...
 
@@ -31,20 +31,20 @@ class Sensor(Protocol):
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns the sensor of a scenario in its initial state.
+    """Returns a scenario's sensor in its initial state: physical if section [sensor] is given, otherwise plain.
 
     Args:
-        scenario: survey scenario; its section [sensor] selects the physical sensor.
+        scenario: survey scenario.
         raw_rig: rig with the size and focal length of the raw images; None = those of the frames.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
 
 class PhotoSensor:
-    """Physical sensor of both cameras, with auto-exposure that increases the exposure time first, then the gain.
+    """Physical sensor of both cameras, with auto-exposure that increases first the exposure time, then the gain.
 
-    Beyond the limits of exposure and gain, images stay dark or saturate. Auto-exposure meters the radiance and not the
-    image, so that it does not oscillate where an image saturates.
+    If exposure time and gain reach their limits, images become dark or saturate. Auto-exposure meters the radiance, not
+    the image, so it does not oscillate if an image saturates.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -65,14 +65,14 @@ class PhotoSensor:
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns the exposure of a frame, metered on the previous frames; `light` affects the next frames."""
+        """Returns this frame's exposure, metered on the previous frames; its radiance `light` affects later frames."""
         gain = self._exposure.gain_for(float(_weighted_mean(light, self._vignetting).max()))
         product_s = gain / self._signal_per_s
         exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
         return ExposureSetting(gain, exposure_s, min(max(product_s / exposure_s, 1.0), self._most_gain))
 
     def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
-        """Returns the radiance (H, W, 3) averaged over the exposure, with rolling shutter and motion blur.
+        """Returns the radiance (H, W, 3) recorded by the moving camera, with rolling shutter and motion blur.
 
         Args:
             light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
@@ -91,11 +91,11 @@ class PhotoSensor:
         return blur_by_motion(light, depth, self._focal_px, twist, setting.exposure_s)
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns the 8-bit image (H, W, 3) of a radiance, without noise where `rng` is None."""
+        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
         return self.develop(self.raw(light, setting, rng))
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
-        """Returns raw digital numbers: (H, W) with a Bayer filter, otherwise (H, W, 3)."""
+        """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""
         return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
 
     def develop(self, raw: Raw) -> Image:
@@ -119,14 +119,14 @@ class PhotoSensor:
         )  # fmt: skip
 
     def _tone_table(self) -> NDArray[np.uint8]:
-        """Returns the 8-bit value (3, 2^bits) of every digital number in each band."""
+        """Returns a table (3, 2^bits) of the 8-bit value for each band and digital number."""
         signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
         return np.clip(255 * self._white[:, None] * signal + 0.5, 0, 255).astype(np.uint8)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _weighted_mean(light, weights):
-    """Returns the mean (3,) over all pixels of `light` (H, W, 3) multiplied by `weights` (H, W), for each band."""
+    """Returns the mean (3,) of `light` (H, W, 3) times `weights` (H, W) over all pixels, for each band."""
     total = np.zeros(3)
     for v in range(weights.shape[0]):
         row, shares = light[v].reshape(-1), weights[v]

@@ -1,8 +1,8 @@
 """Pixel model: shot noise, full well, read noise, gain and quantization to digital numbers.
 
 The linear model of EMVA 1288: photons generate electrons with Poisson statistics, read-out adds normal noise, and the
-camera outputs K (electrons + noise) above a black level, clipped to its largest digital number. Not modelled: dark
-current, which is negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels.
+camera outputs a black level plus K (electrons + noise), clipped to the largest digital number. Dark current, which is
+negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels are not modelled.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from twin.imaging.row_parallel import in_row_bands
 
 Raw = NDArray[np.uint16]
 
-FEW_ELECTRONS = 10  # below: exact Poisson numbers; above: normal numbers corrected for the skewness
-MOST_ELECTRONS = 80  # bound of the inversion, never reached for a mean of ten
+FEW_ELECTRONS = 10  # below this mean: exact Poisson numbers; above: normal numbers corrected for skewness
+MOST_ELECTRONS = 80  # largest count of `_poisson`; practically never reached for means below ten
 
 
 class PixelResponse(NamedTuple):
     """Response of the pixels in one exposure.
 
     Args:
-        electrons_per_cd: (3,) expected electrons at 1 cd/m2 on the axis, for R, G, B.
+        electrons_per_cd: (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B.
         full_well_e: full-well capacity [e-].
         read_noise_e: standard deviation of the read noise [e-].
         dn_per_e: digital numbers per electron, K of EMVA 1288.
@@ -55,7 +55,7 @@ def read_out(
         light: (H, W, 3) light per colour band in photometric units [cd/m2].
         vignetting: (H, W) illuminance relative to the axis.
         response: response of the pixels.
-        bayer: whether each pixel has one colour band only.
+        bayer: whether each pixel records only one colour band.
         rng: random stream, of which one number is drawn per image; None = no noise.
     """
     height, width = vignetting.shape
@@ -99,10 +99,11 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 
 @njit(cache=True, nogil=True)
 def _normal_to_poisson(expected, shot):
-    """Replaces normal numbers z in `shot` by electron counts with mean m, variance and skewness of a Poisson number.
+    """Replaces standard normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
 
-    The numbers are m + s z + (z^2 - 1) / 6, the first terms of the Cornish-Fisher expansion (1938), with
-    s^2 = m - 1/18 - 1/12 to compensate for the variance of the quadratic term and of the rounding.
+    The counts are m + s z + (z^2 - 1) / 6, rounded, with m the mean: the first terms of the Cornish-Fisher expansion
+    (1938), which give the skewness. s^2 = m - 1/18 - 1/12 compensates for the variance of the quadratic term and of the
+    rounding.
     """
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):
@@ -114,7 +115,7 @@ def _normal_to_poisson(expected, shot):
 
 @njit(cache=True, nogil=True)
 def _poisson(expected, uniform):
-    """Returns a Poisson-distributed number of electrons by inversion, from 32 random bits."""
+    """Returns a Poisson-distributed number of electrons of mean `expected`, by inversion of 32 random bits."""
     uniform = (np.float64(uniform) + 0.5) * 2.0**-32
     probability = np.exp(-np.float64(expected))
     below, count = probability, 0
@@ -127,7 +128,7 @@ def _poisson(expected, uniform):
 
 @njit(cache=True, nogil=True)
 def _digitise(electrons, noise, response, out):
-    """Fills `out` (n,) with the digital numbers of `electrons` plus read noise."""
+    """Fills `out` (n,) with the digital numbers of `electrons` plus read noise; `noise` is standard normal."""
     full_well, read_noise, dn_per_e, black, top = response[3], response[4], response[5], response[6], response[7]
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(out.size):

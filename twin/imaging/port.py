@@ -5,8 +5,8 @@ air of refractive index 1. Near the axis of an untilted port the camera in water
 ray at a small angle leaves the outer face at height h and angle w, both proportional to its angle in air. The pinhole
 lies at a distance h / w from that face, on the side of the camera, and its focal length is that of the lens times the
 ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g, in water of index n,
-this is n times the focal length, d (n - 1) + t (n / g - 1) behind the pupil (Treibitz et al. 2012, doi
-10.1109/TPAMI.2011.105, give the errors of this approximation off the axis).
+the pinhole lies d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that of the lens.
+Treibitz et al. 2012 (doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
-STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # of Newton's method in `air_tangents`; step and tolerance are tangents
-SMALL_RAD = 1e-4  # paraxial angle, whose cube is negligible
+STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: number of steps; step of differences, tolerance (tangents)
+SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
 class Pinhole(NamedTuple):
-    """Pinhole camera in water that is equivalent to a camera behind a port near its axis.
+    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port.
 
     Args:
         centre_m: position of the pinhole on the optical axis, positive in front of the entrance pupil.
@@ -50,7 +50,7 @@ def pinhole(port: PortConfig) -> Pinhole:
 def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
     """Returns origin on the outer face [m] and unit direction in water, both (..., 3), of rays with tangents in air.
 
-    NaN where the ray is blocked or totally reflected. Without a port, rays start at the pupil.
+    NaN where a ray misses the port or is totally reflected. Without a port, rays start at the entrance pupil.
 
     Args:
         port: geometry and refractive indices.
@@ -71,8 +71,8 @@ def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
 def air_tangents(port: PortConfig, points_m: Array) -> Array:
     """Returns the tangents (..., 2) in air of the rays that reach points (..., 3) [m]; NaN where no ray does.
 
-    Inverse of `water_rays` by Newton's method, starting from the equivalent pinhole. The angle in air grows faster than
-    that in water, so that convergence is monotonic for a flat pane.
+    Inverse of `water_rays` by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
+    monotonic, because the angle in air grows faster than the angle in water.
     """
     tangents = points_m[..., :2] / points_m[..., 2:]
     if port.kind == "none":
@@ -81,7 +81,7 @@ def air_tangents(port: PortConfig, points_m: Array) -> Array:
     tangents = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
 
     def miss(at: Array) -> Array:
-        """Returns the lateral distance of the rays from the points, divided by depth."""
+        """Returns the lateral offset (..., 2) of the rays from the points at their depth, divided by the depth."""
         origin, direction = water_rays(port, at)
         along = (points_m[..., 2:] - origin[..., 2:]) / direction[..., 2:]
         return (origin + along * direction - points_m)[..., :2] / points_m[..., 2:]
@@ -102,7 +102,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
     Args:
         ray: (..., 3) unit directions of incidence.
         normal: (..., 3) unit normals in the direction of propagation.
-        ratio: refractive index before the face divided by that behind it.
+        ratio: refractive index before the face, divided by the index behind the face.
     """
     cosine = (ray * normal).sum(axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):
@@ -111,7 +111,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the plane at `depth_m` in the glass of a flat pane."""
+    """Returns intersections and normals (..., 3) of rays with the plane at `depth_m` from the inner face of a pane."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     along = ray @ normal
@@ -120,7 +120,7 @@ def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tup
 
 
 def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the sphere at depth `depth_m` in the glass of a dome."""
+    """Returns intersections and normals (..., 3) of rays with the sphere at `depth_m` from the inner face of a dome."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre
     along = (from_centre * ray).sum(axis=-1)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 LOG2_E = 1.4426950408889634
-LEAST = -126.0  # smallest exponent, that of the smallest normal number in single precision; others are clipped to it
+LEAST = -126.0  # exponent of the smallest normal number in single precision; smaller exponents are clipped to it
 
 
 @njit(cache=True, nogil=True, inline="always")

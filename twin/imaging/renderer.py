@@ -1,4 +1,4 @@
-"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without water and without lamps."""
+"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without the effects of water and lamps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
-NEAR_M = 0.05  #: near clipping plane
+NEAR_M = 0.05  #: depth of the near clipping plane
 
 
 class Renderer:
@@ -25,7 +25,7 @@ class Renderer:
     Args:
         scene: MuJoCo model of the scene.
         width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
-        znear_m, zfar_m: clipping planes.
+        znear_m, zfar_m: depths of the clipping planes.
     Raises:
         TwinError: OpenGL is not available.
     """
@@ -56,7 +56,7 @@ class Renderer:
         self._shown = np.ones(len(self._tiles), dtype=bool)
 
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; depth inf = no floor.
+        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor.
 
         Args:
             world_from_camera: (4, 4) pose of the camera.
@@ -97,7 +97,7 @@ class Renderer:
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the visible tiles; hidden ones lose their mesh, as a geom without a mesh costs almost nothing."""
+        """Shows only the visible tiles; hidden tiles lose their mesh, as a geom without a mesh costs almost no time."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible
@@ -131,7 +131,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the tiles in view: no side of the view frustum excludes their bounding box.
+    """Returns a mask (n,) of the tiles that may be in view: their bounding box is outside no side of the view frustum.
 
     Args:
         scene: MuJoCo model of the scene.
@@ -141,7 +141,7 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
     low, high = scene.tile_low_m - world_from_camera[:3, 3], scene.tile_high_m - world_from_camera[:3, 3]
-    # the innermost corner of a box relative to a side: along each axis the end that the normal points to
+    # per side, the corner of each box that is farthest inward: along each axis, the end to which the normal points
     farthest = high @ np.maximum(inward, 0).T + low @ np.minimum(inward, 0).T
     return np.all(farthest >= 0, axis=1)
 
@@ -149,7 +149,7 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
 def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.float32) -> NDArray[np.float32]:
     """Returns the depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far); inf where nothing is drawn.
 
-    1 / depth = z (1/near - 1/far) + 1/far.
+    With z the value in the buffer, 1 / depth = z (1/near - 1/far) + 1/far.
     """
     inverse = z_buffer * np.float32(1 / near_m - 1 / far_m) + np.float32(1 / far_m)
     return np.where(z_buffer > 0, np.reciprocal(inverse), np.float32(np.inf))

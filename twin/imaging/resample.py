@@ -1,8 +1,8 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps round positions to 1/32 px. Radiance is resampled with the B-spline itself as the response of a pixel,
-which suppresses detail of the rendering beyond half a cycle per pixel that would alias. Sensor images are interpolated:
-a prefilter makes the spline pass through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
+OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline itself is the response
+of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Images of the sensor are
+interpolated: a prefilter makes the spline pass through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Radiance = NDArray[np.float32]
 Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
 
 REACH_PX = 2  # support of the spline to each side
-POLE, MIRRORED = 3**0.5 - 2, 16  # of the spline's prefilter; POLE^16 is negligible in single precision
-INTERSECTION_STEPS = 4  # each multiplies the error by p / z times the floor's slope; p, z: see `intersect`
-INTERSECTION_PX = 1e-3  # size of the last step; the remaining error is a few percent of it
+POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
+INTERSECTION_STEPS = 4  # at most; each multiplies the error by p / z (see `intersect`) times the slope of the floor
+INTERSECTION_PX = 1e-3  # iteration ends at steps below this; the remaining error is a few percent of the last step
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
-    """Returns the radiance (h, w, 3) that pixels at these positions collect from a radiance image (H, W, 3).
+    """Returns the radiance (h, w, 3) recorded by pixels at these positions in a radiance image (H, W, 3).
 
     Beyond the image border the last row or column is repeated.
     """
@@ -50,13 +50,14 @@ def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
 def intersect(depth: NDArray[np.float32], positions: Positions, parallax_px_m: Positions) -> Positions:
     """Returns the image positions where rays that do not pass through the camera centre intersect the floor.
 
-    A ray at distance p [m] from the camera centre at depth zero is imaged f p / z away from its vanishing point, with z
-    the depth of the floor at that position. 1 / z of a plane is linear in the image and is interpolated linearly.
+    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
+    vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
+    is linear for a plane, is interpolated bilinearly.
 
     Args:
         depth: (H, W) depth [m]; inf where there is no floor.
         positions: (h, w, 2) vanishing points of the rays.
-        parallax_px_m: (h, w, 2) product f p [px m].
+        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m].
     """
     out, near = np.empty_like(positions), np.reciprocal(depth)
     in_row_bands(lambda first, end: _intersect(near, positions, parallax_px_m, out, first, end), len(positions))
@@ -65,7 +66,7 @@ def intersect(depth: NDArray[np.float32], positions: Positions, parallax_px_m: P
 
 @njit(cache=True, nogil=True, inline="always")
 def _weights(t):
-    """Returns the B-spline weights of four pixels for a position at a distance t in [0, 1] from the second."""
+    """Returns the B-spline weights of four consecutive pixels for a position t in [0, 1] pixels after the second."""
     s, sixth = np.float32(1.0) - t, np.float32(1 / 6)
     four, three = np.float32(4.0), np.float32(3.0)
     a, d = s * s * s * sixth, t * t * t * sixth
@@ -138,7 +139,7 @@ def _filter_rows(image, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect(near, positions, parallax, out, first, end):
-    """Fills rows `first` to `end` of `out` by fixed-point iteration; `near` is 1 / depth."""
+    """Fills rows `first` to `end` of `out` by fixed-point iteration (see `intersect`); `near` is 1 / depth."""
     rows, cols = near.shape
     for v in range(first, end):
         for u in range(out.shape[1]):

@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 THREADS = 2  # with more threads, synchronization costs more than it gains: an image takes milliseconds
-LEAST_ROWS = 32  # smallest band; for fewer rows, waking a thread costs more than the work
+LEAST_ROWS = 32  # smallest band; for fewer rows, starting a thread costs more than the work
 
 
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1) -> None:
-    """Runs `work(first_row, end_row)` over all rows, in parallel where processors are free.
+    """Runs `work(first_row, end_row)` over all rows, in parallel if the image is large and processors are available.
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.

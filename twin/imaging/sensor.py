@@ -1,6 +1,6 @@
-"""Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8 bits.
+"""Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8-bit output.
 
-It is used for scenarios without a section [sensor]; its gain is unlimited and its exposure time zero.
+It is used for scenarios without a section [sensor]. Its gain is unlimited and its exposure time is zero.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ DARK_CD_M2 = 1e-6  # lower limit of the metered light
 
 
 class AutoExposure:
-    """Auto-exposure: sets the gain that brings the mean of the brightest channel to `gray_level`, with a lag.
+    """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest channel reaches `gray_level`.
 
-    The brightest channel is used because water absorbs colours: if the mean of all channels were metered, the least
-    absorbed channel would saturate. The gain of a frame is computed from the previous frames, as in a real camera; the
-    gain of the first frame is computed from that frame itself.
+    The brightest channel is used because water absorbs the colours unequally: if the mean of all channels were metered,
+    the least absorbed channel would saturate. The gain of a frame is computed from the previous frames, as in a real
+    camera; the gain of the first frame is computed from that frame itself.
 
     Args:
         gray_level: target mean as a fraction of full scale.
         frame_rate_hz: frames per second.
-        lag_s: time constant; 0 = the gain follows within one frame.
+        lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
         limits: smallest and largest gain [1 / (cd/m2)].
     """
 
@@ -53,11 +53,11 @@ class AutoExposure:
         self._log_gain: float | None = None
 
     def gain(self, radiance: Radiance) -> float:
-        """Returns the gain of this frame [1 / (cd/m2)]; its radiance (H, W, 3) affects the next frames."""
+        """Returns the gain of this frame [1 / (cd/m2)]; its radiance (H, W, 3) affects the gain of later frames."""
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
-        """Same as `gain` for the mean of the brightest channel [cd/m2]; the target is clipped to the limits."""
+        """Same as `gain`, given the mean of the brightest channel [cd/m2]; the target gain is clipped to the limits."""
         least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
         metered = float(np.log(wanted))
@@ -70,7 +70,7 @@ class ExposureSetting(NamedTuple):
     """Exposure of one frame.
 
     Args:
-        gain: image signal per unit of light on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
+        gain: image signal per unit of radiance on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
         exposure_s: exposure time; 0 for a sensor without motion blur.
         analogue_gain: amplification before digitization.
     """
@@ -88,7 +88,7 @@ class PlainSensor:
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns the exposure of a frame, metered on the previous frames; `light` affects the next frames."""
+        """Returns this frame's exposure, metered on the previous frames; its radiance `light` affects later frames."""
         return ExposureSetting(self._exposure.gain(light))
 
     def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
@@ -96,7 +96,7 @@ class PlainSensor:
         return light
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns the 8-bit image (H, W, 3) of a radiance, without noise where `rng` is None."""
+        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
         if rng is not None:
             return expose(light, setting.gain, self._imaging, rng)
         noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
@@ -104,13 +104,13 @@ class PlainSensor:
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """Returns the 8-bit image (H, W, 3) of a radiance; the noise variance is read^2 + shot^2 * signal.
+    """Returns the noisy 8-bit image (H, W, 3) of a radiance image; the noise variance is read^2 + shot^2 * signal.
 
     Args:
         radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
-        gain: image signal per unit of light [1 / (cd/m2)]; a signal of 1 saturates.
-        imaging: standard deviations of read noise, and of shot noise at full scale, as fractions of full scale.
-        rng: random stream of this camera; one number is drawn per image.
+        gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
+        imaging: standard deviation of read noise, and of shot noise at full signal, as fractions of full scale.
+        rng: random stream of this camera, from which one number is drawn per image.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)
@@ -123,7 +123,7 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
 
 @njit(cache=True, nogil=True)
 def _mean(light):
-    """Returns the mean (3,) of each band of an image (H, 3 W): first over rows, then over columns."""
+    """Returns the mean (3,) of each band of an image (H, 3 W), summed first over rows, then over columns."""
     columns, total = np.zeros(light.shape[1]), np.zeros(3)
     for v in range(light.shape[0]):
         row = light[v]
@@ -136,7 +136,7 @@ def _mean(light):
 
 @njit(cache=True, nogil=True)
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` of `image` (H, 3 W); each 64 random bits yield four normal numbers."""
+    """Fills rows `first` to `end` of `image` (H, 3 W) with 8-bit values; 64 random bits yield four normal numbers."""
     n = light.shape[1]
     n_words = (n + 3) // 4
     full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)

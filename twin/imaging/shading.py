@@ -1,8 +1,8 @@
-"""Compiled kernels of `optics`: one row of pixels at a time, in loops that the compiler can vectorize.
+"""Compiled kernels of `optics`: they process one row of pixels at a time, in loops that the compiler can vectorize.
 
-A table lookup takes two loops over the row: the first computes the cell and the fraction within it (`lookup`), the
-second reads the table. This lets the compiler vectorize the first loop. For the same reason, rows of colours are
-indexed in memory order.
+A table lookup takes two loops over the row: the first computes the table cell and the fraction within the cell
+(`lookup`), the second reads the table. This lets the compiler vectorize the first loop. For the same reason, pixels of
+colour images are indexed in memory order.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depth
 def shade(albedo, depth, focal, lamps, beams, transmission, scatter_table, sky, out, lit, scatter_out, first, end):
     """Fills rows `first` to `end` of `out` (H, W, 3) with radiance.
 
-    Where `scatter_out` is given, the backscatter is written to it and not added to `out`. The compiler removes the
-    code for arguments that are None.
+    If `scatter_out` (H, W, 3) is given, the backscatter is written to it instead of being added to `out`. The compiler
+    removes the code for arguments that are None.
 
     Args:
-        lamps: (n, 10) position, axis, intensity, colour.
+        lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)), 0 to 1.
         transmission: (3, m) transmission at even steps of path length.
-        scatter_table: (rows, cols, 3, ranges) backscatter on a coarse pixel grid and at even steps of r / (r + scale).
-        sky: illuminance below the surface (3,); attenuation with depth and with range from the camera (2, 3) [1/m];
-            caustics (n + 1, n + 1), or None; (3, 4) map from a point in the camera to column and row in the caustics
-            and depth below the surface.
+        scatter_table: (rows, cols, 3, ranges) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
+        sky: illuminance just below the surface (3,) [lx]; attenuation with depth and with range from the camera (2, 3)
+            [1/m]; caustics (m + 1, m + 1) or None; (3, 4) map from a point in the camera axes to column and row in the
+            caustics and depth below the surface.
         lit: (n, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no shadows.
     """
     height, width = depth.shape
@@ -76,8 +76,8 @@ def shade(albedo, depth, focal, lamps, beams, transmission, scatter_table, sky, 
 def _range_and_normal(depth, v, y, focal, range_m, normal):
     """Computes range and unit normal (3, W) of the floor in a row of pixels; the normal points towards the camera.
 
-    The normal follows from the depth gradient. The smaller of the slopes to both neighbours is used, so that a depth
-    edge does not tilt the surface next to it.
+    The normal is computed from the depth gradient. In each direction, the smaller of the depth differences to the two
+    neighbours is used, so a depth edge does not tilt the normals next to it.
     """
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
@@ -100,10 +100,10 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
-    """Computes the light of a lamp on the floor of a row of pixels.
+    """Computes the geometry of the illumination by a lamp for the floor in a row of pixels.
 
-    Fills `out` (3, W): illuminance by an isotropic lamp in clear water, sqrt(1 - cos(angle from the beam axis)), and
-    distance from the lamp.
+    Fills `out` (3, W) with the illuminance that an isotropic lamp would cause in clear water, with
+    sqrt(1 - cos(angle from the beam axis)), and with the distance from the lamp.
     """
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
@@ -126,7 +126,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, attenuated from the lamp to the floor and to the camera."""
+    """Adds to `light` (3, W) the illuminance by a lamp, attenuated on the path from lamp to floor to camera."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
@@ -151,7 +151,7 @@ def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
-    """Fills `share` (W,) with the daylight on the floor in a row of pixels relative to its mean; 0 without floor."""
+    """Fills `share` (W,) with the daylight on the floor relative to its mean, for a row of pixels; 0 without floor."""
     half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
         share[u] = one if here[u] < far else zero
@@ -191,7 +191,7 @@ def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_rows(table, row, out):
-    """Fills `out` with the backscatter table of one row of pixels, interpolated between two rows of `table`."""
+    """Fills `out` (cols, 3, ranges) with the backscatter for a row of pixels, interpolated between rows of `table`."""
     j = min(int(row), table.shape[0] - 2)
     w = row - np.float32(j)
     lower, upper = table[j], table[j + 1]
@@ -205,7 +205,7 @@ def _interpolate_rows(table, row, out):
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
     """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range.
 
-    The order of operations is deliberate in each band: another order would change the last bits of the images.
+    The bands deliberately differ in the order of operations: another order would change the last bits of the images.
     """
     cols, _, ranges = table.shape
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
@@ -234,7 +234,7 @@ def _interpolate_backscatter(table, range_m, lookup, backscatter):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, backscatter, out):
-    """Fills `out` (W, 3) with the radiance of a Lambertian floor (albedo 255 = 1) plus the backscatter."""
+    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus the backscatter."""
     reflected = np.float32(1 / (255 * np.pi))
     white, filled = albedo.reshape(-1), out.reshape(-1)
     for u in range(out.shape[0]):

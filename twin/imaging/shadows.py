@@ -1,8 +1,8 @@
-"""Shadows that the floor casts in the light of the lamps, which are mounted at a distance from the cameras.
+"""Shadows that the floor casts in the light of the lamps; visible because the lamps are at a distance from the cameras.
 
-A point of the floor is in shadow where the straight ray to the lamp passes below the floor. The floor is the rendered
-surface itself: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses its edges, so
-that only edge crossings are tested, and only in blocks of cells that are high enough to reach the ray. A ray that
+A point of the floor is in the shadow of a lamp if the straight ray to the lamp passes below the floor. The floor is the
+rendered surface: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses one of its
+edges, so only edge crossings are tested, and only in blocks of cells that are high enough to reach the ray. A ray that
 starts on the floor and rises more steeply than all triangles passed so far is still above the floor.
 """
 
@@ -21,9 +21,9 @@ from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 
-BLOCK_CELLS = 8  # side of the blocks whose highest point is stored
-STRIDE_PX = 4  # spacing of the pixels tested first; between four equal results no further pixels are tested
-BIAS_M = 1e-4  # smallest height of the floor above the ray that counts as a hit, as depth is single precision
+BLOCK_CELLS = 8  # side of a block of cells; the highest point and the steepest slope of each block are stored
+STRIDE_PX = 4  # spacing of the pixels tested first; pixels between four equal results are not tested
+BIAS_M = 1e-4  # the floor must exceed the ray by this to occlude it, as depth is in single precision
 
 
 class Heights(Protocol):
@@ -40,7 +40,15 @@ class Heights(Protocol):
 
 
 class _Grid(NamedTuple):
-    """Heights (ny, nx) of the grid nodes; per block, highest node and steepest slope [m per cell]; origin, spacing."""
+    """Floor heights prepared for ray casting.
+
+    Args:
+        height_m: (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west.
+        block_top_m: (rows, cols) height of the highest node of each block of cells.
+        block_rise_m: (rows, cols) steepest slope of the triangles of each block [m per cell].
+        west_m, south_m: position of the first node.
+        spacing_m: distance between neighbouring nodes.
+    """
 
     height_m: NDArray[np.float32]
     block_top_m: NDArray[np.float32]
@@ -85,7 +93,7 @@ class Shadows:
 
 
 def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns the largest height [m] and the steepest triangle slope [m per cell] of each block, borders included."""
+    """Returns the largest height [m] and the steepest triangle slope [m per cell] of each block of cells."""
     along_x, along_y = np.diff(height, axis=1), np.diff(height, axis=0)
     south_east = np.hypot(along_x[:-1], along_y[:, 1:])
     north_west = np.hypot(along_x[1:], along_y[:, :-1])
@@ -93,7 +101,7 @@ def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
-    """Returns the largest value of each block of cells, including the nodes on its far borders."""
+    """Returns the largest value of each block; with `border` 1, nodes on its north and east borders are included."""
     starts = [np.arange(0, n - border, BLOCK_CELLS) for n in values.shape]
     inner = np.maximum.reduceat(np.maximum.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     if not border:
@@ -106,7 +114,7 @@ def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _test_lattice(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, first, end):
-    """Fills rows `first` to `end` of `lattice` (lamps, rows, cols), 1 = lit, at pixels `STRIDE_PX` apart."""
+    """Fills rows `first` to `end` of `lattice` (lamps, rows, cols) with 1 = lit or 0, for pixels `STRIDE_PX` apart."""
     for k in range(lamps.shape[0]):
         lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
@@ -118,7 +126,7 @@ def _test_lattice(height, tops, rises, west, south, spacing, depth, focal, pose,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, out, first, end):
-    """Fills `out` (lamps, H, W) between rows of the lattice; tests a pixel where its four corners differ."""
+    """Fills `out` (lamps, H, W) between lattice rows; tests only pixels whose four lattice corners differ."""
     for k in range(lamps.shape[0]):
         lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):
@@ -142,7 +150,7 @@ def _fill_between(height, tops, rises, west, south, spacing, depth, focal, pose,
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp, v, u):
-    """Returns 0 if the floor occludes the lamp at (column, row, height) from the floor point of a pixel, else 1."""
+    """Returns 0 if the floor occludes `lamp` (column, row, height) as seen from the point in pixel (v, u), else 1."""
     z = np.float64(depth[v, u])
     if not np.isfinite(z):
         return np.uint8(1)
@@ -159,10 +167,10 @@ def _is_lit(height, tops, rises, west, south, spacing, depth, focal, pose, lamp,
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _grid_steps(at, along, cell, size):
-    """Returns the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
+    """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
 
     Returns:
-        Step of the cell index; t at the next grid line, and increment of t from line to line.
+        Step of the cell index (-1, 0 or 1), t at the next grid line, and increment of t from line to line.
     """
     if along == 0:
         return 0, np.inf, np.inf

@@ -6,15 +6,16 @@ A point of the floor at depth Z moves through the image of a camera with twist (
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
 
-Each pixel collects light along its own path through the image of mid-exposure: its value is the mean over the exposure;
-with a rolling shutter, it is the light at its position at the time of its row. Pose and true depth of a frame are those
-of mid-exposure of the middle row.
+Both effects are computed from the image at mid-exposure. With motion blur, the value of a pixel is the mean along its
+path: the flow times the exposure time, centred on the pixel. With a rolling shutter, it is the value at the position of
+the pixel minus the flow times the delay of its row. The pose and the true depth of a frame refer to mid-exposure of the
+middle row.
 
-Limits: paths are straight and the flow is constant during the exposure (the curvature of a path is below f (w T)^2 / 8;
-vibration is not modelled). The depth of a pixel is assumed along its whole path: depth edges stay sharp, and marine
-snow, backscatter and the lamp pattern are blurred like the floor. Backscatter and lamp pattern move with the camera,
-but they are smooth over a few pixels. Light is conserved where the flow is uniform. Beyond the image border the last
-pixel is repeated.
+Limits: the flow of a pixel is constant during the exposure time T, so paths are straight (a rotation would bend them by
+less than f (|w| T)^2 / 8); vibration is not modelled. A path is computed with the depth at its own pixel: the blur of a
+near object does not spread over the background. Marine snow, backscatter and the lamp pattern are blurred like the
+floor behind them; backscatter and lamp pattern move with the camera, but hardly vary over a few pixels. Total light is
+conserved only where the flow is uniform. Beyond the image border the last pixel is repeated.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-SHORT_PX = 2.8  # longest path for the 3 x 3 kernel, which is valid up to sqrt(8) px
+SHORT_PX = 2.8  # longest path for the 3 x 3 kernel; at sqrt(8) px along a row its three weights are equal
 
 
 def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
@@ -64,7 +65,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 
 @njit(cache=True, nogil=True, inline="always")
 def _flow(x, y, near, scale, twist):
-    """Returns the optical flow at tangents x, y, with `near` = 1 / depth.
+    """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth.
 
     The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration."""
     one = np.float32(1.0)
@@ -75,7 +76,7 @@ def _flow(x, y, near, scale, twist):
 
 @njit(cache=True, nogil=True, inline="always")
 def _cubic(t):
-    """Returns the weights of four neighbours at -1, 0, 1, 2 for a position t in [0, 1] (Keys 1981, a = -1/2)."""
+    """Returns the weights of the pixels at -1, 0, 1, 2 for cubic interpolation at t in [0, 1] (Keys 1981, a = -1/2)."""
     half, one, steep = np.float32(0.5), np.float32(1.0), np.float32(1.5)
     s = one - t
     return (
@@ -108,9 +109,10 @@ def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _blur_row(above, here, below, near, x, y, scale, twist, out):
-    """Fills a row (3 W,), except its first and last pixel, for short paths; returns whether all paths are short.
+    """Blurs a row (3 W,), except its first and last pixel; returns whether all its paths are short (`SHORT_PX`).
 
-    The nine samples have the moments of a uniform path (a, b): a^2 / 12, b^2 / 12, a b / 12 and, mixed, a^2 b^2 / 80.
+    The weights of the 3 x 3 kernel have the moments of a uniform distribution along a straight path (a, b) [px]:
+    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80.
     """
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
@@ -131,10 +133,12 @@ def _blur_row(above, here, below, near, x, y, scale, twist, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
-    """Computes the mean radiance over a path centred on a pixel, from samples one pixel apart along its longer axis a.
+    """Writes to `out` the mean radiance over a path centred on pixel (a, b), from 2 m + 1 samples.
 
-    All 2 m + 1 samples have equal weight except the two at the ends, whose weight makes the variance equal to
-    that of a uniform path, length^2 / 12, for every length. Interpolation across the path does not change the variance.
+    The path extends by `length` along image axis a and by the smaller `aside` along axis b [px]. The samples are one
+    pixel apart along a and are interpolated along b, which does not change the variance along a. Their weights are
+    equal except at the two ends, where they are chosen such that this variance is that of a uniform distribution,
+    length^2 / 12.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]

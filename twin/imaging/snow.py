@@ -1,9 +1,9 @@
 """Marine snow: small white particles that drift with the current through the light of the lamps.
 
-The particles fill a periodic box around the left camera: a particle that leaves it on one side, as the vehicle moves,
-re-enters on the other. Particles are therefore the same in both cameras and from frame to frame. A particle of diameter
-D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Blur spreads its light: by one pixel due to
-the lens and, as the lens is focused at infinity, by f A / z due to the aperture of diameter A.
+The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
+side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
+of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Two blurs spread its light: one
+pixel due to the lens, and f A / z due to defocus (a lens with an aperture of diameter A, focused at infinity).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from twin.scenario.model import SnowConfig
 
 Array = NDArray[np.float64]
 
-BOX_M = 5.0  # side of the periodic box; snow is visible up to half of it
+BOX_M = 5.0  # side of the periodic box; along each axis of the world, snow is visible up to half of it
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture
 PIXEL_BLUR_PX = 1.0
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera: column and row (n, 2) [px], depth (n,) [m], light per band (n, 3) [cd/m2]."""
+    """Particles in view of a camera: column and row (n, 2) [px], depth (n,) [m], radiance per band (n, 3) [cd/m2]."""
 
     pixel: Array
     depth_m: Array
@@ -94,7 +94,7 @@ class MarineSnow:
         _draw(light, depth, particles.pixel, particles.depth_m, particles.radiance, width_px, cover_px2)
 
     def _radiance(self, points: Array, sources: LightSources) -> Array:
-        """Returns the light (n, 3) of particles at `points` (n, 3) in the camera axes, per colour band [cd/m2]."""
+        """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m]."""
         range_m = np.linalg.norm(points, axis=1)[:, None]
         attenuation = self._water.attenuation_per_m
         day = sources.daylight
@@ -108,13 +108,13 @@ class MarineSnow:
 
 
 def _width_px(focal_px: float, diameter_m: float, depth_m: Array | float) -> Array:
-    """Returns the diameter of a particle in the image [px], including blur."""
+    """Returns the diameter of a particle's image [px], including blur."""
     return np.sqrt((focal_px / np.asarray(depth_m)) ** 2 * (diameter_m**2 + APERTURE_M**2) + PIXEL_BLUR_PX**2)
 
 
 @njit(cache=True, nogil=True)
 def _draw(light, depth, pixel, z, radiance, width, cover):
-    """Draws each particle as a disc with a soft rim into `light`, occluding what is behind it."""
+    """Draws each particle into `light` as a disc with a soft rim, except where the floor is nearer."""
     rows, cols = depth.shape
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5

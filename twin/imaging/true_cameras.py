@@ -1,9 +1,10 @@
 """Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
 
 The floor is rendered for two parallel pinhole cameras in water, with images larger than the frames where necessary.
-Each pixel of a raw image has its own ray through lens and port; its radiance is sampled where that ray intersects the
-rendered depth. The sensor makes a raw image of the sampled radiance, and a frame is the raw image rectified with the
-believed calibration. Where the true cameras are the believed pinholes, the rendered image is used unchanged.
+Each pixel of a raw image has its own ray through lens and port; the radiance of the pixel is sampled from the rendered
+image at the point where its ray intersects the rendered floor. The sensor model converts the sampled radiance to the
+raw image, which is rectified with the believed calibration to obtain the frame. If both true cameras equal the believed
+pinhole cameras, the rendered image is used unchanged.
 
 Raw images have the size of the frames plus a border that the rectification needs.
 """
@@ -31,8 +32,8 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-NEAREST_M = 0.3  # nearest floor that the margin covers
-MARGIN_STEP_PX = 8  # the rendered margin is a multiple of this, so that the image size keeps its divisors
+NEAREST_M = 0.3  # smallest depth of the floor for which the rendered margin suffices
+MARGIN_STEP_PX = 8  # the rendered margin is a multiple of this, so the image size keeps factors of two up to 16
 WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
 
 
@@ -56,7 +57,7 @@ class CameraModel(NamedTuple):
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Returns origin [m] and direction (..., 3) of the rays of pixels (..., 2); NaN where a pixel has no ray."""
+        """Returns origin [m] and direction (..., 3) of the rays of pixels (..., 2) in water; NaN if there is no ray."""
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
             air = air / self.pinhole.focal_ratio
@@ -79,9 +80,9 @@ class SamplingMap(NamedTuple):
     """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled.
 
     Args:
-        positions: (h, w, 2) position for each raw pixel if the point it shows is at infinity [px].
-        parallax_px_m: (h, w, 2) shift of that position for a point at a finite depth, times the depth [px m]; None if
-            zero.
+        positions: (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px].
+        parallax_px_m: (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is
+            `positions` + `parallax_px_m` / z. None if zero.
     """
 
     positions: Positions
@@ -97,10 +98,10 @@ class TrueCameras:
             the margin.
         margin_px: (columns, rows) by which the rendered image extends beyond the frame on each side.
         raw_rig: calibration of the raw images: their size, the focal length of the lens in air, the true baseline.
-        sampling: for the left and the right camera, position in the rendered image of each raw pixel; None where the
-            raw image is the rendered image.
-        rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None where the
-            frame is the raw image.
+        sampling: for the left and the right camera, position in the rendered image of each raw pixel; None if the
+            rendered images are used as raw images.
+        rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw
+            images are used as frames.
         models: models of the true left and right camera.
         believed: camera model that is used to rectify the images of both cameras.
         rectified_depth_m: depth of the points for which the rectification is exact.
@@ -138,7 +139,12 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the frame pixels (n, 2) of points (n, 3) [m] in the rendered camera's axes; NaN if not imaged."""
+        """Returns the pixels (n, 2) in the frame of points (n, 3) [m], given in axes of the rendered camera.
+
+        Args:
+            points_m: (n, 3) points; those that are not imaged have NaN pixels.
+            camera: 0 left, 1 right.
+        """
         rig = self.rendered_rig
         if self.sampling is None:
             return rig.project(points_m)
@@ -153,7 +159,8 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     """Returns the true cameras of a scenario.
 
     Raises:
-        TwinError: rays are blocked by the port, the lens folds the image, or the field of view is too wide.
+        TwinError: the lens is outside its dome, the port transmits no rays to part of the image, the distortion folds
+            the image back onto itself, or the field of view is too wide.
     """
     believed_rig, calibration = scenario.believed_rig(), scenario.calibration_error
     _check_port(scenario.port)
@@ -197,7 +204,7 @@ def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
 
 
 def _believed_model(scenario: Scenario) -> CameraModel:
-    """Returns the camera model for the rectification; an uncalibrated port only scales its focal length."""
+    """Returns the camera model for the rectification; an uncalibrated port only changes the focal length."""
     rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
     lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
     port = scenario.port
@@ -215,7 +222,7 @@ def right_rotation(calibration: CalibrationErrorConfig) -> Array:
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    """Returns whether both true cameras are the believed pinholes, apart from the baseline."""
+    """Returns whether both true cameras equal the believed pinhole cameras, apart from the baseline."""
     same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
@@ -233,7 +240,7 @@ def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Arr
 
 
 def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns positions and parallax, as in `SamplingMap`, of raw pixels in a rendered image of the frame's size."""
+    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin."""
     distorted = (pixels - camera.principal_px) / camera.focal_px
     if np.isnan(lenses.undistort(distorted, camera.lens)).any():
         raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
@@ -256,7 +263,7 @@ def _or_none(parallax: Array) -> Positions | None:
 
 
 def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
-    """Returns columns and rows (h, w, 2) of an image with a border, relative to the first pixel of the image."""
+    """Returns column and row (h, w, 2) of all pixels of an image and its border; (0, 0) is the image's corner pixel."""
     columns = np.arange(-border[0], rig.width_px + border[0])
     rows = np.arange(-border[1], rig.height_px + border[1])
     return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
@@ -270,7 +277,7 @@ def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
 
 
 def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the margin (columns, rows) [px] around the frame with which the rendered image covers all raw pixels."""
+    """Returns the margin (columns, rows) [px] that the rendered image needs to cover all raw pixels."""
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
     margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX

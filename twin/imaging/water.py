@@ -52,12 +52,12 @@ class Medium(NamedTuple):
 
     @property
     def attenuation_per_m(self) -> Array:
-        """Effective attenuation (3,) [1/m]: a + (1 - k) b.
+        """Effective attenuation coefficient (3,) [1/m]: a + (1 - k) b.
 
-        With k = 0 this is the beam attenuation c = a + b, where all scattered light counts as lost. Most scattered
-        light hardly changes its direction, however, so that c underestimates the light of distant floors in turbid
-        water. If k is the fraction scattered by small angles, this is a + 0.26 b, close to G = a + 0.3 b measured for
-        range-gated images.
+        With k = 0 this is the beam attenuation coefficient c = a + b, which counts all scattered light as lost. Most
+        light is scattered by small angles, however, so in turbid water c overestimates the attenuation of the light
+        from a distant floor. With k = 0.74, the fraction scattered by less than 15 deg, the coefficient is
+        a + 0.26 b, close to a + 0.3 b measured for range-gated images.
         """
         return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
@@ -129,7 +129,7 @@ def downwelling_per_m(water: Medium) -> Array:
     """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a sun at the zenith.
 
     Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; a fit to
-    Monte Carlo simulations of multiple scattering, so that Kd lies between a and c.
+    Monte Carlo simulations of multiple scattering. Kd lies between a and c.
     """
     a, b = water.absorption_per_m, water.scattering_per_m
     return np.sqrt(a**2 + 0.235 * a * b)

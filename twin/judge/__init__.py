@@ -1,1 +1,1 @@
-"""Comparison of the estimates with the truth: numbers only, no figures and no text."""
+"""Evaluation of the estimates against the truth. Computes metrics only; `twin.report` presents them."""

@@ -20,9 +20,10 @@ FAR_SHARE = 0.9
 def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     """Returns `tracks[]` of metrics.json: one row for each alignment at the end of a track.
 
-    `before_ga[k]` and `after_ga[k]` belong to `alignments[k]`. The alignment of the whole survey at the end has no
-    such entry and no row. The n positions of an entry are those of the last n keyframes up to the end of the track
-    (all keyframes, or those of the moving window). They are anchored at the first true pose, like the trajectories.
+    `result.before_ga[k]` and `result.after_ga[k]` hold the keyframe positions (n, 3) before and after
+    `result.alignments[k]`. They belong to the last n keyframes up to the end of the track: all keyframes, or those of
+    the moving window. The alignment of the whole survey at the end has no such positions and therefore no row. Errors
+    are computed after anchoring at the first true pose, as for the trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
     error_m = path_errors(result.final, truth.trajectory).distance_m
@@ -51,11 +52,11 @@ def _row(
 
 
 def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
-    """Returns the RMS position error at the far end of a track [m].
+    """Returns the RMS position error at the far end of a track [m]; None if the track has no frames.
 
-    The far end consists of the frames at no less than 0.9 of the track's greatest distance from the start, where drift
-    is greatest (Negahdaripour & Madjidi 2003, section III). The error of a single frame would be
-    dominated by its frame-to-frame noise.
+    The far end consists of the frames at no less than `FAR_SHARE` of the track's greatest distance from the start,
+    where drift is greatest (Negahdaripour & Madjidi 2003, section III). The error of a single frame would be dominated
+    by frame-to-frame noise.
 
     Args:
         track: number of the track, from 1.
@@ -69,7 +70,12 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """Returns the RMSE [m] of positions (n, 3) of the last n keyframes in `frames`."""
+    """Returns the RMSE [m] of estimated positions (n, 3) of the last n keyframes in `frames`; None if there are none.
+
+    Args:
+        positions: (n, 3) estimated positions [m], which are anchored here.
+        frames: frame numbers of the keyframes.
+    """
     n = min(len(positions), len(frames))
     if n == 0:
         return None

@@ -1,4 +1,4 @@
-"""Computing time of each stage against the real-time budget of Negahdaripour & Madjidi (2003).
+"""Computing time of each processing stage, compared with the real-time budget of Negahdaripour & Madjidi (2003).
 
 Frame-to-frame motion has to finish within one frame, all keyframe work within the N frames up to the next keyframe,
 and global alignment while the vehicle keeps station.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-#: Stages of the estimators that run at a keyframe. The other stages belong to the simulator or run after the survey.
+#: Stages of the estimators that run at each keyframe. Their total time is compared with the budget of a keyframe.
 KEYFRAME_STAGES = ("stereo", "f2m", "network", "flow")
 #: Key of the row that sums `KEYFRAME_STAGES`.
 KEYFRAME_WORK = "keyframe"
@@ -20,7 +20,7 @@ class StageTime(NamedTuple):
 
     Args:
         stage: key of the stage in metrics.json, or `KEYFRAME_WORK`.
-        n_calls: number of calls.
+        n_calls: number of calls; for `KEYFRAME_WORK` the number of keyframes.
         mean_ms, p95_ms: mean and 95th percentile of the duration of a call [ms].
         total_s: total duration of all calls [s].
         budget_ms: largest allowed mean duration [ms]; None if the stage has no budget.
@@ -65,7 +65,7 @@ def _stage_time(stage: str, row: Mapping[str, Any], budget_ms: float | None) -> 
 
 
 def _keyframe_work(stages: Mapping[str, Any], n_keyframes: int, budget_ms: float | None) -> StageTime:
-    """Returns the sum of `KEYFRAME_STAGES`, with the mean per keyframe."""
+    """Returns the total time of all `KEYFRAME_STAGES` and its mean per keyframe."""
     total_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEYFRAME_STAGES)
     mean_ms = 1e3 * total_s / n_keyframes if n_keyframes else None
     return StageTime(KEYFRAME_WORK, n_keyframes, mean_ms, None, total_s, budget_ms)

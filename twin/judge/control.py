@@ -12,8 +12,8 @@ from twin.judge.swaths import travel_direction
 def control_metrics(truth: Truth) -> dict[str, float | None]:
     """Returns `control.*` of metrics.json.
 
-    The cross-track error covers the frames in which the vehicle travels, the altitude error all frames, the 3-D
-    station-keeping error the frames in which it keeps station.
+    The cross-track error is computed over the frames in which the vehicle travels, the altitude error over all frames,
+    and the station-keeping error (3-D distance) over the frames in which the vehicle keeps station.
     """
     n = min(len(truth.trajectory), len(truth.reference))
     offset = truth.trajectory.positions[:n] - truth.reference[:n]
@@ -26,7 +26,7 @@ def control_metrics(truth: Truth) -> dict[str, float | None]:
 
 
 def cross_track(offset: Array, direction: Array) -> Array:
-    """Returns the horizontal component of offsets across the direction of travel (n,), positive to port [m].
+    """Returns the cross-track component (n,) of offsets [m]: horizontal, positive to port of the direction of travel.
 
     Args:
         offset: (n, 3) position minus reference [m].

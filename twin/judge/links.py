@@ -22,8 +22,8 @@ ALONG_NODES = 2
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
     """Returns `links` of metrics.json: errors of the along and the across links.
 
-    `bridged` is the number of links that frame-to-frame motion replaces because no points were matched. Their errors
-    are not evaluated.
+    `bridged` is the number of links that consist of frame-to-frame motion because no points were matched. The errors of
+    these links are not evaluated.
     """
     measured = result.links.select(result.links.n_points > 0)
     near = node_distance(measured, linked_nodes(result.links)) <= ALONG_NODES
@@ -41,7 +41,12 @@ def linked_nodes(links: Links) -> NDArray[np.int64]:
 
 
 def node_distance(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns the number of nodes (n,) from keyframe i to keyframe j of each link: 1 for consecutive nodes."""
+    """Returns the distance (n,) between the two nodes of each link, counted in nodes: 1 for consecutive nodes.
+
+    Args:
+        links: n links between keyframes i < j.
+        nodes: increasing numbers of the keyframes that are nodes.
+    """
     return np.searchsorted(nodes, links.j) - np.searchsorted(nodes, links.i)
 
 
@@ -52,7 +57,7 @@ def motion_errors(links: Links, estimates: Array, world_from_keyframe: Array) ->
 
     Args:
         links: n links, of which only i and j are read.
-        estimates: (n, 4, 4) motion of each link.
+        estimates: (n, 4, 4) estimated motion for each link.
         world_from_keyframe: (n_keyframes, 4, 4) true poses of the keyframes.
     """
     return _motion_errors(world_from_keyframe[links.i], world_from_keyframe[links.j], np.ascontiguousarray(estimates))
@@ -71,7 +76,7 @@ def _motion_errors(true_i, true_j, estimates):
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
     """Returns number, RMS errors and mean NEES of links, and the RMS errors of their closed-form motions.
 
-    Links without a closed-form motion do not contribute to the latter. The mean NEES is 6 for consistent covariances.
+    The closed-form errors cover the links with a closed-form motion. The mean NEES is 6 for consistent covariances.
     """
     errors = motion_errors(links, links.i_from_j, world_from_keyframe)
     has_closed_form, closed_forms = links.by_closed_form

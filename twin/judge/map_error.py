@@ -19,9 +19,9 @@ def height_error(elevation: ElevationMap, truth: Truth) -> Array:
 def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """Returns `map.*` of metrics.json; every value is None without a map.
 
-    completeness is the fraction of observed cells that have an estimate. NMAD is 1.4826 median |e - median e|. LE90 is
-    the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the sigma calibration: the RMS of error / sigma,
-    which is 1 if the estimated standard deviations are right.
+    completeness is the fraction of observed cells that have an estimate. For height errors e, NMAD is
+    1.4826 median |e - median e|, and LE90 is the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the
+    sigma calibration: the RMS of error / sigma, which is 1 if the estimated standard deviations are correct.
     """
     if elevation is None:
         return dict.fromkeys(KEYS)
@@ -43,7 +43,7 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
 
 
 def normalised_error(elevation: ElevationMap, truth: Truth) -> Array:
-    """Returns the ratios height error / sigma (n,) of the cells that have both values."""
+    """Returns height error / sigma (n,) of the cells that have a height error and a positive sigma."""
     error = height_error(elevation, truth)
     known = np.isfinite(error) & (elevation.sigma_m > 0)
     return error[known] / elevation.sigma_m[known]

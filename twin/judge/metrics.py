@@ -1,4 +1,4 @@
-"""metrics.json: all metrics of a survey, with the same keys for complete and aborted surveys."""
+"""Contents of metrics.json: all metrics of a survey, with the same keys for complete and aborted surveys."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
 
 
 def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
-    """Returns the result without keyframes whose frame was not recorded because the survey was interrupted."""
+    """Returns the result without keyframes and stereo observations of frames that an aborted survey did not record."""
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
     observations = [observation for observation in result.stereo_observations if observation.row < n_frames]
@@ -96,7 +96,7 @@ def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
 
 
 def check_require(names: Mapping[str, float]) -> None:
-    """Checks the metric names of `[require]` before the survey is flown.
+    """Checks before the survey that every name in the scenario's `[require]` table is a metric.
 
     Raises:
         TwinError: a name is not a metric.

@@ -1,8 +1,8 @@
 """Image overlap along a swath and between neighbouring swaths, from the true poses and the true floor.
 
-The footprint of a keyframe is a horizontal rectangle at the mean floor height below the camera. Its width across the
-heading is W depth / f and its length along the heading H depth / f, for an image of W x H pixels and the focal length
-f. Camera tilt and relief within the footprint are neglected.
+The footprint of a keyframe is a horizontal rectangle at the mean floor height below the camera. For an image of W x H
+pixels, the focal length f [px] and the height h of the camera above the mean floor, it is W h / f wide across the
+heading and H h / f long along the heading. Camera tilt and relief within the footprint are neglected.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def overlap_metrics(
     direction of travel is removed. Both are fractions of the footprint area.
 
     Args:
-        grid: cells of `truth.height_m`; without it the mean height of the whole floor is used.
+        grid: cells of `truth.height_m`; None: every footprint is at the mean height of the whole floor.
         planned: pattern, overlap_along and overlap_across of the plan.
     """
     prints = footprints(result.keyframe_rows, truth, rig, grid, planned.get("pattern", "lawnmower"))
@@ -78,12 +78,14 @@ def footprints(
 def mean_depth(
     position: Array, height_m: NDArray[np.float32], mean_height_m: float, grid: MapGrid | None, rig: StereoRig
 ) -> float:
-    """Returns the height of a camera above the mean floor within the square that it observes [m].
+    """Returns the height of a camera above the mean floor height in a square below it [m].
+
+    The side of the square is the mean of the width and the length of the footprint at the height `mean_height_m`.
 
     Args:
         position: (3,) position of the camera [m].
         height_m: (rows, cols) true heights on `grid`.
-        mean_height_m: mean height of the whole floor, used where `grid` is None or the square holds no heights.
+        mean_height_m: mean height of the whole floor, used instead if `grid` is None or the square holds no heights.
     """
     if grid is None:
         return float(position[2]) - mean_height_m
@@ -112,8 +114,8 @@ def along_overlap(prints: Footprints) -> Array:
 def across_overlap(prints: Footprints) -> Array:
     """Returns the overlap (m,) of each keyframe with the nearest keyframe of the next swath.
 
-    It is a fraction of the area, computed from the component of their offset across the direction of travel. Where the
-    vehicle heads along the legs, it is the sidelap.
+    The overlap is a fraction of the area. It is computed from the offset between the two keyframes across the direction
+    of travel; the offset along it is ignored. If the vehicle heads along its legs, the overlap is the sidelap.
     """
     pairs = [_nearest_in_next(prints, swath) for swath in range(int(prints.swath.max(initial=-1)))]
     if not pairs:
@@ -125,7 +127,7 @@ def across_overlap(prints: Footprints) -> Array:
 
 
 def _nearest_in_next(prints: Footprints, swath: int) -> NDArray[np.int64]:
-    """Returns the numbers (2, m) of the keyframes of a swath and of the keyframes of the next swath nearest to them."""
+    """Returns pairs (2, m) of footprint indices: each keyframe of a swath, and the nearest one of the next swath."""
     here, there = np.flatnonzero(prints.swath == swath), np.flatnonzero(prints.swath == swath + 1)
     if len(here) == 0 or len(there) == 0:
         return np.zeros((2, 0), dtype=np.int64)
@@ -134,10 +136,12 @@ def _nearest_in_next(prints: Footprints, swath: int) -> NDArray[np.int64]:
 
 
 def _shared_area(prints: Footprints, first: NDArray[np.int64], second: NDArray[np.int64], offset: Array) -> Array:
-    """Returns the overlap (m,), as a fraction of the area, of pairs of footprints, each pair at its mean size.
+    """Returns the overlap (m,), as a fraction of the area, of pairs of footprints.
+
+    Both footprints of a pair are given the mean of their sizes and the orientation of the first.
 
     Args:
-        first, second: (m,) numbers of the keyframes. Both footprints are oriented like the first.
+        first, second: (m,) indices of the footprints of each pair.
         offset: (m, 2) offset of the second footprint from the first [m].
     """
     heading = prints.heading[first]

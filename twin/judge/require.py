@@ -1,4 +1,4 @@
-"""Requirements of the scenario: limits for metrics, and whether a survey meets them."""
+"""Requirements of a scenario: limits of metrics, and whether a survey meets each limit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MORE_IS_BETTER = (
 def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Returns `require` of metrics.json: value, limit and verdict of each required metric.
 
-    A metric without a value does not pass.
+    A metric whose value is None fails.
 
     Raises:
         TwinError: a name does not refer to a number in metrics.json.
@@ -56,12 +56,12 @@ def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
 
 
 def more_is_better(name: str) -> bool:
-    """Returns whether larger values of a metric are better, so that its limit is a lower bound."""
+    """Returns whether larger values of a metric are better; its limit is then a lower bound."""
     return name.startswith(MORE_IS_BETTER)
 
 
 def _value(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Returns the metric with a dotted name."""
+    """Returns the value of the metric with a dotted name, e.g. "map.le90_m"."""
     value: Any = metrics
     for key in name.split("."):
         value = value[key]

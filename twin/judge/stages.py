@@ -73,7 +73,7 @@ def stage_errors(metrics: Mapping[str, Any]) -> list[StageError]:
 
 
 def _errors(path: Trajectory, true: Trajectory) -> dict[str, float | None]:
-    """Returns RMS and largest position error [m]; both are None if the path lacks poses."""
+    """Returns RMS and largest position error [m]; both are None if poses are missing from the path."""
     complete = len(path.world_from_camera) == len(true)
     distance_m = path_errors(path, true).distance_m if complete else np.zeros(0)
     return {"ate_rmse_m": rms(distance_m), "ate_max_m": finite_float(distance_m.max()) if len(distance_m) else None}

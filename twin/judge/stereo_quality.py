@@ -9,10 +9,10 @@ from twin.judge.summary_statistics import percentile
 
 
 def stereo_quality(result: SurveyResult) -> dict[str, Any]:
-    """Returns `vision` of metrics.json, over all stereo observations, including those without a keyframe.
+    """Returns `vision` of metrics.json, over all stereo observations, including those that gave no keyframe.
 
     points_median and points_p10 are the median and the 10th percentile of the number of matched points.
-    contrast_median is None where no image is rendered. blind_looks is the number of stereo observations with too few
+    contrast_median is None if no images are rendered. blind_looks is the number of stereo observations with too few
     points for a keyframe.
     """
     points = [observation.n_points for observation in result.stereo_observations]

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from twin.core.records import Array, Truth
 
 #: A frame belongs to a leg if |cos| of the angle between its direction of travel and the axis of the legs exceeds
-#: this value (26 deg).
+#: this value (angle below 26 deg).
 ON_LEG_COSINE = 0.9
 
 
 def travel_direction(reference: Array) -> Array:
     """Returns horizontal unit vectors of travel (n, 2) along reference positions (n, 3).
 
-    Where the reference stands still, the last direction is repeated.
+    While the reference position does not change, the previous direction is kept; [1, 0] if it never changes.
     """
     n = len(reference)
     if n == 0:

@@ -1,4 +1,4 @@
-"""Absolute trajectory errors after anchoring at the first true pose. No transform is fitted."""
+"""Absolute trajectory errors: estimates are anchored at the first true pose, without a fitted transform."""
 
 from __future__ import annotations
 

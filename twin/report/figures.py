@@ -1,4 +1,4 @@
-"""Figures of the survey report. Each figure function returns None if the run lacks the data."""
+"""Figures of the survey report. Each figure function returns None if its data are missing from the run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from twin.report.wording import PROCESSING_STAGES, improvement, length
 WIDTH_IN = 9.6
 #: Longest side of a map in a figure [cells]; finer maps are subsampled.
 MAP_CELLS = 500
-#: The true path is a broad band below the estimates, so that it remains visible where they coincide with it.
+#: The true path is drawn as a broad band below the estimates, so it remains visible where they coincide with it.
 PATH_STYLES: dict[str, dict[str, Any]] = {
     "reference": {"linestyle": "--", "linewidth": 1.0},
     "truth": {"linewidth": 5.0, "alpha": 0.35},
@@ -33,7 +33,7 @@ PATH_STYLES: dict[str, dict[str, Any]] = {
 
 
 def draw_all(run: Run) -> dict[str, str]:
-    """Returns every figure that the run has the data for, as data URIs by name."""
+    """Returns the PNG data URI of each figure whose data the run contains, by name of the figure."""
     functions: dict[str, Callable[[Run], Figure | None]] = {
         "plan_view": plan_view,
         "path_errors": path_error_curves,
@@ -87,7 +87,7 @@ def _add_keyframes(axes: Axes, run: Run) -> None:
 
 
 def _limit_to_paths(axes: Axes, run: Run) -> None:
-    """Sets the limits of the axes to the extent of the trajectories and a margin."""
+    """Sets the limits of the axes to the extent of the trajectories plus a margin."""
     xy = np.concatenate([path.positions[:, :2] for path in run.trajectories.values()])
     if len(xy):
         low, high = xy.min(axis=0), xy.max(axis=0)
@@ -117,7 +117,7 @@ def path_error_curves(run: Run) -> Figure | None:
 
 
 def _log_scale(axes: Axes) -> None:
-    """Sets a logarithmic scale that starts just below the 1st percentile of the positive values."""
+    """Sets a logarithmic y axis that starts just below the 1st percentile of the positive values of all curves."""
     sizes = np.concatenate([np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines])
     sizes = sizes[sizes > 0]
     if len(sizes):
@@ -164,7 +164,7 @@ def track_bars(run: Run) -> Figure | None:
 
 
 def stereo_quality_curves(run: Run) -> Figure | None:
-    """Returns matched points and contrast over time; red: stereo observations with too few points for a keyframe."""
+    """Returns curves of matched points and contrast over time; red: observations with too few points for a keyframe."""
     observations, path = run.keyframes.stereo_observations, run.trajectories.get("online")
     if path is None or not len(observations) or observations[:, 0].max() >= len(path):
         return None
@@ -291,7 +291,7 @@ def timing_bars(run: Run) -> Figure | None:
 
 
 def subsampled(raster: Raster) -> np.ndarray:
-    """Returns every n-th row and column, so that neither side has more than `MAP_CELLS`."""
+    """Returns every n-th row and column of a raster, with the smallest n for which no side exceeds `MAP_CELLS`."""
     step = int(np.ceil(max(raster.values.shape[:2]) / MAP_CELLS))
     return raster.values[::step, ::step]
 
@@ -306,7 +306,7 @@ def _height_scale(heights: np.ndarray) -> tuple[float, float]:
 def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
     """Returns hill-shaded RGBA colours (rows, cols, 4), lit from the north-west; cells without data are transparent.
 
-    Heights are clipped to the colour scale, because one outlier would use up the whole range of the shading.
+    Heights are clipped to the colour scale, because a single outlier would remove the shading from all other cells.
 
     Args:
         heights: (rows, cols) [m], NaN for no data.

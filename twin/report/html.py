@@ -17,7 +17,7 @@ def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
     """Renders a template to self-contained HTML.
 
     Args:
-        package: package that holds the template; the files that it includes may also be in `twin.report`.
+        package: package that contains the template; files that the template includes may also be in `twin.report`.
         template: file name of the template.
         context: variables of the template.
     """

@@ -13,7 +13,7 @@ JPEG_QUALITY = 78
 
 
 def jpeg_bytes(image: Image, longest_px: int) -> bytes:
-    """Returns an RGB image as JPEG, reduced so that no side is longer than `longest_px`."""
+    """Returns an RGB image as JPEG data, reduced if necessary until its longer side is `longest_px`."""
     if (scale := longest_px / max(image.shape[:2])) < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

@@ -19,13 +19,13 @@ import numpy as np
 from twin.core.records import Array, Image
 from twin.report.images import read_rgb
 
-#: Time limit of the rendering process; a surface that takes longer is left out of the report.
+#: Time limit of the rendering process; if rendering takes longer, the report has no picture of the surface.
 LIMIT_S = 15.0
 WIDTH_PX, HEIGHT_PX, VFOV_DEG = 1400, 900, 30.0
 #: Viewing direction: depression angle, and angle of the camera's position from south towards east.
 DEPRESSION_DEG, EAST_DEG = 42.0, 20.0
 MARGIN = 1.04
-#: Percentiles of the coordinates that have to fit into the picture; outliers of the height may be cut off.
+#: The picture shows all vertices with coordinates between these percentiles; outliers may be cut off.
 FRAMED_PERCENT = (0.2, 99.8)
 #: Direction to the light in the axes of glTF (east, up, south): north-west, as in all maps of the report.
 LIGHT = np.array([-0.5, 0.7, -0.5])
@@ -83,11 +83,12 @@ def shaded_colours(colours: Image, normals: Array) -> Image:
 
 
 def camera_pose(vertices: Array) -> Array:
-    """Returns the pose (4, 4) of the nearest OpenGL camera (viewing along -z) with all vertices but outliers in view.
+    """Returns the pose (4, 4) of an OpenGL camera (viewing along -z) as near as possible with the vertices in view.
 
-    Let the camera be at distance d from the centre of the vertices, and q a vertex relative to that centre in the axes
-    of the camera. The vertex is in view if |q_x| <= t (d - q_z) for the tangent t of half the horizontal field of view,
-    and likewise for q_y.
+    The viewing direction is fixed (`DEPRESSION_DEG`, `EAST_DEG`), and outliers are ignored (`FRAMED_PERCENT`). Let the
+    camera be at distance d from the centre of the vertices, and q a vertex relative to this centre in camera axes. The
+    vertex is in view if |q_x| <= t (d - q_z), where t is the tangent of half the horizontal field of view, and if q_y
+    satisfies the same condition for the vertical field of view.
 
     Args:
         vertices: (n, 3) in the axes of glTF [m].

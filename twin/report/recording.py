@@ -21,12 +21,12 @@ from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.scenario import file as scenario_file
 
-#: Largest number of keyframes with images, and the longest side of their images and of the mosaic [px].
+#: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
 N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
 
-#: Command of the Rerun viewer; --bind restricts it to this machine.
+#: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
-#: The true floor is translucent and lowered: coincident surfaces of an accurate map would flicker (z-fighting).
+#: The true floor is translucent and lowered, because it would flicker (z-fighting) where an accurate map coincides.
 TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
 
 
@@ -35,7 +35,7 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
 
     Args:
         folder: the run folder.
-        metrics: used instead of metrics.json if that file does not exist yet.
+        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
 
     Raises:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
@@ -119,7 +119,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs trajectories and network as they grow, snapshot by snapshot."""
+    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part that exists by then."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
         for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
@@ -133,9 +133,9 @@ def log_paths(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the elevation map in the mosaic's colours, each part at the first snapshot whose keyframes observe it.
+    """Logs the final elevation map in the colours of the orthomosaic.
 
-    All heights are those of the final map.
+    Each part of the map appears at the first snapshot whose keyframes observe it.
     """
     if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
         return
@@ -171,7 +171,7 @@ def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None
 
 
 def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: FrameTimes) -> None:
-    """Logs the existing images of the left or right camera at these frames."""
+    """Logs the images of the left or right camera (`side`) at the given frames; missing images are skipped."""
     images = [read_rgb(run.image_file(int(f), side)) for f in times.frames]
     exists = np.array([image is not None for image in images], dtype=bool)
     if exists.any():
@@ -182,7 +182,7 @@ def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: Fram
 
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
-    """Logs the two cameras in the frame of the rig (the left camera), scaled to the size of the logged images."""
+    """Logs the two cameras in axes of the left camera, with the calibration scaled to the size of the logged images."""
     scale = min(1.0, IMAGE_WIDTH_PX / rig.width_px)
     camera = rr.Pinhole(
         image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,
@@ -219,7 +219,15 @@ def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, 
 def log_curve(
     recording: rr.RecordingStream, entity: str, times: FrameTimes, values: Array, role: str | None = None
 ) -> None:
-    """Logs one curve on both timelines, in the colour of its role."""
+    """Logs one curve on both timelines (frame number and simulated time).
+
+    Args:
+        recording: recording to log to.
+        entity: entity path of the curve.
+        times: (n,) frame numbers and times of the values.
+        values: (n,) values of the curve.
+        role: key of its colour and label in `twin.report.style`; None: default colour, labelled by the entity's name.
+    """
     if len(values):
         style: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
         style |= {"colors": rgb(role)} if role else {}
@@ -241,7 +249,7 @@ class LiveViewer:
         log_rig(self.recording, rig)
 
     def log_frame(self, frame: Frame, estimate: Estimate) -> None:
-        """Logs the pose of a frame, and at keyframes also the images and the path."""
+        """Logs pose and sigma of a frame; for a frame with a stereo pair, also the images and the path so far."""
         pose = estimate.world_from_camera
         _set_time(self.recording, frame.index, frame.time_s)
         quaternion = rr.Quaternion(xyzw=geometry.quaternion_xyzw(pose[:3, :3]))
@@ -255,17 +263,17 @@ class LiveViewer:
 
 
 def colour(role: str) -> tuple[int, int, int]:
-    """Returns the colour of a role on the viewer's dark background, where the truth is white."""
+    """Returns the RGB colour of a role (see `style.COLOURS`), with white for the truth on the dark background."""
     return (245, 245, 245) if role == "truth" else rgb(role)
 
 
 def line(positions: Array, role: str) -> rr.LineStrips3D:
-    """Returns positions (n, 3) as one line in the colour of its role."""
+    """Returns positions (n, 3) as one polyline in the colour of `role`."""
     return rr.LineStrips3D([positions.astype(np.float32)], colors=[colour(role)], radii=rr.Radius.ui_points(1.5))
 
 
 def segments(pairs: Array, role: str) -> rr.LineStrips3D:
-    """Returns pairs of points (n, 2, 3) as separate line segments in the colour of their role."""
+    """Returns pairs of points (n, 2, 3) as separate line segments in the colour of `role`."""
     return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
 
 
@@ -279,7 +287,7 @@ def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Me
 
 
 def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
-    """Returns an RGB image as JPEG, reduced so that no side is longer than `longest_px`."""
+    """Returns an RGB image as a Rerun JPEG image, reduced if necessary until its longer side is `longest_px`."""
     return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
 
 

@@ -1,4 +1,4 @@
-"""Time series of a run for the recording: snapshots, durations, subsampling."""
+"""Time series of a run for the recording: times of the snapshots, durations of the stages, subsampling."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FrameTimes(NamedTuple):
 
 
 def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
-    """Yields the number of the last keyframe of each snapshot, with its frame number and time [s]."""
+    """Yields the last keyframe of each snapshot: (keyframe number, (frame number, time [s]))."""
     path, frames = run.trajectories.get("online"), run.keyframes.frames
     if path is None or not len(frames):
         return
@@ -32,7 +32,7 @@ def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
 
 
 def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
-    """Returns times and durations [ms] of global alignment and of the stages called once per frame or keyframe."""
+    """Returns times and durations [ms], by stage: global alignment, and stages called once per frame or keyframe."""
     path = run.trajectories.get("online")
     if path is None:
         return {}
@@ -46,7 +46,10 @@ def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
 
 
 def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns the duration of each global alignment [ms], at the time of the last keyframe of its track."""
+    """Returns, as item "ga", the last frame and the duration [ms] of each global alignment; {} if there is none.
+
+    The last frame is that of the last keyframe of the aligned track.
+    """
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
     rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]
@@ -54,7 +57,7 @@ def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]
 
 
 def stride(n: int, limit: int = N_SAMPLES) -> int:
-    """Returns the smallest stride that keeps at most `limit` of n items."""
+    """Returns the smallest stride with which at most `limit` of n items are kept."""
     return max(1, -(-n // limit))
 
 

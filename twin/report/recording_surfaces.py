@@ -1,4 +1,4 @@
-"""Elevation maps as coloured surfaces for the 3-D view, split by the time at which they were first observed."""
+"""Elevation maps as coloured surfaces for the 3-D view, divided by the time at which each part is first observed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Surface(NamedTuple):
 
 
 def floor_surface(raster: Raster) -> Surface:
-    """Returns the true floor in grey, lighter with height."""
+    """Returns the true floor as a surface in grey; higher points are lighter."""
     low, high = np.nanpercentile(raster.values, [1, 99]) if np.isfinite(raster.values).any() else (0.0, 1.0)
     shade = np.clip((raster.values - low) / max(high - low, 1e-6), 0, 1)
     grey = np.nan_to_num(110 + 90 * shade).astype(np.uint8)
@@ -45,7 +45,7 @@ def floor_surface(raster: Raster) -> Surface:
 
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
-    """Returns the estimated map in the colours of the orthomosaic, or coloured by height if there is no orthomosaic."""
+    """Returns the estimated map as a surface in the colours of the orthomosaic, or coloured by height without one."""
     if mosaic is not None and mosaic.values.shape[:2] == dem.values.shape:
         return _surface(dem, mosaic.values)
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
@@ -54,7 +54,7 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def _surface(raster: Raster, colours: Image) -> Surface:
-    """Returns the mesh of a raster: every n-th cell as a vertex, triangles between neighbours that have a height."""
+    """Returns the mesh of a raster: every n-th row and column as vertices; triangles if all corners have a height."""
     step = int(np.ceil(np.sqrt(raster.values.size / N_VERTICES)))
     x, y = raster.grid.centres()
     height = raster.values[::step, ::step]
@@ -67,7 +67,7 @@ def _surface(raster: Raster, colours: Image) -> Surface:
 
 
 def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the number (n,) of the first group of cameras that observes each point; `NOT_OBSERVED` if none does.
+    """Returns the number (n,) of the first camera group that has each point in view; `NOT_OBSERVED` if none has.
 
     Args:
         points: (n, 3) in the world [m].
@@ -91,7 +91,7 @@ def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArra
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles whose last vertex is observed by the given group, with the vertices they use.
+    """Returns the triangles that are completely observed for the first time with a given group, and their vertices.
 
     Args:
         group: (n,) group of each vertex, as `first_observed` returns it.

@@ -52,9 +52,9 @@ class Keyframes(NamedTuple):
         frames: (n,) frame number of each keyframe.
         tracks: (n,) track of each keyframe, from 1.
         n_frames_per_keyframe: planned frames from one keyframe to the next; None if unknown.
-        timing_ms: durations of the calls of some stages, in order [ms].
-        stereo_observations: (m, 3) frame number, matched points and contrast (NaN without images) of each stereo
-            observation, including those without a keyframe.
+        timing_ms: for some processing stages, the duration of each call in chronological order [ms].
+        stereo_observations: (m, 3) frame number, number of matched points and contrast (NaN without images) of each
+            stereo observation, including those that gave no keyframe.
     """
 
     frames: NDArray[np.int64]
@@ -66,7 +66,7 @@ class Keyframes(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """Contents of a run folder. A missing file gives a missing key, an empty array or None."""
+    """Contents of a run folder. A missing file is represented by a missing key, an empty array or None."""
 
     folder: Path
     scenario: dict[str, Any]
@@ -79,7 +79,7 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Returns whether the run has metrics."""
+        """Returns whether the survey has finished, i.e. has metrics."""
         return self.metrics is not None
 
     def image_file(self, frame: int, side: str) -> Path:
@@ -96,7 +96,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
     Args:
         folder: the run folder.
-        metrics: used instead of metrics.json if that file does not exist yet.
+        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
 
     Raises:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
@@ -148,7 +148,7 @@ def _empty_network() -> Network:
 
 
 def _read_keyframes(file: Path) -> Keyframes:
-    """Reads keyframes/index.json; a missing file gives no keyframes."""
+    """Reads keyframes/index.json; returns no keyframes if the file is missing."""
     index = _read_json(file) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
@@ -165,12 +165,12 @@ def _read_json(file: Path) -> Any:
 
 
 def _read_existing(files: dict[str, Path], reader: Any) -> dict[str, Any]:
-    """Returns the contents of those files that exist and are not empty."""
+    """Returns the contents, as `reader` returns them, of those files that exist and are not empty."""
     return {key: _read(file, reader) for key, file in files.items() if file.is_file() and file.stat().st_size > 0}
 
 
 def _read(file: Path, reader: Any) -> Any:
-    """Returns `reader(file)`. Raises TwinError if that fails."""
+    """Returns `reader(file)`; raises TwinError if the file cannot be read."""
     try:
         return reader(file)
     except (OSError, ValueError, KeyError, IndexError, RasterioError) as error:

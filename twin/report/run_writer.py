@@ -1,4 +1,4 @@
-"""Writing a run folder: scenario and log from the start, results after the flight, metrics.json last."""
+"""Writing a run folder: scenario and log during the survey, results after the survey, metrics.json last."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from twin.exchange import posegraph
 from twin.scenario import file as scenario_file
 from twin.scenario.model import Scenario
 
-#: Presentations that `RunFolder.finish` can produce.
+#: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 PICTURES = ("report", "recording")
-_RESERVE_BYTES = 4 * 2**20  # deleted before the results are written, so that they fit on a full disk
+_RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ class RunFolder:
     Args:
         folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run.
-        outputs: members of `PICTURES` to produce at the end; this may take longer than a short survey. None: write the
-            metrics only, without trajectories and maps.
+        outputs: members of `PICTURES` to write at the end, which may take longer than a short survey. None: write
+            neither these nor trajectories and maps, only the metrics.
 
     Raises:
         TwinError: the folder cannot be written.
@@ -84,7 +84,7 @@ class RunFolder:
         self._log.close()
 
     def log(self, event: str, **fields: Any) -> None:
-        """Adds a line to the log. A full disk is ignored, so that the survey continues."""
+        """Adds a line to the log. Write errors (full disk) are ignored, so the survey continues."""
         try:
             self._log.write(json.dumps({"event": event, **fields}) + "\n")
             self._log.flush()
@@ -94,8 +94,9 @@ class RunFolder:
     def finish(self, record: SurveyRecord) -> dict[str, Any]:
         """Writes all results and returns the metrics as written.
 
-        The metrics are written first under a temporary name and renamed last: report and recording are made from the
-        folder, and a folder without metrics.json counts as unfinished. A full disk sets the status to "aborted".
+        The metrics are written first under a temporary name and renamed to metrics.json last, because a folder without
+        metrics.json counts as unfinished. If another result cannot be written, e.g. because the disk is full, the
+        status becomes "aborted".
         """
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
@@ -150,7 +151,7 @@ class RunFolder:
         mesh.write_glb(self.path / "mesh.glb", elevation)
 
     def _write_pictures(self, outputs: Collection[str], metrics: dict[str, Any]) -> None:
-        """Writes report and recording; their libraries are imported only here."""
+        """Writes the requested report and recording; their libraries are imported only when needed."""
         if "report" in outputs:
             from twin.report import survey_page
 

@@ -1,4 +1,4 @@
-"""Table of the positioning stages with the error, improvement, inputs and disabled corrections of each."""
+"""Table of the positioning stages: inputs, error, gain over the preceding stage, and disabled corrections."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class StageRow(NamedTuple):
         stage: key of the stage.
         inputs: measurements that the stage uses.
         rmse_m: RMS position error of the keyframes [m].
-        gain: error of the preceding stage / error of this stage; None if there is no preceding stage.
+        gain: error of the preceding stage / error of this stage; None if one of them is missing or zero.
         disabled: note on the corrections that the scenario disables in this stage; "" if there are none.
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-#: Colour of each role (Okabe & Ito palette, distinguishable with colour vision deficiency).
+#: Colour of each plotted quantity, by key (Okabe & Ito palette, distinguishable with colour vision deficiency).
 COLOURS = {
     "truth": "#1b2a33",
     "reference": "#9aa8b0",
@@ -45,6 +45,6 @@ FIGURE_STYLE: dict[Any, Any] = {
 
 
 def rgb(role: str) -> tuple[int, int, int]:
-    """Returns the colour of a role as (red, green, blue), 0 to 255."""
+    """Returns the colour of `role`, a key of `COLOURS`, as (red, green, blue), each 0 to 255."""
     text = COLOURS[role]
     return int(text[1:3], 16), int(text[3:5], 16), int(text[5:7], 16)

@@ -32,7 +32,7 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
     Args:
         folder: the run folder.
-        metrics: used instead of metrics.json if that file does not exist yet.
+        metrics: contents of metrics.json, if that file does not exist yet; None: the file is read.
 
     Raises:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
@@ -43,12 +43,12 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
 
 def render(run: Run) -> str:
-    """Returns the report as HTML."""
+    """Returns the report of a run as HTML."""
     return render_page("twin.report", "survey_page.html.j2", context(run))
 
 
 def context(run: Run) -> dict[str, Any]:
-    """Returns the variables of the template."""
+    """Returns the variables of the HTML template, survey_page.html.j2."""
     metrics = run.metrics or {}
     return {
         "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
@@ -72,7 +72,7 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def mosaic_image(run: Run) -> str | None:
-    """Returns the orthomosaic as a JPEG data URI, white where there is no data; None without a mosaic."""
+    """Returns the orthomosaic as a JPEG data URI, white where it has no data; None if the run has no mosaic."""
     if "mosaic" not in run.rasters:
         return None
     mosaic = run.rasters["mosaic"].values
@@ -80,26 +80,29 @@ def mosaic_image(run: Run) -> str | None:
 
 
 def surface_image(run: Run) -> str | None:
-    """Returns an oblique view of the map's mesh as a JPEG data URI; None without a picture."""
+    """Returns an oblique view of the mesh as a JPEG data URI; None if there is no mesh or rendering fails."""
     picture = surface_picture(run.folder / "mesh.glb")
     return None if picture is None else jpeg_uri(picture)
 
 
 def sample_images(run: Run) -> list[tuple[int, str, str | None]]:
-    """Returns frame number, left and right image (JPEG data URIs) of keyframes spread over the survey."""
+    """Returns (frame number, left image, right image) of at most `N_SAMPLES` keyframes spread over the survey.
+
+    The images are JPEG data URIs; the right one is None if it does not exist.
+    """
     frames = run.frames_with_image()
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(N_SAMPLES, len(frames))).round().astype(int))
     return [(frames[k], *_stereo_pair(run, frames[k])) for k in chosen]
 
 
 def _stereo_pair(run: Run, frame: int) -> tuple[str, str | None]:
-    """Returns left and right image of a keyframe as JPEG data URIs; the right one is None if it does not exist."""
+    """Returns the left and the right image of a keyframe as JPEG data URIs; "" or None, respectively, if missing."""
     left, right = (read_rgb(run.image_file(frame, side)) for side in ("left", "right"))
     return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
 
 
 def jpeg_uri(image: NDArray[np.uint8]) -> str:
-    """Returns an RGB image as a JPEG data URI."""
+    """Returns an RGB image as a JPEG data URI, reduced so that no side is longer than `IMAGE_PX`."""
     return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, IMAGE_PX)).decode()
 
 

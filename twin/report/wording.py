@@ -1,4 +1,4 @@
-"""Results as text: numbers with units, the summary of a survey, and the terms that the reports explain."""
+"""Text of the reports: numbers with units, the summary and key figures of a survey, and definitions of terms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 DASH = "–"  # noqa: RUF001
 
-#: Names of the processing stages of metrics.json (`timing.stages`), and of their sum at a keyframe.
+#: Display names of the processing stages in metrics.json (`timing.stages`) and of the sum of all keyframe stages.
 PROCESSING_STAGES = {
     "physics": "simulator: physics",
     "render": "simulator: rendering",
@@ -45,7 +45,7 @@ TERMS = {
 
 
 class KeyFigure(NamedTuple):
-    """One entry of the overview.
+    """One of the key figures at the top of a report.
 
     Args:
         label: name of the quantity.
@@ -59,7 +59,7 @@ class KeyFigure(NamedTuple):
 
 
 def length(value_m: float | None) -> str:
-    """Returns a length in mm, cm or m."""
+    """Returns a length as text in mm, cm or m; a dash for None."""
     if value_m is None:
         return DASH
     size = abs(value_m)
@@ -69,9 +69,9 @@ def length(value_m: float | None) -> str:
 
 
 def percent(fraction: float | None) -> str:
-    """Returns a fraction in percent with up to one decimal, or a dash for None and NaN.
+    """Returns a fraction as text in percent with at most one decimal; a dash for None, NaN and infinity.
 
-    Values that would be rounded to 0 % or 100 % are given as "< 0.1 %" and "> 99.9 %".
+    Fractions that are not 0 or 1 but would be rounded to 0 % or 100 % are given as "< 0.1 %" or "> 99.9 %".
     """
     if fraction is None or not math.isfinite(fraction):
         return DASH
@@ -84,39 +84,43 @@ def percent(fraction: float | None) -> str:
 
 
 def angle(value_deg: float | None) -> str:
-    """Returns an angle as text in degrees."""
+    """Returns an angle as text in degrees; a dash for None."""
     return DASH if value_deg is None else f"{value_deg:.2f}°"
 
 
 def milliradians(value_deg: float | None) -> str:
-    """Converts an angle from degrees to text in milliradians; 1 mrad is 1 mm at 1 m distance."""
+    """Returns an angle [deg] as text in milliradians; 1 mrad subtends 1 mm at a distance of 1 m."""
     return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
 
 
 def ratio(value: float | None) -> str:
-    """Returns a ratio with two digits below ten and as an integer above."""
+    """Returns a ratio as text, with one decimal below ten and as an integer from ten; a dash for None."""
     return DASH if value is None else f"{value:.1f} ×" if value < 9.95 else f"{value:.0f} ×"  # noqa: RUF001
 
 
 def improvement(gain: float | None) -> str:
-    """Returns the ratio of errors before / after as text, "smaller" or "larger"; "" if they differ by less than 5 %."""
+    """Returns the change of an error as text, e.g. "2.0 × smaller"; "" for a change up to 5 % or an unknown one.
+
+    Args:
+        gain: error before divided by error after; None if unknown.
+    """
     if gain is None or 0.95 <= gain <= 1.05:
         return ""
     return f"{ratio(gain)} smaller" if gain > 1 else f"{ratio(1 / gain)} larger"
 
 
 def milliseconds(value_ms: float | None) -> str:
-    """Returns a duration as text in ms, or in s if it is one second or longer."""
+    """Returns a duration as text, in ms below one second and in s from one second; a dash for None."""
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
 
 def plain(value: Any) -> str:
-    """Returns a number with up to four significant digits; a dash for None."""
+    """Returns a value as text, a float with at most four significant digits; a dash for None."""
     return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
-    """Returns the summary of a survey: status, conditions, final position error, map quality and warning.
+    """Returns the summary of a survey as text: status, conditions, final position error, map quality and warnings.
 
     Args:
         metrics: contents of metrics.json; None for an unfinished survey.
@@ -133,7 +137,7 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns altitude and water of the survey as text."""
+    """Returns the altitude and the water type of a survey as text."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")
@@ -158,7 +162,7 @@ def _results(metrics: Mapping[str, Any]) -> str:
 
 
 def closed_form_comparison(links: Mapping[str, Any]) -> str:
-    """Returns a sentence that compares the translation error of the links with that of the closed form."""
+    """Returns sentences that compare the translation errors of the links with those of the closed form, eq. (2)."""
     changes = []
     for direction in ("along", "across"):
         error = links[direction]["translation_rmse_m"]
@@ -174,7 +178,7 @@ def closed_form_comparison(links: Mapping[str, Any]) -> str:
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    """Returns the overview of a survey; empty for empty metrics."""
+    """Returns the key figures of a survey; an empty list if `metrics` is empty."""
     return [*_position_figures(metrics), *_map_figures(metrics), *_survey_figures(metrics)] if metrics else []
 
 

@@ -1,4 +1,4 @@
-"""Object of the turbidity experiment: a hollow concrete block on rippled sand."""
+"""Floor of the turbidity experiment: a hollow concrete block on rippled sand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ SAND, CONCRETE = (0.36, 0.31, 0.23), (0.45, 0.44, 0.42)  # albedo
 
 
 def block_on_sand(seed: int) -> Terrain:
-    """Returns a terrain with the block, centred at the origin; its reference plane is the mean height of the sand."""
+    """Returns a terrain with the block at its centre, which is the origin; the mean height of the sand is about 0.
+
+    Args:
+        seed: seed of the sand relief, the roughness of the block and the grain of the texture.
+    """
     rng = np.random.default_rng(seed)
     x, y = _grid(SPACING_M, edges=True)
     ripples = 0.012 * np.sin(2 * np.pi * (x + 0.15 * np.sin(2.1 * y) + 0.04 * np.sin(5.3 * y)) / 0.16)
@@ -37,7 +41,7 @@ def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
 
     Args:
         step_m: grid spacing.
-        edges: whether to return the grid nodes, including the terrain edges; otherwise the cell centres.
+        edges: True for the grid nodes, including those on the terrain edges; False for the cell centres.
     """
     axes = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
     east, north = (axis if edges else axis + step_m / 2 for axis in axes)

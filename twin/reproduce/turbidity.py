@@ -1,6 +1,6 @@
-"""Fig. 8 of Negahdaripour & Madjidi (2003) with simulated images: one object at five turbidity levels.
+"""Reproduction of Fig. 8 of Negahdaripour & Madjidi (2003): simulated images of one object at five turbidity levels.
 
-The contrast as a function of range is computed in addition.
+Contrast as a function of range is computed in addition.
 """
 
 from __future__ import annotations
@@ -62,11 +62,12 @@ def render_levels(
 def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: Array) -> Array:
     """Returns the contrast of fine detail on a level floor, relative to clear water.
 
-    The direct signal carries the detail. Forward scatter (a blur) and backscatter add light without detail, so that
-    C / C0 = direct / (direct + forward + backscatter) (Duntley 1963, here for lamps that are fixed to the camera).
+    The direct signal carries the detail; forward scatter (a blur) and backscatter add light without detail. The
+    contrast C relative to its value C0 in clear water is therefore C / C0 = direct / (direct + forward + backscatter)
+    (Duntley 1963, here for lamps that are fixed to the camera).
 
     Args:
-        scenario: lamps and camera.
+        scenario: source of the lamps and the camera.
         illumination: water and daylight.
         ranges_m: (n,) ranges at which the contrast is computed.
 
@@ -91,7 +92,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
 
 
 def summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
-    """Returns the contents of turbidity.json."""
+    """Returns the contents of turbidity.json: water, image quality and contrast at each turbidity level."""
     names = ("gray_level", "contrast", "veil_share", "saturated_share", "snr", "texture_snr")
     return {
         "schema": "twin.turbidity/1",
@@ -115,7 +116,7 @@ def summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
 
 
 def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Returns the summary as the rows of a table, for green light."""
+    """Returns the values of a summary for the green band as table rows, the header first."""
     header = ("turbidity", "attenuation c", "contrast", "backscatter", "grey level SD", "texture SNR", "visibility")
     max_range_m = summary["contrast_left"]["range_m"][-1]
     rows = [
@@ -131,7 +132,7 @@ def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
-    """Writes turbidity.png and turbidity.json to a folder; returns the summary."""
+    """Writes turbidity.png and turbidity.json to a folder, which is created if missing; returns the summary."""
     folder.mkdir(parents=True, exist_ok=True)
     results = summary(levels)
     (folder / "turbidity.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

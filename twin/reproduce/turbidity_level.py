@@ -13,7 +13,7 @@ from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]
 
-#: Fraction of its clear-water contrast below which detail is invisible.
+#: Contrast relative to clear water below which fine detail counts as invisible.
 MIN_VISIBLE_CONTRAST = 0.05
 
 
@@ -25,7 +25,7 @@ class TurbidityLevel(NamedTuple):
         water: optical properties of the water.
         image: (H, W, 3) image of the left camera.
         quality: image quality, see `look.image_quality`.
-        ranges_m: (n,) ranges at which the contrast is given.
+        ranges_m: (n,) ranges at which `contrast` is given.
         contrast: (n, 3) contrast of fine detail relative to clear water for R, G, B.
     """
 
@@ -38,6 +38,6 @@ class TurbidityLevel(NamedTuple):
 
     @property
     def visibility_m(self) -> float | None:
-        """Range at which the green contrast falls below `MIN_VISIBLE_CONTRAST`; None if it does not."""
+        """Shortest range at which the green contrast is below `MIN_VISIBLE_CONTRAST`; None if there is none."""
         invisible = np.flatnonzero(self.contrast[:, 1] < MIN_VISIBLE_CONTRAST)
         return float(self.ranges_m[invisible[0]]) if invisible.size else None

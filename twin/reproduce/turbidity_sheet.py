@@ -20,7 +20,7 @@ PANEL_IN = 3.1
 
 
 def draw(levels: Sequence[TurbidityLevel], file: Path) -> Path:
-    """Draws the figure to a PNG file; returns its path."""
+    """Draws the figure, writes it to a PNG file and returns the path of the file."""
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
     with matplotlib.rc_context(FIGURE_STYLE):
@@ -52,7 +52,7 @@ def _picture(axes: Axes, level: TurbidityLevel) -> None:
 
 
 def _histogram_of(image: Any, band: int) -> Any:
-    """Returns the histogram (128,) of a band: the fraction of the pixels in each bin of two grey levels."""
+    """Returns the histogram (128,) of a colour band: the fraction of pixels in each bin, two grey levels wide."""
     return np.histogram(image[..., band], bins=128, range=(0, 256))[0] / image[..., band].size
 
 

@@ -1,1 +1,1 @@
-"""The scenario: its models and its TOML file."""
+"""The scenario: its data model, and reading and writing of its TOML file."""

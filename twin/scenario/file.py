@@ -26,7 +26,7 @@ _ABSENT = object()
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file with the file that it extends, and applies overrides.
+    """Reads a scenario file and the files that it extends, and applies overrides.
 
     Args:
         path: a file, or a name in scenes/.
@@ -53,9 +53,13 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
-    """Returns the keys and values of a scenario (file or name in scenes/) merged with its base file.
+    """Returns the keys and values of a scenario, merged over its base file; the values are not validated.
 
-    Values are not checked. Raises ScenarioError where a file cannot be read or contains a renamed key.
+    Args:
+        path: a file, or a name in scenes/.
+
+    Raises:
+        ScenarioError: a file cannot be read or contains the old name of a renamed key.
     """
     tree, _, errors = _read_with_base(find_scene(path), including_files=())
     if errors:
@@ -64,12 +68,12 @@ def read_tree(path: str | Path) -> dict[str, Any]:
 
 
 def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
-    """Returns the scenario of a tree in which some keys have new values.
+    """Returns the validated scenario of a tree of keys, some of which are given new values.
 
     Args:
         tree: keys and values of a scenario; not modified.
-        values: dotted keys and their values; file paths are relative to the folder of the source.
-        source: origin of the values, for file and line in error messages.
+        values: dotted keys and their new values; relative file paths refer to the folder of `source.path`.
+        source: file that the new values come from, for error messages.
 
     Raises:
         ScenarioError: lists every error.
@@ -90,7 +94,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 
 
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
-    """Returns the tree as a validated model. Raises ScenarioError, which lists every error."""
+    """Validates a tree of keys and values and returns the model. Raises ScenarioError, which lists every error."""
     try:
         return model.model_validate(tree)
     except ValidationError as error:
@@ -104,7 +108,7 @@ def find_scene(path: str | Path) -> Path:
         path: an existing file, or a name in scenes/.
 
     Raises:
-        ScenarioError: there is no such file or name.
+        ScenarioError: no such file or name exists.
     """
     import scenes
 
@@ -121,7 +125,7 @@ def find_scene(path: str | Path) -> Path:
 
 
 def dump_toml(scenario: Scenario) -> str:
-    """Returns the scenario as TOML, which `load_scenario` reads as an equal scenario."""
+    """Returns the scenario as the text of a TOML file, which `load_scenario` reads as an equal scenario."""
     tree = scenario.model_dump(mode="json", exclude_none=True)
     require = tree.pop("require")
     tables = {key: tree.pop(key) for key in ("lamps", "beacons")}
@@ -129,10 +133,10 @@ def dump_toml(scenario: Scenario) -> str:
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """Reads a TOML file, without the file that it extends.
+    """Reads one TOML file; a file that it extends is not read.
 
     Returns:
-        Its keys and values, and the line of each dotted key.
+        Keys and values, and the line number of each dotted key.
 
     Raises:
         ScenarioError: the file cannot be read, or is not TOML.
@@ -157,8 +161,8 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
         including_files: absolute paths of the files that extend this one, directly or indirectly.
 
     Returns:
-        Keys and values without the renamed keys, with absolute file paths; their files and lines; and an error for
-        each renamed key.
+        The merged keys and values, with absolute file paths and without old names of renamed keys; the files and line
+        numbers that they come from; and one error for each old name.
     """
     if file.resolve() in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
@@ -187,7 +191,7 @@ def _remove(tree: dict[str, Any], key: str) -> bool:
 
 
 def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
-    """Makes the file paths in a tree absolute."""
+    """Makes the file paths in a tree absolute, in place; relative paths refer to `folder`."""
     for section, key in (name.split(".") for name in _PATH_KEYS):
         keys = tree.get(section)
         if isinstance(keys, dict) and isinstance(keys.get(key), str):
@@ -195,7 +199,7 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """Returns the path with ${TWIN_DATA} expanded; other relative paths are relative to `folder`."""
+    """Returns an absolute path with ${TWIN_DATA} expanded; a relative path without it refers to `folder`."""
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
         return Path(value.replace("${TWIN_DATA}", data)).resolve()
@@ -203,7 +207,7 @@ def _expand(value: str, folder: Path) -> Path:
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Returns the two trees merged; where both have a value, that of `top` is used."""
+    """Returns two trees merged; where both contain a key, the value in `top` takes precedence."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -212,7 +216,7 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    """Sets one `key=value` in the tree."""
+    """Sets a key of the tree to a value, both given as `key=value`."""
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -230,7 +234,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
     """Sets a dotted key in the tree.
 
     Args:
-        origin: beginning of an error message.
+        origin: source of the value, with which error messages begin.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -246,7 +250,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
 
 
 def _child(node: Any, part: str, origin: str) -> Any:
-    """Returns the section or list item with this name."""
+    """Returns the section or list item `part` of a node; a missing section is created."""
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdigit() or int(part) >= len(node):
@@ -255,7 +259,7 @@ def _child(node: Any, part: str, origin: str) -> Any:
 
 
 def _renamed(key: str) -> str | None:
-    """Returns the new name of an old key, or of a key in an old section; None where nothing was renamed."""
+    """Returns the new name of a renamed key, or of a key in a renamed section; None for any other key."""
     for old, new in _RENAMED_KEYS.items():
         if key == old or key.startswith(f"{old}."):
             return new + key.removeprefix(old)
@@ -263,7 +267,7 @@ def _renamed(key: str) -> str | None:
 
 
 def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
-    """Returns a pydantic error as a TwinError with scenario key, problem and allowed values."""
+    """Converts a pydantic error to a TwinError with dotted key, problem and allowed values."""
     field = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         allowed = _fields(item["loc"][:-1], model)
@@ -294,7 +298,7 @@ _ALLOWED = {
 
 
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
-    """Returns the names of the keys allowed in the section at this location in the model."""
+    """Returns the keys allowed in a section of the model, given the path to the section."""
     for part in location:
         if part not in model.model_fields:  # an item of a list, a key of a table
             continue
@@ -305,6 +309,6 @@ def _fields(location: Iterable[Any], model: Any) -> list[str]:
 
 
 def _hint(word: str, names: Sequence[str]) -> str:
-    """Returns ` (did you mean NAME?)` for the closest name, or "" where none is close."""
+    """Returns ` (did you mean NAME?)` with the name most similar to the word, or "" if none is similar."""
     close = difflib.get_close_matches(word, names, n=1)
     return f" (did you mean {close[0]}?)" if close else ""

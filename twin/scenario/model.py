@@ -1,4 +1,4 @@
-"""The scenario as frozen models: every section and key with its unit, range and meaning."""
+"""Data model of a scenario: every section and key with its unit, range and meaning."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
 
 
 class Section(BaseModel):
-    """Base class of the sections: frozen, without unknown keys, finite numbers only."""
+    """Base class of the sections: immutable; rejects unknown keys, NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Rejects strings and booleans where a number is required; pydantic would convert them."""
+        """Rejects strings and booleans where a number is required; pydantic alone would convert them to numbers."""
         kind = cls.model_fields[info.field_name or ""].annotation
         if kind in (float, int) and isinstance(value, str | bool):
             raise PydanticCustomError("float_type" if kind is float else "int_type", "a number")
@@ -75,15 +75,15 @@ class TerrainConfig(Section):
 
 
 class VehicleConfig(Section):
-    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); the factors let a study vary its hydrodynamics."""
+    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); a study can vary its drag and added mass by factors."""
 
     dynamics: Literal["rigid", "kinematic"] = Field(
         default="rigid",
-        description="rigid: a rigid body under thrust, drag and current; kinematic: moves level, at constant height "
-        "and at exactly the commanded velocity, without forces",
+        description="rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height and "
+        "moves exactly at the commanded velocity, without forces",
     )
     buoyancy_n: float = Field(
-        default=1.0, ge=-20, le=20, description="net buoyancy after trimming, positive is upwards [N]"
+        default=1.0, ge=-20, le=20, description="buoyancy minus weight after trimming, positive upwards [N]"
     )
     drag_factor: float = Field(default=1.0, ge=0.05, le=20, description="multiplies linear and quadratic drag")
     added_mass_factor: float = Field(default=1.0, ge=0, le=5, description="multiplies the added mass")
@@ -97,7 +97,7 @@ class RigConfig(Section):
     hfov_deg: float = Field(default=60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
     baseline_m: float = Field(default=0.15, gt=0.005, le=3, description="distance between the cameras [m]")
     frame_rate_hz: float = Field(
-        default=30.0, ge=5, le=120, description="frame rate; the control loop oscillates at much lower rates [Hz]"
+        default=30.0, ge=5, le=120, description="rate of frames and commands; at low rates the control oscillates [Hz]"
     )
     mount_m: Vector3 = Field(
         default=(0.0, 0.0, -0.15), description="midpoint of the cameras in the body frame: forward, left, up [m]"
@@ -155,7 +155,7 @@ class SensorConfig(Section):
     full_well_e: float = Field(
         default=10000.0, ge=100, le=1e7, description="full-well capacity, which is full scale at gain 1 [e-]"
     )
-    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="read noise of a pixel, in the dark [e-]")
+    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="read noise of a pixel (1 sigma) [e-]")
     bits: Literal[8, 12] = Field(
         default=12, description="bit depth of the analogue-to-digital converter; delivered images have 8 bits"
     )
@@ -189,9 +189,9 @@ class LensConfig(Section):
 class PortConfig(Section):
     """Window in front of each lens; every ray is refracted at both of its faces.
 
-    The field of view given for the rig is that of an equivalent pinhole in water: the one that reproduces the image
-    near its centre, at any distance, for a port that is not tilted. The position of a camera is the position of this
-    pinhole.
+    `rig.hfov_deg` is the field of view of the equivalent pinhole camera in water, whose image agrees near the centre,
+    at any distance, with the image through the port if the port is neither tilted nor laterally offset. The position of
+    a camera is that of this pinhole.
     """
 
     kind: Literal["none", "flat", "dome"] = Field(
@@ -253,15 +253,15 @@ class WaterConfig(Section):
     turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies the scattering coefficient")
     absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
         default=None,
-        description="absorption coefficient for R, G, B in place of the Jerlov type's; needs scattering_per_m [1/m]",
+        description="absorption coefficient for R, G, B; replaces the Jerlov type; needs scattering_per_m [1/m]",
     )
     scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
         default=None,
-        description="scattering coefficient for R, G, B in place of the Jerlov type's; needs absorption_per_m [1/m]",
+        description="scattering coefficient for R, G, B; replaces the Jerlov type; needs absorption_per_m [1/m]",
     )
     spectrum_file: str | None = Field(
         default=None,
-        description="CSV of wavelength [nm], absorption and scattering [1/m] in place of the Jerlov type's; "
+        description="CSV of wavelength [nm], absorption and scattering [1/m]; replaces the Jerlov type; "
         "${TWIN_DATA} is expanded",
     )
     mean_cosine: float = Field(
@@ -271,8 +271,8 @@ class WaterConfig(Section):
     kept_share: float = Field(
         default=0.0, ge=0, le=1,
         description="fraction k of the scattered light that stays in the beam (multiple scattering): attenuation is "
-        "a + (1 - k) b, from the beam attenuation c (k = 0) to absorption alone (k = 1); 0.74 keeps scattering "
-        "angles below 15 deg",
+        "a + (1 - k) b, from the beam attenuation c (k = 0) to absorption alone (k = 1); k = 0.74 is the fraction "
+        "scattered by less than 15 deg",
     )  # fmt: skip
 
     @property
@@ -296,7 +296,7 @@ class LampConfig(Section):
     beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(
         default=(),
         description="beam pattern: pairs of angle off the axis [deg], from 0, and intensity relative to the axis, "
-        "interpolated linearly, dark beyond the last angle; empty: a measured LED",
+        "interpolated linearly, dark beyond the last angle; empty: the measured beam of an LED lamp",
     )
     colour_temperature_k: float = Field(
         default=6500.0, ge=1000, le=40000,
@@ -310,12 +310,12 @@ class SunConfig(Section):
     illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="illuminance of white daylight [lx]")
     depth_m: float = Field(
         default=0.0, ge=0, le=500,
-        description="depth of the reference plane z = 0 below the surface, where illuminance_lx applies; the water "
-        "attenuates it on the way down; 0: illuminance_lx applies on the sea floor, whatever its height [m]",
+        description="depth of the reference plane z = 0 below the water surface; illuminance_lx applies at the surface "
+        "and decreases with depth; 0: no surface, illuminance_lx applies on the sea floor at any height [m]",
     )  # fmt: skip
     caustics: float = Field(
         default=0.0, ge=0, le=1,
-        description="fraction of the daylight that is direct sunlight, which waves focus; needs depth_m",
+        description="fraction of the daylight that is direct sunlight, which waves focus into caustics; needs depth_m",
     )  # fmt: skip
 
 
@@ -334,7 +334,7 @@ class CurrentConfig(Section):
 
 
 class NavigationConfig(Section):
-    """Navigation sensors: all are simulated; the estimators get the readings of those in `aiding`."""
+    """Navigation sensors: all are simulated, but the estimators receive only the readings of those in `aiding`."""
 
     aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty: vision only")
     pressure_sigma_m: float = Field(
@@ -401,7 +401,7 @@ class PlanConfig(Section):
         default=0, ge=0, le=1000, description="number of tracks (two legs, or one loop); 0: enough to cover the area"
     )
     clearance_m: float = Field(
-        default=0.3, ge=0, le=10, description="smallest vertical distance of the cameras to the sea floor [m]"
+        default=0.3, ge=0, le=10, description="smallest allowed vertical distance from the cameras to the sea floor [m]"
     )
 
 
@@ -461,8 +461,8 @@ class Source(BaseModel):
     Args:
         path: file of the scenario.
         lines: line number of each dotted key of that file.
-        base: the same for the file that it extends.
-        overrides: `key=value` of the command line.
+        base: origin of the keys of the file that this file extends; None if it extends none.
+        overrides: overrides from the command line, each `key=value`.
     """
 
     path: Path
@@ -473,7 +473,7 @@ class Source(BaseModel):
     def describe(self, error: TwinError) -> str:
         """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, or `--set: ...` for an overridden key.
 
-        The line is that of the key, or of the innermost section in the file that contains it.
+        FILE and LINE are those of the key or, if no file contains the key, of the innermost section around it.
         """
         overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
         in_overridden_section = error.field not in self.lines and any(
@@ -488,7 +488,7 @@ class Source(BaseModel):
         return f"{file.path}:{file.lines.get(key, 1)}: {error}"
 
     def _files(self) -> list[Source]:
-        """Returns the file and those that it extends."""
+        """Returns this source and the sources of the files that it extends, directly or indirectly."""
         return [self, *(self.base._files() if self.base else [])]
 
 
@@ -524,11 +524,11 @@ class Scenario(Section):
 
     @property
     def source(self) -> Source:
-        """Origin of the scenario, for error messages."""
+        """Files, line numbers and overrides that the scenario was read from, for error messages."""
         return self._source
 
     def believed_rig(self) -> StereoRig:
-        """Returns the calibrated rig as the estimators use it, without the calibration error."""
+        """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""
         rig = self.rig
         focal_px = rig.image_width_px / 2 / float(_tan_deg(rig.hfov_deg / 2))
         forward, left, up = rig.mount_m
@@ -543,7 +543,7 @@ class Scenario(Section):
         )
 
     def believed_noise(self) -> SensorNoise:
-        """Returns the noise of the navigation sensors and the positions of the beacons as the estimators use them."""
+        """Returns the sensor noise and the beacon positions that the estimators assume."""
         navigation = self.navigation
         return SensorNoise(
             navigation.pressure_sigma_m,
@@ -561,7 +561,7 @@ class Scenario(Section):
         return EstimatorSettings(**self.estimate.model_dump())
 
     def fingerprint(self) -> str:
-        """Returns a hash of all values; scenarios with the same hash give the same survey."""
+        """Returns a hash of all values, 16 hexadecimal digits; scenarios with equal hashes give the same survey."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 

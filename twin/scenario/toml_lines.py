@@ -1,4 +1,4 @@
-"""Line numbers of the keys of a TOML text."""
+"""Line numbers of the keys in a TOML text."""
 
 from __future__ import annotations
 
@@ -53,7 +53,14 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def _blocks(header: str, path: str, body: _Body, n_header_lines: int) -> Iterator[_Block]:
-    """Yields the block of a table, then the blocks of the tables in it."""
+    """Yields the block of a table, then the blocks of the tables in it.
+
+    Args:
+        header: header of the table; empty for the top level and for a table without a header of its own.
+        path: dotted key of the table; empty for the top level.
+        body: keys and items of the table.
+        n_header_lines: number of lines that the header occupies, 0 or 1.
+    """
     keys = [(path, 0)] if path else []
     row, tables = n_header_lines, []
     for key, item in body:
@@ -75,7 +82,7 @@ def _blocks(header: str, path: str, body: _Body, n_header_lines: int) -> Iterato
 
 
 def _with_parent(name: str, blocks: Iterator[_Block]) -> Iterator[_Block]:
-    """Yields the blocks; the first one also gives the line of a parent that has no header of its own."""
+    """Yields the blocks; the first one is given the key `name` of the parent, which has no header of its own."""
     for position, block in enumerate(blocks):
         if position == 0:
             block.keys.insert(0, (name, 0))
@@ -83,7 +90,7 @@ def _with_parent(name: str, blocks: Iterator[_Block]) -> Iterator[_Block]:
 
 
 def _locate(keys: list[tuple[str, int]], path: str, key: Key | None, item: Item, row: int) -> int:
-    """Adds a key, and the keys in its value, to `keys`; returns the row where the text after the value begins."""
+    """Adds a key and the keys in its value, with their rows, to `keys`; returns the row after the item."""
     if key is None:  # whitespace or a comment
         return row + item.as_string().count("\n")
     name = _join(path, key)
@@ -94,7 +101,7 @@ def _locate(keys: list[tuple[str, int]], path: str, key: Key | None, item: Item,
 
 
 def _locate_value(keys: list[tuple[str, int]], name: str, item: Item, row: int) -> int:
-    """Adds the keys in a value to `keys`; returns the row of its end."""
+    """Adds the keys in a value, with their rows, to `keys`; returns the row in which the value ends."""
     if isinstance(item, AbstractTable):
         for key, value in item.value.body:
             row = _locate(keys, name, key, value, row)
@@ -105,7 +112,7 @@ def _locate_value(keys: list[tuple[str, int]], name: str, item: Item, row: int) 
 
 
 def _locate_items(keys: list[tuple[str, int]], name: str, array: Array, row: int) -> int:
-    """Adds the items of an array, and the keys in them, to `keys`; returns the row of the closing bracket."""
+    """Adds the items of an array and the keys in them, with their rows, to `keys`; returns the row of the last "]"."""
     text = array.as_string()
     position = 1
     for index in range(len(array)):

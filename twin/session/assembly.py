@@ -26,10 +26,10 @@ def open_world(mission: Mission, stopwatch: StageTimer) -> World:
 
 
 def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators of a survey, with visual measurements from images or from the surrogate world.
+    """Returns the estimators of a survey; their visual measurements come from images or from the surrogate world.
 
     Args:
-        folder: run folder; images of keyframes are spooled below it.
+        folder: run folder; keyframe images and mosaic tiles are stored in its subfolder "keyframes".
     """
     if mission.scenario.imaging.fidelity == "rendered":
         return navigator_with(mission, image_vision(mission, folder, stopwatch), stopwatch)
@@ -40,14 +40,14 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
 
 
 def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:
-    """Returns the visual measurements from images, which use the believed calibration and not the true one."""
+    """Returns the source of visual measurements from images; it uses the believed calibration, not the true one."""
     cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
     settings = mission.scenario.estimator_settings()
     return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch)
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators. They get believed calibration and noise, settings and planned start, not the truth."""
+    """Returns the estimators. They receive believed calibration and noise, settings and planned start, but no truth."""
     scenario = mission.scenario
     return Navigator(
         mission.rig,

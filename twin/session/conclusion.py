@@ -44,7 +44,7 @@ class Flight(NamedTuple):
 
 
 def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
-    """Aligns all keyframes, builds the map, compares with the truth, and writes the run folder."""
+    """Aligns all keyframes, builds the map, compares trajectories and map with the truth, and writes the run folder."""
     mission, world, navigator, stopwatch, reason = flight
     try:
         result = navigator.finish()
@@ -71,7 +71,7 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
 
 
 def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns simulated and wall time, peak memory, and the durations of the processing stages."""
+    """Returns simulated and wall time [s], peak memory [MiB], and the durations of the processing stages."""
     return {
         "wall_s": wall_s,
         "simulated_s": simulated_s,
@@ -81,7 +81,7 @@ def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str
 
 
 def _identity(mission: Mission, reason: str, warning: str) -> dict[str, Any]:
-    """Returns name, seed, version, scenario hash, status, reason of an abort, and warning of a survey."""
+    """Returns name, seed, program version, scenario hash, status, reason for an abort, and warnings of a survey."""
     scenario = mission.scenario
     return {
         "name": scenario.name,

@@ -1,4 +1,4 @@
-"""Monitor of a running survey: progress, log, live view, and the abort when vision stays lost."""
+"""Monitoring of a running survey: progress, log and live view; abort if vision stays lost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from twin.errors import SurveyAborted
 from twin.report.run_writer import RunFolder
 from twin.world.mission import Mission
 
-_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for longer
+_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for a longer time
 
 
 class SurveyProgress(NamedTuple):
@@ -19,9 +19,9 @@ class SurveyProgress(NamedTuple):
 
     Args:
         simulated_s, wall_s: simulated and wall time [s].
-        share: completed fraction of the stage, 0 to 1.
-        sigma_m: standard deviation of the online position [m].
-        stage: "survey", "map" or "report".
+        share: completed fraction of `stage`, 0 to 1.
+        sigma_m: standard deviation of the online position, root of the sum of the three variances [m].
+        stage: current stage, "survey", "map" or "report".
     """
 
     simulated_s: float
@@ -32,10 +32,10 @@ class SurveyProgress(NamedTuple):
 
 
 class SurveyMonitor:
-    """Reports every frame of a survey, and aborts the survey if vision is lost for too long.
+    """Reports the progress of a survey at every frame, and aborts the survey if vision is lost for too long.
 
     Args:
-        progress: function called with the progress after every frame.
+        progress: function called with the progress after every frame and during the later stages.
         live: whether to show the survey in Rerun while it runs.
     """
 
@@ -70,7 +70,7 @@ class SurveyMonitor:
             raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
 
     def report_stage(self, stage: str, share: float) -> None:
-        """Reports the completed fraction of a stage after the flight."""
+        """Reports the completed fraction of a stage that follows the flight, "map" or "report"."""
         self.progress(SurveyProgress(0.0, self.wall_s, share, 0.0, stage))
 
     @property

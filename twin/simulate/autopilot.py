@@ -1,4 +1,4 @@
-"""Pose controller of the BlueROV2, with published vehicle parameters.
+"""Pose controller of the BlueROV2, designed with published vehicle parameters.
 
 The controller ignores the drag and added-mass factors of the scenario, which therefore act as model errors.
 """
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:
-    """Returns a pose controller with the published hull and thruster parameters and one command per frame."""
+    """Returns a pose controller for the published hull and thruster parameters, which gives one command per frame."""
     hull = trimmed_hull(VehicleConfig.model_validate({}))
     model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
     allocation = pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
@@ -28,13 +28,14 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
-    """Returns the greatest steady speed in still water along a direction, at which one thruster saturates [m/s].
+    """Returns the greatest steady speed in still water along a direction, at which the first thruster saturates [m/s].
 
-    Drag is linear v + quadratic v |v| along each axis, so the thrust of each thruster is p v + q v^2.
+    Drag along each axis is linear v + quadratic v |v|. Each thruster therefore needs the thrust p v + q v^2, with p and
+    q from the thrust allocation.
 
     Args:
-        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
-        direction: (3,) unit vector of the velocity in the body.
+        vehicle: vehicle settings of the scenario, with the factor on drag.
+        direction: (3,) unit vector of the velocity, in body axes.
     """
     hull = trimmed_hull(vehicle)
     configuration = angular_first(BLUEROV2_HEAVY.thrust_configuration)
@@ -48,5 +49,5 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 
 
 def _thrust_n(command: Array) -> Array:
-    """Returns the steady thrust [N] at commands in [-1, 1]."""
+    """Returns the steady thrust (n,) [N] of a BlueROV2 thruster for commands (n,) in [-1, 1]."""
     return steady_thrust_n(command, BLUEROV2_HEAVY.thrust_coefficients)

@@ -1,7 +1,8 @@
 """Compiled rigid-body simulation of the vehicle without MuJoCo, for surveys that are not rendered.
 
-It integrates as MuJoCo does for a free body without contacts: velocity first, then position with the new velocity, then
-rotation by the body rates. `mujoco_vehicle.MujocoVehicle` and this module agree within rounding errors.
+The integration is that of MuJoCo for a free body without contacts: velocity first, then position with the new velocity,
+then rotation with the new angular velocity. The results equal those of `mujoco_vehicle.MujocoVehicle` within rounding
+errors.
 """
 
 from __future__ import annotations
@@ -33,10 +34,12 @@ class RigidBodyState(NamedTuple):
     """State and parameters of a rigid body in water; the arrays of the state are modified in place.
 
     Args:
-        pose: (4, 4) true pose, modified in place.
-        velocity: (6,) velocity of the free joint, half a timestep before the pose, modified in place.
-        acceleration: (6,) acceleration of the last step, modified in place.
-        kick: (1,) number of timesteps by which the next step advances the velocity: 0.5 in the first step, then 1.
+        pose: (4, 4) true pose world_from_body, modified in place.
+        velocity: (6,) [linear in world axes, angular in body axes] velocity [m/s, rad/s], half a timestep before the
+            time of the pose, modified in place.
+        acceleration: (6,) rate of change of `velocity` in the last step [m/s2, rad/s2], modified in place.
+        kick: (1,) number of timesteps by which the next step advances the velocity: 0.5 in the first step, then 1;
+            modified in place.
         thrusters: thrusters of the vehicle, modified in place.
         hull: hull of the vehicle.
         current: (3,) velocity of the steady current in the world [m/s].
@@ -57,7 +60,7 @@ class CompiledVehicle:
     """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
 
     Args:
-        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
+        vehicle: vehicle settings of the scenario: buoyancy, and factors on drag and added mass.
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
         timestep_s: physics timestep.
@@ -73,16 +76,16 @@ class CompiledVehicle:
 
     @property
     def world_from_body(self) -> Array:
-        """Returns the true pose (4, 4)."""
+        """Returns the true pose world_from_body (4, 4)."""
         return self.state.pose.copy()
 
     @property
     def twist_body(self) -> Array:
-        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s] at the time of the pose."""
+        """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return body_twist(self.state)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates a whole number of physics steps under constant thruster commands (8,) in [-1, 1].
+        """Simulates a duration, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
             SurveyAborted: the physics diverged.
@@ -91,7 +94,7 @@ class CompiledVehicle:
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
-        """Advances the simulated time after `advance` has advanced the state.
+        """Advances the simulated time and checks the state; called after `advance` has advanced the state.
 
         Raises:
             SurveyAborted: the physics diverged.
@@ -110,7 +113,7 @@ def body_twist(body):
 
 @njit(cache=True, nogil=True)
 def has_diverged(body):
-    """Returns whether the velocity is not finite or beyond SPEED_LIMIT_MPS or RATE_LIMIT_RADPS."""
+    """Returns whether a component of the velocity is not finite or reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS."""
     speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
     return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 

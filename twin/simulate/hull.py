@@ -1,4 +1,4 @@
-"""Hull of the BlueROV2 with the trim of a scenario; timestep and velocity limits of the physics."""
+"""Hull parameters of the BlueROV2 with the vehicle settings of a scenario; timestep and speed limits of the physics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from twin.simulate.hydrodynamics import Hull, angular_first
 
 MAX_TIMESTEP_S = 1 / 120
 GRAVITY_MPS2 = 9.81
-SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far beyond any underwater vehicle: the physics has diverged
+SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far above any speed of the vehicle; reached only by divergence
 
 
 def physics_timestep_s(frame_rate_hz: float) -> float:
@@ -21,7 +21,7 @@ def physics_timestep_s(frame_rate_hz: float) -> float:
 
 
 def trimmed_hull(vehicle: VehicleConfig) -> Hull:
-    """Returns the BlueROV2 hull with the buoyancy and the drag and added mass factors of a scenario."""
+    """Returns the hull parameters of the BlueROV2, with the vehicle settings of a scenario."""
     rov = BLUEROV2_HEAVY
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(

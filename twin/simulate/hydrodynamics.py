@@ -2,10 +2,11 @@
 
     (M_RB + M_A) nu' + C_RB(nu) nu + C_A(nu_r) nu_r + M_A w x R'v_c + D(nu_r) nu_r + g(R) = tau,   nu_r = nu - R'v_c
 
-A twist is the [angular, linear] velocity of the centre of gravity in body axes, a wrench is [moment, force]. The fourth
-term accounts for the rate of change of a steady current in rotating body axes: without it, the dynamics would not be
-Galilean invariant. The equation is solved for nu' including added mass; feeding back the acceleration of the last step
-would be unstable where added mass exceeds mass.
+The twist nu is the [angular, linear] velocity of the centre of gravity in body axes, w its angular part, and tau the
+wrench [moment, force]. R is the rotation world_from_body and v_c the velocity of a steady current in the world. The
+fourth term is due to the rate of change of R'v_c when the body rotates; without this term, the dynamics would not be
+Galilean invariant. The equation is solved for nu' with the total inertia M_RB + M_A. Computing the added-mass force
+from the acceleration of the previous step instead would be unstable where added mass exceeds mass.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class Hull(NamedTuple):
         added_inertia: (6,) added moments of inertia [kg m2], then added masses [kg].
         linear_drag: (6,) coefficients of linear drag [N m s/rad, then N s/m], positive.
         quadratic_drag: (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive.
-        centre_of_buoyancy_m: (3,) position of the centre of buoyancy in the body.
-        weight_n, buoyancy_n: weight and buoyancy force.
+        centre_of_buoyancy_m: (3,) position of the centre of buoyancy in body axes.
+        weight_n, buoyancy_n: weight and buoyancy force [N].
     """
 
     inertia: Array
@@ -60,9 +61,9 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     Args:
         hull: parameters of the hull.
         world_from_body: (3, 3) rotation from the body to the world.
-        twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
+        twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
         current_mps: (3,) velocity of the steady current in the world.
-        wrench: (6,) wrench of the thrusters in the body [N m, N].
+        wrench: (6,) [moment, force] of the thrusters in body axes [N m, N].
     """
     flow = np.zeros(6)  # R'v_c
     up = np.zeros(3)
@@ -95,10 +96,11 @@ def free_joint_acceleration(
 ) -> Array:
     """Returns the acceleration (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
 
-    These are [linear in the world, angular in the body], so the linear part is R (v' + w x v).
+    These coordinates are [linear in world axes, angular in body axes]. The linear part is R (v' + w x v), with v the
+    linear and w the angular velocity in body axes.
 
     Args:
-        velocity: (6,) velocity of the free joint [m/s, rad/s].
+        velocity: (6,) velocity in these coordinates [m/s, rad/s].
         hull, world_from_body, current_mps, wrench: as defined in `acceleration`.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
@@ -114,7 +116,7 @@ def free_joint_acceleration(
 
 @njit(cache=True, nogil=True)
 def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
-    """Converts a free joint's velocity (6,) [linear in world, angular in body] to a twist (6,) in the body."""
+    """Converts a free joint's velocity (6,), [linear in world, angular in body axes], to a twist (6,) in body axes."""
     twist = np.zeros(6)
     for k in range(3):
         twist[k] = velocity[3 + k]
@@ -124,13 +126,13 @@ def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
 
 
 def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twist: Array) -> float:
-    """Returns the kinetic energy, including added mass in still water, plus the potential energy [J].
+    """Returns the mechanical energy in still water [J]: potential energy, and kinetic energy including added mass.
 
     Args:
         hull: parameters of the hull.
         world_from_body: (3, 3) rotation from the body to the world.
-        position_m: (3,) position of the centre of gravity.
-        twist: (6,) [angular, linear] velocity in the body [rad/s, m/s].
+        position_m: (3,) position of the centre of gravity in the world.
+        twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
     """
     centre_z = position_m[2] + float(world_from_body[2] @ hull.centre_of_buoyancy_m)
     kinetic = 0.5 * float((hull.inertia + hull.added_inertia) @ twist**2)

@@ -1,4 +1,4 @@
-"""Vehicle without dynamics: level, at constant height, it moves exactly at the commanded velocity."""
+"""Vehicle without dynamics: it stays level at constant height and moves exactly at the commanded velocity."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ Array = NDArray[np.float64]
 class KinematicVehicle:
     """Vehicle that moves horizontally at the commanded velocity, without rotation, thrust, drag or current.
 
-    This is the simulated vehicle of Negahdaripour & Madjidi (2003, section V-A): t_Z and all rotations are zero.
+    This is the vehicle simulated by Negahdaripour & Madjidi (2003, section V-A): its vertical translation t_Z and all
+    rotations are zero.
 
     Args:
-        world_from_body: (4, 4) initial pose, at rest.
+        world_from_body: (4, 4) initial pose, at rest and level.
     """
 
     def __init__(self, world_from_body: Array):
@@ -26,11 +27,11 @@ class KinematicVehicle:
 
     @property
     def twist_body(self) -> Array:
-        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s]."""
+        """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s]; the angular part is zero."""
         return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Moves for a duration at the horizontal part of a velocity command (3,) in the world [m/s].
+        """Moves the vehicle for a duration with the horizontal part of a velocity command (3,) in the world [m/s].
 
         Raises:
             SurveyAborted: the command is not finite.

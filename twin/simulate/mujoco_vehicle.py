@@ -1,4 +1,4 @@
-"""Vehicle simulated by MuJoCo, with an applied force that yields the acceleration of the hydrodynamic model."""
+"""Vehicle simulated by MuJoCo; the applied force yields the acceleration of the hydrodynamic model."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Array = NDArray[np.float64]
 
 
 class MujocoVehicle:
-    """BlueROV2 Heavy under thrust, drag and current, stepped by MuJoCo with its own MjData.
+    """BlueROV2 Heavy under thrust, drag and current, simulated by MuJoCo with an MjData of its own.
 
     MuJoCo's step (velocity first, then position with the new velocity) is interpreted as leapfrog integration: the
-    velocity of the joint refers to half a timestep before its pose. Energy is then conserved to second order in the
-    timestep.
+    velocity of the free joint refers to half a timestep before the pose. Without drag and thrust, energy is then
+    conserved to second order in the timestep.
 
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        vehicle: vehicle settings of the scenario: trim, and factors of drag and added mass.
+        vehicle: vehicle settings of the scenario: buoyancy, and factors on drag and added mass.
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
     """
@@ -51,17 +51,17 @@ class MujocoVehicle:
 
     @property
     def time_s(self) -> float:
-        """Returns the simulated time."""
+        """Returns the simulated time [s]."""
         return float(self._data.time)
 
     @property
     def world_from_body(self) -> Array:
-        """Returns the true pose (4, 4)."""
+        """Returns the true pose world_from_body (4, 4)."""
         return geometry.pose(self._rotation, self._data.xpos[self._body])
 
     @property
     def twist_body(self) -> Array:
-        """Returns the true [angular, linear] velocity in the body (6,) [rad/s, m/s] at the time of the pose."""
+        """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return twist_from_free_joint(self._rotation, self._velocity_now())
 
     @property
@@ -74,7 +74,7 @@ class MujocoVehicle:
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates a whole number of physics steps under constant thruster commands (8,) in [-1, 1].
+        """Simulates a duration, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
             SurveyAborted: the physics diverged.
@@ -90,7 +90,7 @@ class MujocoVehicle:
         self._history.append(self._snapshot())
 
     def _advance(self, wrench: Array) -> None:
-        """Simulates one physics step under a wrench (6,) of the thrusters in the body."""
+        """Simulates one timestep under the wrench (6,) of the thrusters, [moment, force] in body axes [N m, N]."""
         model, data = self._model, self._data
         velocity = self._velocity_now()
         target = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
@@ -105,7 +105,7 @@ class MujocoVehicle:
         self._acceleration, self._kick = target, 1.0
 
     def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
-        """Raises SurveyAborted, with the last states, if the acceleration or velocity is not finite or too large."""
+        """Raises SurveyAborted, listing the last states, if the acceleration is not finite or the speed too large."""
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
             return

@@ -17,7 +17,7 @@ from twin.scenario.model import NavigationConfig
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-_BEACON_HEIGHT_M = 0.05  # a beacon stands out from the surface it is mounted on by at most this height
+_BEACON_HEIGHT_M = 0.05  # greatest height of a beacon above the surface on which it is mounted
 
 
 class NavigationSensors:
@@ -28,7 +28,8 @@ class NavigationSensors:
         noise: standard deviations from the data sheets, and the surveyed positions of the beacons.
         rig: nominal calibration of the stereo rig.
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
-        project: projects points (n, 3) in the left camera to pixels (n, 2), with true calibration; None: `rig.project`.
+        project: projects points (n, 3) in left camera axes to pixels (n, 2) with the true calibration; None: the
+            projection of `rig`.
     """
 
     def __init__(
@@ -52,8 +53,9 @@ class NavigationSensors:
         Args:
             time_s: time of the frame.
             world_from_body: (4, 4) true pose.
-            twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
-            depth_m: at a keyframe, a function that returns the true depth (height, width) of the left image; else None.
+            twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
+            depth_m: function that returns the true depth (height, width) of the left image [m]; None if the frame is
+                not a keyframe.
         """
         readings = read_pressure_and_attitude(
             world_from_body, self._rig.body_from_camera, self._noise, self._aiding, self._rng["navigation"]
@@ -75,7 +77,7 @@ class NavigationSensors:
         )
 
     def per_frame_sensors(self) -> PerFrameSensors:
-        """Returns the parameters of the sensors that are read at every frame, for compiled code."""
+        """Returns the parameters of the sensors that are read at every frame, in a form for compiled code."""
         pressure, ahrs, dvl = (name in self._aiding for name in ("pressure", "ahrs", "dvl"))
         return PerFrameSensors(
             self._rig.body_from_camera, self._noise.pressure_m, self._noise.attitude_sigmas_rad, self._dvl.gain,
@@ -83,24 +85,24 @@ class NavigationSensors:
         )  # fmt: skip
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Draws the standard normal numbers that `read` would draw for the next frames.
+        """Draws the standard normal numbers that `read` would draw over the next frames for the per-frame sensors.
 
         Returns:
-            (n_frames, 4) for pressure and attitude; (n_frames, 3) for the Doppler velocity log.
+            Numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the Doppler velocity log.
         """
         return self._rng["navigation"].standard_normal((n_frames, 4)), self._rng["dvl"].standard_normal((n_frames, 3))
 
 
 class PerFrameSensors(NamedTuple):
-    """Parameters of the sensors that are read at every frame.
+    """Parameters of the sensors that are read at every frame: pressure sensor, AHRS and Doppler velocity log (DVL).
 
     Args:
         body_from_camera: (4, 4) pose of the left camera in the body.
         pressure_sigma_m: standard deviation of the height from pressure.
         attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw.
         dvl_gain: 1 + scale error of the Doppler velocity log.
-        dvl_sigma_mps: standard deviation of each velocity component.
-        has_pressure, has_ahrs, has_dvl: whether each sensor is used.
+        dvl_sigma_mps: standard deviation of each component of the DVL velocity.
+        has_pressure, has_ahrs, has_dvl: whether each sensor is used for aiding.
     """
 
     body_from_camera: Array
@@ -115,15 +117,15 @@ class PerFrameSensors(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_numbers):
-    """Simulates the readings of the per-frame sensors; NaN for a sensor that is not used.
+    """Simulates the readings of the per-frame sensors; the readings of sensors not used for aiding are NaN.
 
     Args:
         sensors: `PerFrameSensors`.
         world_from_body: (4, 4) true pose.
-        twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
+        twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
         numbers, dvl_numbers: (4,) and (3,) standard normal numbers, see `NavigationSensors.draw_noise`.
     Returns:
-        Height of the left camera [m], attitude (3,) [rad], velocity (3,) in the body [m/s].
+        Height of the left camera [m], roll, pitch and yaw of the body (3,) [rad], and velocity (3,) in body axes [m/s].
     """
     height, angles = _height_and_attitude(
         world_from_body, sensors.body_from_camera, sensors.pressure_sigma_m, sensors.attitude_sigmas_rad, numbers
@@ -146,14 +148,14 @@ def read_pressure_and_attitude(
 ) -> Readings:
     """Simulates the pressure sensor and the attitude and heading reference system (AHRS).
 
-    The pressure sensor is in the housing of the left camera and measures the height of the camera, so attitude errors
-    do not enter through a lever arm. The AHRS measures roll, pitch and yaw of the body. Noise is always drawn for both,
-    so that random numbers do not depend on `aiding`.
+    The pressure sensor is in the housing of the left camera and measures the height of this camera; its reading
+    therefore needs no lever arm correction, in which attitude errors would enter. The AHRS measures roll, pitch and yaw
+    of the body. Noise is drawn for both sensors even if unused, so that random numbers do not depend on `aiding`.
 
     Args:
-        world_from_body, body_from_camera: (4, 4) true poses.
+        world_from_body, body_from_camera: (4, 4) true pose of the body, and pose of the left camera in the body.
         noise: standard deviations of the sensor errors.
-        aiding: names of the sensors used; the readings of the others are None.
+        aiding: names of the sensors used for aiding; the readings of the others are None.
         rng: random generator of these two sensors only.
     """
     height, angles = _height_and_attitude(
@@ -166,7 +168,7 @@ def read_pressure_and_attitude(
 
 @njit(cache=True, nogil=True)
 def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, attitude_sigmas_rad, numbers):
-    """Returns the measured camera height [m] and attitude (3,) [rad], with noise from standard normal numbers (4,)."""
+    """Returns measured camera height [m] and roll, pitch, yaw (3,) [rad]; noise from standard normal numbers (4,)."""
     up, arm = world_from_body[2], body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
     angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_sigmas_rad * numbers[1:]
@@ -174,7 +176,7 @@ def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, at
 
 
 class DopplerVelocityLog:
-    """Doppler velocity log: velocity over ground with white noise and a scale error that is constant over the survey.
+    """Doppler velocity log (DVL): velocity over ground, with white noise and a scale error constant over the survey.
 
     Args:
         noise: standard deviations of the white noise and of the scale error.
@@ -186,7 +188,7 @@ class DopplerVelocityLog:
         self.gain = 1 + noise.dvl_scale * float(rng.standard_normal())
 
     def read(self, velocity_mps: Array) -> Array:
-        """Returns the measured velocity (3,) [m/s] for a true velocity (3,) of the body's origin, in the body."""
+        """Returns the measured velocity (3,) for the true velocity (3,) of the body's origin, in body axes [m/s]."""
         return _dvl_velocity(velocity_mps, self.gain, self._sigma_mps, self._rng.standard_normal(3))
 
 
@@ -200,7 +202,7 @@ class AcousticPositioning:
     """Ultra-short baseline (USBL) positioning, triggered by keyframes so that each fix coincides with a stereo pair.
 
     Args:
-        noise: standard deviations of the measured position.
+        noise: standard deviation of each coordinate of a fix.
         interval_s: shortest time between two fixes.
         rng: random generator of this sensor only.
     """
@@ -210,11 +212,11 @@ class AcousticPositioning:
         self._next_s = 0.0
 
     def read(self, time_s: float, position_m: Array) -> Array | None:
-        """Returns the measured position (3,) at a keyframe; None if the interval has not elapsed.
+        """Returns the measured position (3,) at a keyframe; None if the interval since the last fix has not elapsed.
 
         Args:
             time_s: time of the keyframe.
-            position_m: (3,) true position of the left camera.
+            position_m: (3,) true position of the left camera in the world.
         """
         if time_s < self._next_s - 1e-9:
             return None
@@ -231,13 +233,13 @@ def detect_beacons(
 ) -> tuple[BeaconDetection, ...]:
     """Simulates the detection of beacons in the left image; beacons occluded by the floor are not detected.
 
-    Noise is drawn for every beacon, so that random numbers do not depend on which beacons are in view.
+    Noise is drawn for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
 
     Args:
         world_from_camera: (4, 4) true pose of the left camera.
         depth_m: (height, width) true depth of the left image.
-        project: projects points (n, 3) in the left camera to pixels (n, 2).
-        noise: standard deviations of the beacon measurements, and surveyed positions of the beacons.
+        project: projects points (n, 3) in left camera axes to pixels (n, 2).
+        noise: standard deviation of column and row of a detected beacon, and surveyed positions of the beacons.
         rng: random generator of this sensor only.
     """
     beacons = np.array(noise.beacons_m).reshape(-1, 3)
@@ -249,7 +251,7 @@ def detect_beacons(
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
-    """Returns whether a point at a pixel (2,) and a depth is inside the image and in front of the floor."""
+    """Returns whether a point, given by its pixel (2,) and its depth, is inside the image and not behind the floor."""
     rows, columns = depth_m.shape
     if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # also true for NaN
         return False

@@ -1,4 +1,4 @@
-"""Thruster model: steady thrust curve and linear lag."""
+"""Thruster model: steady thrust as a function of the command, and linear lag."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ Array = NDArray[np.float64]
 
 @njit(cache=True, nogil=True)
 def steady_thrust_n(command: Array, coefficients: Array) -> Array:
-    """Returns the steady thrust [N] at zero speed for commands u in [-1, 1].
+    """Returns the steady thrust (n,) [N] of a thruster at rest in the water for commands u in [-1, 1].
 
     Args:
         command: (n,) commands.
         coefficients: coefficients of the odd polynomial in u, from the highest power down to u.
     """
     thrust = np.zeros_like(command)
-    for coefficient in coefficients:  # Horner's scheme in the square
+    for coefficient in coefficients:  # Horner's scheme in u^2
         thrust = thrust * command * command + coefficient
     return thrust * command
 
 
 class ThrusterState(NamedTuple):
-    """State and parameters of n thrusters with a linear lag for a fixed timestep; the state is modified in place.
+    """State and parameters of n thrusters with a linear lag, discretised for a fixed timestep.
 
     Args:
         a, b, c: (m, m), (m, 1), (m,) discrete state-space model of the lag, of order m: transition, input and output.
-        configuration: (6, n) wrench [moment, force] in the body per newton of each thruster.
+        configuration: (6, n) wrench [moment, force] in body axes per newton of thrust of each thruster.
         coefficients: coefficients of the thrust curve, as in `steady_thrust_n`.
         lag_state: (m, n) state of the lag, modified in place.
         steady_n: (n,) steady thrust of the last command, modified in place.
@@ -74,7 +74,7 @@ class LaggedThrusters:
         return self.state.c @ self.state.lag_state
 
     def wrench(self) -> Array:
-        """Returns the current wrench of all thrusters, [moment, force] in the body (6,) [N m, N]."""
+        """Returns the current total wrench of the thrusters (6,), [moment, force] in body axes [N m, N]."""
         return thruster_wrench(self.state)
 
     def command(self, command: Array) -> None:
@@ -82,7 +82,7 @@ class LaggedThrusters:
         set_thruster_command(self.state, command)
 
     def step(self) -> None:
-        """Advances the lag by one timestep under the last commands."""
+        """Advances the thrusts by one timestep under the last commands."""
         step_thrusters(self.state)
 
 
@@ -118,13 +118,13 @@ def thruster_wrench(thrusters):
 
 
 def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
-    """Discretises the controllable canonical form of 1 / denominator for inputs that are constant over a timestep.
+    """Discretises the controllable canonical form (A, B) of 1 / denominator for inputs constant over a timestep dt.
 
-    The first rows of exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
+    The first n rows of exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
 
     Args:
-        denominator: (n + 1,) coefficients, the leading one 1.
-        timestep_s: dt.
+        denominator: (n + 1,) polynomial coefficients from the highest power down; the first one is 1.
+        timestep_s: dt [s].
     Returns:
         Transition matrix (n, n) and input matrix (n, 1).
     """

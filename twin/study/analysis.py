@@ -1,4 +1,4 @@
-"""Statistical analysis of a study's table: pass probability, metrics, sensitivities and reasons of failure."""
+"""Statistical analysis of a study's results: pass probability, metrics, sensitivities and reasons for failure."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _MAX_REASONS = 12
 
 
 class MetricSummary(NamedTuple):
-    """Distribution of a metric over the surveys: median, one-sided 95 % bound and required limit.
+    """Distribution of a metric over the surveys: median, 95th or 5th percentile, and required limit.
 
-    The bound is the 95th percentile, or the 5th percentile if larger values of the metric are better. `limit` is None
-    if the metric has no requirement.
+    `surveys` is the number of surveys; `bound` is the 95th percentile, or the 5th percentile if larger values of the
+    metric are better; `limit` is None if the metric has no requirement.
     """
 
     name: str
@@ -35,7 +35,7 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for text) and explained fraction of rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN for text) and explained fraction of the rank variance."""
 
     key: str
     metric: str
@@ -46,7 +46,8 @@ class Sensitivity(NamedTuple):
 class KeyComparison(NamedTuple):
     """Medians of a key over the surveys that passed and over the surveys that did not pass.
 
-    `superiority`: probability that the value of a survey that did not pass exceeds that of a survey that passed.
+    `superiority` is the probability that the key has a greater value in a survey that did not pass than in one that
+    passed; ties count half.
     """
 
     key: str
@@ -56,7 +57,7 @@ class KeyComparison(NamedTuple):
 
 
 class FailureReason(NamedTuple):
-    """Reason why surveys did not pass, and the number of surveys with this reason."""
+    """Reason why surveys did not pass, their status, and the number of these surveys."""
 
     status: str
     reason: str
@@ -64,7 +65,7 @@ class FailureReason(NamedTuple):
 
 
 class StudyAnalysis:
-    """Statistics of the results table of a study; boolean and numeric arrays have one element per survey."""
+    """Statistics of the results table of a study, which has one row per survey; array attributes follow its rows."""
 
     def __init__(self, rows: pa.Table, study: Study):
         self.rows, self.study, self.required_probability = rows, study, study.probability
@@ -92,9 +93,10 @@ class StudyAnalysis:
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
     def included(self, metric: str) -> NDArray[np.bool_]:
-        """Returns the mask of the surveys that the statistics of a metric include.
+        """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
 
-        These are the complete surveys with a value; image quality metrics also include aborted surveys.
+        These are the complete surveys with a value of the metric. The statistics of image quality metrics ("vision.")
+        also include aborted surveys.
         """
         flown = self.evaluated if metric.startswith("vision.") else self.complete
         return flown & np.isfinite(self.numbers(metric))
@@ -108,24 +110,24 @@ class StudyAnalysis:
         return limits
 
     def _passed(self) -> NDArray[np.bool_]:
-        """Returns the mask of the surveys that were completed and met every requirement."""
+        """Returns the mask (n,) of the surveys that were completed and met every requirement."""
         met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
         return np.logical_and.reduce([self.complete, *met])
 
     @cached_property
     def cluster_name(self) -> str:
-        """Returns the column of the clusters of correlated surveys: "sample", or "seed" if it has more values."""
+        """Returns the column that labels correlated surveys: "sample", or "seed" if that has more distinct values."""
         n_samples, n_seeds = (len(np.unique(self.numbers(name))) for name in ("sample", "seed"))
         return "sample" if n_samples >= n_seeds else "seed"
 
     @cached_property
     def clusters(self) -> Array:
-        """Returns the cluster label of each survey."""
+        """Returns the cluster label of each survey (n,)."""
         return self.numbers(self.cluster_name)
 
     @cached_property
     def pass_probability(self) -> Interval:
-        """Returns the fraction of the evaluated surveys that passed, with its interval."""
+        """Returns the fraction of the evaluated surveys that passed, with its confidence interval."""
         return statistics.clustered_proportion(self.passed[self.evaluated], self.clusters[self.evaluated])
 
     @property
@@ -135,14 +137,14 @@ class StudyAnalysis:
         return required is not None and not self.pass_probability.value >= required
 
     def key_numbers(self, key: str) -> Array | None:
-        """Returns the values of a key, or None if they are not numbers."""
+        """Returns the value of a key in each survey (n,), or None if the values are not numbers."""
         column = self.rows[f"vary.{key}"]
         if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
             return self.numbers(f"vary.{key}")
         return None
 
     def key_groups(self, key: str, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[str]]:
-        """Groups the chosen surveys by the value of a key; returns the group index of each survey and the names."""
+        """Groups the chosen surveys by the value of a key; returns their group indices and the names of the groups."""
         values = self.key_numbers(key)
         if values is None:
             names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
@@ -152,7 +154,7 @@ class StudyAnalysis:
 
     @cached_property
     def metric_summaries(self) -> list[MetricSummary]:
-        """Returns the median and 95 % bound of each metric."""
+        """Returns the summary of the distribution of each metric."""
         return [self._metric_summary(name) for name in self.metrics]
 
     def _metric_summary(self, name: str) -> MetricSummary:
@@ -169,7 +171,7 @@ class StudyAnalysis:
 
     @cached_property
     def sensitivities(self) -> list[Sensitivity]:
-        """Returns the sensitivity of each metric to each key, sorted by metric and then by strength."""
+        """Returns the sensitivity of each metric to each key, sorted by metric, then strongest first."""
         unsorted = [self._sensitivity(key, metric) for metric in self.metrics for key in self.keys]
         order = {metric: k for k, metric in enumerate(self.metrics)}
         return sorted(unsorted, key=lambda s: (order[s.metric], -_strength(s)))
@@ -184,7 +186,7 @@ class StudyAnalysis:
 
     @cached_property
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
-        """Returns the Sobol indices by metric and axis; empty unless a Saltelli design is complete."""
+        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes."""
         axes = axis_names(self.study)
         usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
         if not usable or len(np.unique(self.numbers("sample"))) != (self.study.sampling.samples or 0) * (len(axes) + 2):
@@ -197,17 +199,17 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean over the seeds of each sample; NaN if any survey of the sample was not completed."""
+        """Returns the mean of a metric over the surveys of each sample; NaN if any of them was not completed."""
         values = np.where(self.complete, self.numbers(metric), np.nan)
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
 
     @cached_property
     def threshold(self) -> tuple[Interval, bool] | None:
-        """Returns the value of the `seek` key at the required pass probability.
+        """Returns the value of the `seek` key at which the pass probability equals the required one.
 
-        The second value is whether the pass probability increases with the key. Returns None if the study has no
-        `seek` key, or if no survey could be evaluated.
+        The second value is True if the pass probability increases with the key, else False. Returns None if the study
+        has no numeric `seek` key or no required pass probability, or if no survey could be evaluated.
         """
         key = self.study.seek
         x = self.key_numbers(key) if key is not None and key in self.keys else None
@@ -219,7 +221,7 @@ class StudyAnalysis:
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Compares each numeric key between surveys that passed and surveys that did not; best separation first."""
+        """Compares the numeric keys of surveys that passed and surveys that did not; best separating key first."""
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)
@@ -232,7 +234,7 @@ class StudyAnalysis:
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:
-        """Returns the reasons why surveys did not pass, with numbers masked and the most frequent first."""
+        """Returns the most frequent reasons why surveys did not pass, in descending order, with numbers masked."""
         counts: dict[tuple[str, str], int] = {}
         for k in np.flatnonzero(~self.passed):
             reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))
@@ -245,7 +247,7 @@ class StudyAnalysis:
 
 
 def mask_numbers(reason: str) -> str:
-    """Returns a reason with its numbers replaced by "…", so that similar reasons can be counted together."""
+    """Returns a reason with every number replaced by "…", so that reasons that differ only in numbers become equal."""
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", reason)
 
 

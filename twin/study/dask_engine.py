@@ -1,4 +1,4 @@
-"""Engine on the workers of a Dask cluster that is already running, or of a Dask cluster started as SLURM jobs."""
+"""Engine that runs tasks on a Dask cluster, which is either already running or started as SLURM jobs."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _CONNECT_TIMEOUT_S = 20
 _QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
 _MIN_QUEUED = 64
 _REFRESH_S = 2.0
-_MAX_LOST_WORKERS = 3  # a task that loses more workers than this has failed
+_MAX_LOST_WORKERS = 3  # a task fails if more Dask workers than this are lost while they run it
 
 
 @contextmanager
 def connect_scheduler(address: str) -> Iterator[DaskEngine]:
-    """Yields an engine on the workers of a running Dask scheduler.
+    """Yields an engine that runs tasks on the workers of a running Dask scheduler.
 
     Raises:
         TwinError: the scheduler does not respond.
@@ -41,7 +41,7 @@ def connect_scheduler(address: str) -> Iterator[DaskEngine]:
 
 @contextmanager
 def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
-    """Yields an engine on a new Dask cluster of `jobs` SLURM jobs.
+    """Yields an engine that runs tasks on a new Dask cluster of `jobs` SLURM jobs.
 
     Raises:
         TwinError: dask-jobqueue is not installed.
@@ -52,7 +52,7 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of one-core jobs; queue, account, time and memory come from the configuration of Dask."""
+    """Returns a cluster of SLURM jobs as configured in Dask (jobqueue.slurm); default: one core and 4 GB per job."""
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:
@@ -65,7 +65,7 @@ def _slurm_cluster(jobs: int) -> Any:
 
 
 class DaskEngine:
-    """Engine on the workers of a Dask cluster; each Dask worker has a pool with one process per thread."""
+    """Engine that runs tasks on a Dask cluster; each Dask worker runs them in a pool of processes, one per thread."""
 
     def __init__(self, client: Client):
         self.client = client
@@ -114,7 +114,7 @@ def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> 
 
 
 class _QueueSize:
-    """Number of tasks to submit to a cluster whose size may change; cached, because each query is a network call."""
+    """Number of tasks to keep submitted, for the present cluster size; cached, because each query is a network call."""
 
     def __init__(self, client: Client):
         self.client, self.tasks, self.updated_s = client, 0, -math.inf

@@ -1,4 +1,4 @@
-"""Experimental design of a study: sampled keys follow a design in the unit cube, grids are enumerated."""
+"""Experimental design of a study: design points in the unit cube for the sampled keys, and full grids of values."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def samples(study: Study) -> Iterator[Sample]:
 
 
 def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
-    """Returns the seeds of a sample; all samples, or all samples of one design point, have the same seeds."""
+    """Returns the seeds of a sample: the same for all samples if `sampling.paired`, else different per design point."""
     plan = study.sampling
     first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]
@@ -61,7 +61,7 @@ def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int)
 
 
 def _saltelli(pairs: Array) -> Array:
-    """Returns the Saltelli design: A, B, and for each axis the matrix A with the column of this axis taken from B.
+    """Returns the Saltelli design: matrices A and B, and for each axis a copy of A with the axis's column from B.
 
     Saltelli et al. 2010, Comput. Phys. Commun. 181, 259.
 
@@ -77,13 +77,13 @@ def _saltelli(pairs: Array) -> Array:
 
 
 def axis_names(study: Study) -> list[str]:
-    """Returns the name of each sampled axis: a key, or the keys of a table joined by " + "."""
+    """Returns the name of each sampled axis: a key, or the jointly varied keys of a table, joined by " + "."""
     single = [key for key, distribution in study.vary.items() if distribution.is_sampled]
     return single + [" + ".join(table.keys) for table in study.together]
 
 
 def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any]]]]:
-    """Yields for each sampled axis the function that converts coordinates (0 to 1) to values by key."""
+    """Yields for each sampled axis a function that converts coordinates (n,), 0 to 1, to n dicts {key: value}."""
     if study.sampling.method == "grid":
         return
     for key, distribution in study.vary.items():
@@ -94,7 +94,7 @@ def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any
 
 
 def _grid_axes(study: Study) -> Iterator[list[list[tuple[str, Any]]]]:
-    """Yields for each axis of the grid its grid points, each a list of (key, value) pairs."""
+    """Yields the grid points of each axis of the grid, each a list of (key, value) pairs."""
     all_axes = study.sampling.method == "grid"
     for key, distribution in study.vary.items():
         if all_axes or not distribution.is_sampled:

@@ -18,7 +18,7 @@ Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 
 
 class Distribution(Section):
-    """Distribution of one key: exactly one of these fields is given."""
+    """Distribution of one varied key; exactly one field is given, whose name is the kind of distribution."""
 
     uniform: Pair | None = Field(default=None, description="[low, high]")
     log_uniform: Pair | None = Field(default=None, description="[low, high]; the logarithm is uniformly distributed")
@@ -27,7 +27,7 @@ class Distribution(Section):
         default=None, description="[mean, standard deviation, low, high]"
     )
     choice: Values | None = Field(default=None, description="one of these values, with equal probability")
-    grid: Values | None = Field(default=None, description="every one of these values, combined with all other samples")
+    grid: Values | None = Field(default=None, description="every one of these values, for every sample of other keys")
 
     @model_validator(mode="before")
     @classmethod
@@ -47,21 +47,21 @@ class Distribution(Section):
 
     @property
     def kind(self) -> str:
-        """Returns the name of the distribution, i.e. of the field that is given."""
+        """Returns the kind of distribution, i.e. the name of the given field."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @property
     def values(self) -> tuple[Any, ...]:
-        """Returns the parameters of the distribution, or the list of values."""
+        """Returns the parameters of the distribution, or the listed values of a choice or grid."""
         return getattr(self, self.kind)
 
     @property
     def is_sampled(self) -> bool:
-        """Returns whether the key is sampled; a grid is enumerated instead."""
+        """Returns whether the key is sampled; the values of a grid are enumerated instead."""
         return self.kind != "grid"
 
     def quantiles(self, probability: Array) -> list[Any]:
-        """Returns the inverse of the cumulative distribution function at these probabilities (0 to 1)."""
+        """Returns the quantiles at probabilities (n,), 0 to 1; the values of a choice or grid are equally probable."""
         if self.kind in ("choice", "grid"):
             return [self.values[k] for k in equal_bins(probability, len(self.values))]
         return [float(value) for value in _QUANTILES[self.kind](clip_probability(probability), *self.values)]
@@ -96,10 +96,10 @@ _QUANTILES = {
 
 
 def clip_probability(probability: Array) -> Array:
-    """Returns probabilities clipped to the open interval (0, 1), where the quantiles of a normal are finite."""
+    """Returns probabilities clipped to [1e-12, 1 - 1e-12], so that the quantiles of normal distributions are finite."""
     return np.clip(probability, 1e-12, 1 - 1e-12)
 
 
 def equal_bins(probability: Array, count: int) -> NDArray[np.int64]:
-    """Returns the index of the bin of each probability, with [0, 1] divided into `count` equal bins."""
+    """Returns the index of the bin that contains each probability, for `count` equal bins of [0, 1]."""
     return np.minimum((probability * count).astype(np.int64), count - 1)

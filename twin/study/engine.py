@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task: its result and an empty `failure`, or None and the reason of the failure."""
+    """Outcome of one task: its result with an empty `failure`, or None with the reason why the task failed."""
 
     task: Task
     result: Result | None
@@ -28,11 +28,12 @@ class Engine(Protocol):
     ) -> Iterator[Outcome[Task, Result]]:
         """Runs `function` on every task and yields the outcomes in order of completion.
 
-        A task fails, with its reason, if it raises an exception, runs longer than `limits.timeout_s`, or its process
-        is killed more than `limits.retries` times. A failed task does not affect the others.
+        A task fails if it raises an exception, runs longer than `limits.timeout_s`, or loses its process more than
+        `limits.retries` times. A failed task does not affect the others.
 
         Args:
-            function: must be importable by name on the workers, like the classes of the tasks and results.
+            function: function of one task. The workers must be able to import it by name, as well as the classes of
+                the tasks and results.
             tasks: picklable arguments of `function`.
             limits: timeout and number of retries of each task.
         """

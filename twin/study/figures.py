@@ -40,7 +40,7 @@ def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
 
 
 def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with `count` axes, in rows of up to `columns`."""
+    """Returns a figure with `count` axes in rows of at most `columns`; four axes form a square by default."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, _ROW_IN * rows))
@@ -51,7 +51,7 @@ def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
 
 
 def pass_probability(analysis: StudyAnalysis) -> Figure | None:
-    """Draws the pass probability against each varied key; returns None if no survey was evaluated."""
+    """Plots the pass probability against each varied key; returns None if no key varies or no survey was evaluated."""
     if not analysis.keys or not analysis.evaluated.any():
         return None
     figure, panels = make_panels(len(analysis.keys))
@@ -74,7 +74,9 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
-    """Formats the x axis for a key, and returns the position of each group: its median value, or its index.
+    """Formats the x axis for a key and returns the x position of each group of surveys.
+
+    The position is the median of the key within the group, or the index of the group if the key is text.
 
     Args:
         axes: axes to format.
@@ -97,7 +99,7 @@ def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], group
 
 
 def _axis_range(values: Array, log: bool) -> tuple[float, float]:
-    """Returns the range of the values with a margin."""
+    """Returns the limits of an axis that shows the values with a margin."""
     low, high = float(values.min()), float(values.max())
     if log:
         return low / 1.15, high * 1.15
@@ -106,7 +108,7 @@ def _axis_range(values: Array, log: bool) -> tuple[float, float]:
 
 
 def spans_decades(values: Array) -> bool:
-    """Returns whether a logarithmic axis suits the values: all positive, with a ratio of more than 8."""
+    """Returns whether a logarithmic axis suits the values: all are positive, and largest / smallest exceeds 8."""
     return bool(values.min(initial=np.inf) > 0 and values.max(initial=0) > 8 * values.min(initial=np.inf))
 
 
@@ -118,7 +120,10 @@ def _error_bars(axes: Axes, x: Array, intervals: list[Interval], colour: str) ->
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
-    """Draws the histogram of each metric with its median, 95 % bound and limit."""
+    """Plots the histogram of each metric with its median, 95 % bound and limit.
+
+    Returns None if no metric has values of two or more surveys.
+    """
     summaries = [summary for summary in summaries if summary.surveys > 1]
     if not summaries:
         return None
@@ -156,7 +161,7 @@ def _bin_edges(values: Array, log: bool) -> Array:
 
 
 def axis_label(metric: str) -> str:
-    """Returns the name of a metric, wrapped to the width of a panel."""
+    """Returns the name of a metric, wrapped to the width of one plot."""
     return textwrap.fill(metric_name(metric), 26)
 
 
@@ -175,7 +180,10 @@ def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
 
 
 def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
-    """Draws a metric against each key: every survey as a dot, and the median of each group with its interval."""
+    """Plots a metric against each varied key: each survey as a dot, group medians with confidence intervals.
+
+    Returns None if no key varies, or if fewer than two surveys have a value.
+    """
     y, included = analysis.numbers(metric), analysis.included(metric)
     if not analysis.keys or included.sum() < 2:
         return None
@@ -203,7 +211,7 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
 
 
 def _dots(axes: Axes, x: Array, y: Array, passed: NDArray[np.bool_], rng: np.random.Generator) -> None:
-    """Draws surveys as dots coloured by their result; a random subset if there are too many."""
+    """Plots surveys as dots whose colour shows whether they passed; a random subset if there are too many."""
     shown = rng.permutation(len(x))[:_MAX_POINTS]
     for mask, colour in ((passed, POINTS), (~passed, NOT_PASSED)):
         subset = shown[mask[shown]]
@@ -211,7 +219,10 @@ def _dots(axes: Axes, x: Array, y: Array, passed: NDArray[np.bool_], rng: np.ran
 
 
 def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
-    """Draws the rank correlation of each metric with each numeric key, with its interval."""
+    """Plots the rank correlation of each metric with each numeric key, with its confidence interval.
+
+    Returns None if no correlation is defined.
+    """
     shown = [s for s in sensitivities if np.isfinite(s.correlation.value)]
     metrics = list(dict.fromkeys(s.metric for s in shown))
     if not shown:
@@ -234,7 +245,10 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
 
 
 def key_histograms(analysis: StudyAnalysis) -> Figure | None:
-    """Draws a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass."""
+    """Plots a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass.
+
+    Returns None if no key is numeric or one of the two sets is empty.
+    """
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
     keys = [key for key in analysis.keys if analysis.key_numbers(key) is not None]
     if not keys or not good.any() or not bad.any():

@@ -1,4 +1,4 @@
-"""One survey of a study: flies it, removes the files that are not to be kept, and returns a row of results."""
+"""One survey of a study: flies it, keeps the requested output files, and returns its row of results."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from twin.study.surveys import Survey
 Row = dict[str, Any]
 #: Files of a run folder that are kept, for each value of the study's `keep`.
 KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
-#: Outputs that a run writes, for each value of the study's `keep`; outputs that would be removed are not written.
+#: Outputs that a run writes, for each value of the study's `keep`; outputs that would be deleted are not written.
 OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
 
 
 def fly(survey: Survey) -> Row:
     """Flies a survey into its folder and returns its row of results.
 
-    The run is written to a hidden folder that is renamed at the end, so that a folder with its final name is complete.
+    The run writes to a hidden folder, which is renamed at the end: a folder with its final name is complete.
     """
     import cv2
 
@@ -48,7 +48,7 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Deletes the files of `scratch` that are not to be kept, and renames the folder to its final name."""
+    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
     if survey.keep == "none":
         return
@@ -66,11 +66,11 @@ def _status(metrics: Mapping[str, Any]) -> str:
 
 
 def row_of(survey: Survey, status: str, reason: str) -> Row:
-    """Returns the columns that every row has: identity, status, reason and varied keys.
+    """Returns the columns that every row has: sample, seed, scenario hash, status, reason and varied keys.
 
     Args:
         status: "complete"; "aborted" if the survey ended early; "refused" if its scenario cannot be flown; "failed" if
-            the program or the computer failed, so that the survey has no result.
+            the program or the computer failed, which leaves the survey without a result.
     """
     identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
     return identity | {"status": status, "reason": reason} | {f"vary.{k}": v for k, v in survey.values.items()}
@@ -83,7 +83,10 @@ def has_passed(row: Row) -> bool:
 
 
 def flatten(metrics: Mapping[str, Any]) -> Row:
-    """Returns the values of metrics.json by dotted name; names of measured run times begin with "timing."."""
+    """Returns the values in the sections of metrics.json by dotted name, e.g. "map.le90_m".
+
+    Names of measured run times begin with "timing.". Values outside the sections, such as the status, are left out.
+    """
     row: Row = {}
     for section, value in metrics.items():
         if section == "tracks":

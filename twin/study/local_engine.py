@@ -13,7 +13,11 @@ from twin.study.worker import TaskLimits, WorkerPool
 
 
 class LocalEngine:
-    """Engine on worker processes of this machine; one thread of this process waits for each worker."""
+    """Engine on worker processes of this machine; one thread of this process waits for each worker.
+
+    Args:
+        jobs: number of worker processes.
+    """
 
     def __init__(self, jobs: int):
         cores = sorted(os.sched_getaffinity(0))
@@ -35,7 +39,7 @@ class LocalEngine:
                         reply, attempts = future.result()
                         yield Outcome(running.pop(future), reply.value, reply.reason, attempts)
             finally:
-                if running:  # interrupted: the threads can end only after their workers
+                if running:  # interrupted: a thread can end only after its worker
                     self.pool.close()
 
 

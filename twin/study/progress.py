@@ -17,7 +17,7 @@ from twin.study.statistics import wilson_interval
 
 
 class StudyProgress:
-    """Numbers of surveys flown, passed and failed so far, and the current pass probability."""
+    """Counts of surveys that have ended, passed and failed so far, and the current pass probability."""
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
         self.total = self.done = self.passed = self.failed = 0

@@ -20,9 +20,9 @@ _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionari
 
 
 class ResultsLog:
-    """The file rows.jsonl: one row per line, where a later row of a survey replaces an earlier one.
+    """The file rows.jsonl: one row per line; the last row of a survey supersedes its earlier rows.
 
-    If the disk is full, rows stay in memory and are written with the next one.
+    Rows that cannot be written, e.g. to a full disk, stay in memory until the next row is added.
     """
 
     def __init__(self, folder: Path):
@@ -47,12 +47,12 @@ class ResultsLog:
             begin = file.seek(0, 2)
             lines = _line_end(file, begin) + "".join(self._unwritten).encode()
             if (file.write(lines) or 0) < len(lines):
-                file.truncate(begin)  # no partial rows
+                file.truncate(begin)  # remove the partly written row
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
         self._unwritten.clear()
 
     def rows(self) -> Iterator[Row]:
-        """Yields all complete rows in the order of writing."""
+        """Yields all rows in the order of writing; skips partly written rows."""
         if not self.file.exists():
             return
         with self.file.open("rb") as file:
@@ -65,7 +65,7 @@ class ResultsLog:
                     yield row
 
     def done(self) -> set[tuple[int, int]]:
-        """Returns sample and seed of every survey with a result; excludes failed surveys, which are flown again."""
+        """Returns (sample, seed) of every survey with a result; failed surveys are excluded and flown again."""
         status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
         return {key for key, last in status.items() if last != "failed"}
 
@@ -75,7 +75,7 @@ class ResultsLog:
         The table does not depend on the order in which the rows were written.
 
         Args:
-            wanted: sample and seed of the surveys to include; None for all.
+            wanted: (sample, seed) of the surveys to include; None for all.
         """
         last = {(row["sample"], row["seed"]): number for number, row in enumerate(self.rows())}
         included = {number for key, number in last.items() if wanted is None or key in wanted}
@@ -97,7 +97,7 @@ class ResultsLog:
 
 
 def _line_end(file: IO[bytes], end: int) -> bytes:
-    """Returns a line break if the last line of the file is incomplete, e.g. after a power failure; else nothing."""
+    """Returns a line break if the file does not end with one, e.g. after a power failure; else an empty string."""
     if end == 0:
         return b""
     file.seek(end - 1)
@@ -125,7 +125,7 @@ def _sorted_columns(names: Iterable[str]) -> list[str]:
 
 
 def _type(value: Any) -> pa.DataType:
-    """Returns the column type of a value; anything but numbers and strings is stored as JSON text."""
+    """Returns the column type of a value; lists and dictionaries are stored as JSON text."""
     if value is None:
         return pa.null()
     for kind, column in ((bool, pa.bool_()), (int, pa.int64()), (float, pa.float64())):

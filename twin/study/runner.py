@@ -21,7 +21,7 @@ from twin.study.worker import TaskLimits
 
 
 class Throughput(NamedTuple):
-    """Number of surveys flown, their wall time, and the sum of their run times on the workers [s]."""
+    """Number of surveys flown, elapsed wall time [s], and sum of the run times of all surveys on the workers [s]."""
 
     surveys: int
     wall_s: float
@@ -29,7 +29,7 @@ class Throughput(NamedTuple):
 
 
 class StudyResult(NamedTuple):
-    """Results of a study: analysis, report file, write errors, whether Ctrl-C interrupted it, and throughput."""
+    """Results of a study: analysis, report file, messages of write errors, interrupted by Ctrl-C or not, throughput."""
 
     analysis: StudyAnalysis
     page: Path
@@ -48,11 +48,11 @@ def run_study(
 ) -> StudyResult:
     """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
-    Ctrl-C ends the study early; the results up to then are written.
+    Ctrl-C ends the study early; the results obtained until then are written.
 
     Args:
         folder: results folder, new or empty unless `resume` is set.
-        resume: continue the study of the folder.
+        resume: continue the study whose results are in the folder.
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
@@ -126,7 +126,7 @@ def fly_surveys(
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
-    """Returns the row of a survey from the outcome of its task, whether it succeeded or failed."""
+    """Returns the row of a survey from the outcome of its task; a failed task gives a row with status "failed"."""
     row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
     return row | {"timing.attempts": outcome.attempts}
 

@@ -30,7 +30,7 @@ class Proposal(NamedTuple):
 
 
 class Search:
-    """Search for the best plans; its trials are in `optuna.journal`, which other programs may read at the same time."""
+    """Search for the best plans; stores its trials in `optuna.journal`, which other programs can read meanwhile."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path):
         """Starts a search, or continues the search stored in the folder.
@@ -47,14 +47,14 @@ class Search:
             directions=["maximize" if more_is_better(name) else "minimize" for name in config.objectives],
             load_if_exists=True,
         )
-        extendable = {"tune": {"trials", "confirm"}}  # a continued search may have more trials
+        extendable = {"tune": {"trials", "confirm"}}  # may change when a search is continued
         identity = study.model_dump_json(exclude=extendable | {"timeout_s": True, "retries": True})  # pyright: ignore
         if self.optuna_study.user_attrs.get("identity", identity) != identity:
             raise TwinError("--resume", f"{folder} contains another search", "the folder of this search")
         self.optuna_study.set_user_attr("identity", identity)
 
     def next_batch(self) -> list[Proposal]:
-        """Returns the unfinished candidates of an interrupted search, else a new batch; empty after the last trial.
+        """Returns the unfinished candidates of an interrupted search, or else a new batch; [] after the last trial.
 
         A batch depends only on the earlier trials, not on the number of workers or on interruptions.
         """
@@ -76,7 +76,7 @@ class Search:
         Args:
             proposal: the candidate.
             objectives: value of each objective.
-            shortfall: required minus achieved pass probability; at most 0 if the candidate is feasible.
+            shortfall: required minus achieved pass probability; 0 or negative if the candidate is feasible.
         """
         proposal.trial.set_constraint("shortfall", shortfall)
         self.optuna_study.tell(proposal.trial, list(objectives))

@@ -14,11 +14,11 @@ Array = NDArray[np.float64]
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
 _MIN_CLUSTERS = 5  # smallest number of clusters for a bootstrap interval
-_MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value, other keys are grouped in bins
+_MAX_DISCRETE = 12  # largest number of distinct values of a key to be grouped by value; other keys are binned
 
 
 class Interval(NamedTuple):
-    """An estimate with the bounds of its confidence interval; NaN if there are too few data."""
+    """An estimate with the bounds of its confidence interval; NaN where there are too few data."""
 
     value: float
     low: float
@@ -45,13 +45,14 @@ def wilson_interval(successes: float, n: float) -> Interval:
 def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
     """Returns the proportion of successes with Wilson's interval, corrected for correlation within clusters.
 
-    The effective number of surveys is their number divided by the design effect (Kish 1965), i.e. by the ratio of the
-    variance of the proportion, estimated from the variation between clusters, to its variance for independent surveys.
-    It is limited to the range from the number of clusters to the number of surveys.
+    Wilson's interval is computed for the effective number of surveys: their number divided by the design effect (Kish
+    1965). The design effect is the variance of the proportion, estimated from the variation between clusters, divided
+    by its variance for independent surveys. The effective number is limited to the range from the number of clusters
+    to the number of surveys.
 
     Args:
         passed: (n,) whether each survey passed.
-        clusters: (n,) label of the cluster of each survey, i.e. its sample or its seed.
+        clusters: (n,) cluster label of each survey, i.e. its sample or its seed.
     """
     success = np.asarray(passed, dtype=float)
     labels, index = np.unique(np.asarray(clusters), return_inverse=True)
@@ -113,15 +114,16 @@ def median(values: Array) -> Array:
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Returns a percentile along the last axis, ignoring NaN; ten times slower if the array contains NaN."""
+    """Returns a percentile along the last axis, ignoring NaN."""
     function = np.nanpercentile if np.isnan(values).any() else np.percentile
     return function(values, percent, axis=-1)
 
 
 def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
-    """Returns Spearman's rank correlation with its interval, NaN with fewer than five values.
+    """Returns Spearman's rank correlation with its interval; NaN with fewer than five values or a constant x or y.
 
-    The interval is that of Fisher's z with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000, Psychometrika 65, 23).
+    The interval is symmetric in Fisher's z = artanh(r), with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000,
+    Psychometrika 65, 23).
     """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) < 5 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -134,11 +136,12 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
 
 
 def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
-    """Returns the fraction of the variance of y's ranks that the groups explain, corrected for chance.
+    """Returns the fraction of the variance of the ranks of y that the groups explain, corrected for chance.
 
-    This estimates the first-order Sobol index of the ranks by epsilon squared (Kelley 1935):
-    1 - (within / (n - k)) / (total / (n - 1)), with the sums of squares of the ranks within the k groups and in total.
-    Returns NaN if there are fewer than five values per group on average.
+    It is epsilon squared (Kelley 1935), an estimate of the first-order Sobol index of the ranks:
+    1 - (within / (n - k)) / (total / (n - 1)) for n values in k groups, where `within` is the sum of squared deviations
+    of the ranks from their group means, and `total` the sum of squared deviations from the overall mean.
+    Returns NaN if there are fewer than five values per group on average, only one group, or a constant y.
 
     Args:
         groups: (n,) group of each value.
@@ -155,7 +158,10 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
 
 
 class SobolIndex(NamedTuple):
-    """First-order and total Sobol index of an axis: fraction of a metric's variance, without and with interactions."""
+    """First-order and total Sobol index of one sampled axis.
+
+    They are the fractions of a metric's variance that the axis explains, without and with its interactions.
+    """
 
     first: Interval
     total: Interval
@@ -164,7 +170,7 @@ class SobolIndex(NamedTuple):
 def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals.
 
-    See `scipy.stats.sobol_indices`.
+    The estimator is that of `scipy.stats.sobol_indices`.
 
     Args:
         values: (n (n_axes + 2),) metric at the design points of the blocks A, B, AB_1, AB_2, ...
@@ -185,7 +191,7 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
 
 def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool, clusters: ArrayLike) -> Interval:
-    """Returns the value of x at which the pass probability crosses a given value, with its bootstrap interval.
+    """Returns the value of x at which the pass probability crosses `probability`, with its bootstrap interval.
 
     The pass probability is estimated as a monotone function of x by isotonic regression (Barlow et al. 1972).
 
@@ -194,10 +200,10 @@ def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool,
         passed: (n,) whether each survey passed.
         probability: pass probability at the threshold.
         rising: whether the pass probability increases with x.
-        clusters: (n,) label of the cluster of each survey.
+        clusters: (n,) cluster label of each survey.
 
     Returns:
-        The threshold; infinite if the probability is not crossed within the data; NaN with fewer than five clusters.
+        The threshold: infinite if there is no crossing within the range of x, NaN with fewer than five clusters.
     """
     sign, success = 1.0 if rising else -1.0, np.asarray(passed, float)
     _, cluster = np.unique(np.asarray(clusters), return_inverse=True)
@@ -225,9 +231,9 @@ def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool,
 
 
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
-    """Returns the group index of each number: one group per distinct value if these are few, else up to ten bins.
+    """Returns the group index of each number: one group per distinct value if there are few, else two to ten bins.
 
-    Each bin has about the same number of elements.
+    All bins have about the same number of elements.
     """
     values = np.asarray(x, dtype=float)
     distinct, index = np.unique(values, return_inverse=True)
@@ -240,7 +246,7 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
 def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
     """Returns the probability that a value of x exceeds a value of y, with ties counting half; NaN if x or y is empty.
 
-    U / (n_x n_y) with U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
+    It is U / (n_x n_y), with the statistic U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
     """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) == 0 or len(b) == 0:

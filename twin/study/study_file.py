@@ -1,4 +1,4 @@
-"""The study as a TOML file: the scenario, its fixed and varied keys, the sampling, and the requirements."""
+"""Study file (TOML): the scenario, its fixed and varied keys, the sampling, the requirements, and the search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEFAULT_METRICS = (
 
 
 class JointValues(Section):
-    """Keys that vary jointly: each row of the table has one value for every key."""
+    """Table of keys that vary jointly: each row has one value for every key."""
 
     keys: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="dotted keys of the scenario")
     rows: Annotated[tuple[tuple[Any, ...], ...], Field(min_length=1)] = Field(
@@ -49,7 +49,7 @@ class SamplingConfig(Section):
     seeds: int = Field(default=1, ge=1, le=100_000, description="surveys of each sample, each with a different seed")
     paired: bool = Field(
         default=True,
-        description="use the same seeds for all samples, so that they have the same floor and noise; "
+        description="use the same seeds for all samples, so they have the same floor and noise; "
         "else different seeds for each design point",
     )
     seed: int = Field(
@@ -77,7 +77,7 @@ class TuningConfig(Section):
 
 
 class Study(Section):
-    """Monte Carlo study: surveys of one scenario with varied keys."""
+    """Monte Carlo study: surveys of one scenario, some of whose keys vary."""
 
     name: str | None = Field(default=None, min_length=1, max_length=80, description="default: the name of the file")
     scenario: str = Field(description="the scenario to vary: a path relative to this file, or a name in scenes/")
@@ -105,7 +105,7 @@ class Study(Section):
 
     @property
     def source(self) -> Source:
-        """Returns the file and line numbers that the study was read from."""
+        """Returns the study file and the line number of each of its keys."""
         return self._source
 
     @property
@@ -120,12 +120,12 @@ class Study(Section):
 
     @property
     def varied_keys(self) -> list[str]:
-        """Returns every key that varies, alone or jointly."""
+        """Returns every key that varies, alone or jointly with others."""
         return [*self.vary, *(key for table in self.together for key in table.keys)]
 
     @property
     def scenario_file(self) -> Path:
-        """Returns the file of the scenario to vary."""
+        """Returns the path of the scenario file whose keys the study varies."""
         relative = self.source.path.parent / self.scenario
         return find_scene(relative if relative.is_file() else self.scenario)
 
@@ -157,7 +157,10 @@ def load_study(path: str | Path) -> Study:
 
 
 def find_study(path: str | Path) -> Path:
-    """Returns the file of a study: an existing path, or a name in scenes/studies/.
+    """Returns the path of a study file.
+
+    Args:
+        path: a file, or a name in scenes/studies/.
 
     Raises:
         ScenarioError: neither exists.
@@ -173,7 +176,7 @@ def find_study(path: str | Path) -> Path:
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields dotted keys and their values; a table that defines a distribution counts as a value."""
+    """Yields the dotted keys of nested tables with their values; a table that defines a distribution is a value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")
@@ -182,7 +185,7 @@ def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _errors(study: Study) -> Iterable[TwinError]:
-    """Yields the errors that involve more than one value of the study."""
+    """Yields the errors that the validation of single fields does not find."""
     yield from _key_errors(study)
     yield from _table_errors(study)
     yield from _sampling_errors(study)

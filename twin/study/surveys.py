@@ -1,4 +1,4 @@
-"""Surveys of a study: the validated scenario of each sample, once per seed."""
+"""Surveys of a study: the validated scenario of each sample, flown once per seed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MAX_ERRORS = 20
 
 
 class Survey(NamedTuple):
-    """One survey of a study: sample, seed, varied values, scenario with its hash, run folder, and what to keep."""
+    """One survey of a study: sample, seed, varied values, scenario with its hash, run folder, and files to keep."""
 
     sample: int
     seed: int
@@ -28,12 +28,12 @@ class Survey(NamedTuple):
 
     @property
     def key(self) -> tuple[int, int]:
-        """Returns sample and seed, which identify a survey within its study."""
+        """Returns (sample, seed), which identifies a survey within its study."""
         return self.sample, self.seed
 
 
 class SampleSource(Source):
-    """Source of a sampled scenario: reports an error at the line of the study file that gives the key."""
+    """Source of a sampled scenario: reports an error with the line of the study file that sets the key."""
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file
@@ -44,7 +44,7 @@ class SampleSource(Source):
         while key not in self.given and "." in key:
             key = key.rpartition(".")[0]
         study_key = self.given.get(key, "scenario")
-        if study_key.endswith(key):  # e.g. "vary.plan.tracks", which has a line of its own
+        if study_key.endswith(key):  # e.g. "vary.plan.tracks", which has its own line
             in_study = TwinError(study_key + error.field.removeprefix(key), error.problem, error.allowed)
         else:
             in_study = TwinError(study_key, str(error))
@@ -74,7 +74,7 @@ def surveys_of_sample(study: Study, folder: Path, sample: Sample, scenario: Scen
 
 
 def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
-    """Yields sample and seed of every survey."""
+    """Yields (sample, seed) of every survey."""
     return ((sample.number, seed) for sample in samples(study) for seed in seeds_of_sample(study, sample))
 
 
@@ -110,7 +110,10 @@ def check_samples(study: Study) -> None:
 
 
 def merge_errors(errors: Iterable[str]) -> list[str]:
-    """Returns one error per line and key of the study file, with the number of further samples with this error."""
+    """Returns one error per line and key of the study file, with the number of further errors of the same key.
+
+    The list is limited to 20 keys; its last line states how many were left out.
+    """
     by_key: dict[str, list[str]] = {}
     for error in errors:
         by_key.setdefault(": ".join(error.split(": ")[:2]), []).append(error)

@@ -26,13 +26,13 @@ from twin.study.statistics import Interval, wilson_interval
 from twin.study.study_file import Study, TuningConfig
 from twin.study.surveys import Survey, merge_errors, scenario_of_sample, survey_keys, surveys_of_sample
 
-_DEFAULT_PROBABILITY = 0.5  # required pass probability if the study has none
-_SEED_OFFSET = 1_000_000  # added to the seed of the study for the confirmation of finalists
+_DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
+_SEED_OFFSET = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
 _PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna does not accept infinity
 
 
 class SurveyScore(NamedTuple):
-    """Result of a survey as far as the search needs it: status, whether it passed, and metrics of the objectives."""
+    """Part of a survey's result that the search uses: status, whether it passed, and the metrics to optimise."""
 
     status: str
     passed: bool
@@ -46,16 +46,24 @@ class Candidate(NamedTuple):
     values: dict[str, Any]
     objectives: tuple[float, ...]
     pass_probability: Interval
-    shortfall: float  #: required minus achieved pass probability; at most 0 if the plan is feasible
+    shortfall: float  #: required minus achieved pass probability; 0 or negative if the plan is feasible
 
     @property
     def has_metrics(self) -> bool:
-        """Returns whether any survey of the candidate was completed, so that all objectives have a value."""
+        """Returns whether every objective has a value, which requires at least one completed survey."""
         return max(abs(value) for value in self.objectives) < _PENALTY
 
 
 class TuningResult(NamedTuple):
-    """Result of a search: all candidates, the finalists re-evaluated with new seeds, and the recommended plan."""
+    """Result of a search.
+
+    Args:
+        candidates: all evaluated plans.
+        finalists: plans that were evaluated again with new samples and seeds.
+        recommended: the feasible finalist with the best first objective; None if there is none.
+        scenario: scenario of the recommended plan.
+        interrupted: whether Ctrl-C ended the search.
+    """
 
     candidates: list[Candidate]
     finalists: list[Candidate]
@@ -72,16 +80,16 @@ def tune(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> TuningResult:
-    """Searches for the plan specified by `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
+    """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
         folder: results folder, new or empty unless `resume` is set.
-        resume: continue the search of the folder; its surveys are not flown again.
+        resume: continue the search whose results are in the folder; its surveys are not flown again.
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
         TwinError: the study has no [tune]; the folder is not empty, cannot be written, or belongs to another search.
-        ScenarioError: a bound of the search gives an invalid scenario; nothing was flown.
+        ScenarioError: the scenario is invalid at a bound of the search; nothing was flown.
     """
     config = tuning_config(study)
     check_bounds(study, config)
@@ -141,9 +149,9 @@ def required_probability(study: Study) -> float:
 
 
 class CandidateSurveys:
-    """Surveys of the candidates: all candidates are flown with the same samples and seeds of the study.
+    """Surveys of the candidates, with the results obtained so far.
 
-    Keeps the results of the surveys flown so far.
+    All candidates are flown with the same samples and seeds, those of the study.
     """
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, rows: Iterable[Row]):
@@ -185,7 +193,7 @@ class CandidateSurveys:
             yield from surveys_of_sample(self.study, self.folder, sample, scenario)
 
     def missing(self, candidates: dict[int, dict[str, Any]]) -> Iterator[Survey]:
-        """Yields the surveys of these candidates (values by trial number) that have no result yet, or failed."""
+        """Yields the surveys of the candidates (values by trial number) that have not been flown or have failed."""
         for number, values in candidates.items():
             for survey in self.surveys(number, values):
                 if survey.key not in self._scores or self._scores[survey.key].status == "failed":
@@ -214,12 +222,12 @@ class CandidateSurveys:
         return float(np.median(known)) if known else -_PENALTY if more_is_better(name) else _PENALTY
 
     def scenario(self, candidate: Candidate) -> Scenario:
-        """Returns the scenario that the study varies, with the plan of a candidate."""
+        """Returns the scenario of the study with the plan of a candidate; varied keys keep their original values."""
         return scenario_of_sample(self.study, self.base, Sample(0, 0, candidate.values))
 
 
 def check_bounds(study: Study, config: TuningConfig) -> None:
-    """Validates the scenario at each bound of the search.
+    """Validates the scenario at both bounds, or at all listed values, of each searched key.
 
     Raises:
         ScenarioError: lists all errors, each key once.

@@ -54,7 +54,7 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
 
 
 def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
-    """Returns the main result: the recommended plan with its objectives and its pass probability."""
+    """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
     count = f"{len(result.candidates)} plans were evaluated"
     if (chosen := result.recommended) is None:
         if result.interrupted:
@@ -83,9 +83,9 @@ def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[st
 
 
 def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -> str:
-    """Returns the recommended plan as a scenario file with the headline as a comment, or "" if there is no plan.
+    """Returns the recommended plan as a scenario file with the headline as a comment; "" if no plan is recommended.
 
-    The scenario uses rendered images, even if the search used the surrogate.
+    The scenario selects rendered images, even if the search used the surrogate.
     """
     if result.scenario is None:
         return ""
@@ -96,7 +96,7 @@ def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -
 
 
 def trade_off_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
-    """Draws the candidates for each pair of objectives; a single objective is drawn against the trial number."""
+    """Plots the candidates for each pair of objectives; a single objective is plotted against the trial number."""
     pairs = list(combinations(range(len(config.objectives)), 2)) or [(None, 0)]
     figure, panels = make_panels(len(pairs))
     for (x_index, y_index), axes in zip(pairs, panels, strict=True):
@@ -116,7 +116,7 @@ def trade_off_figure(shown: list[Candidate], result: TuningResult, config: Tunin
 
 
 def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
-    """Draws each objective against each searched key."""
+    """Plots each objective against each searched key."""
     cells = [(k, key) for k in range(len(config.objectives)) for key in config.search]
     figure, panels = make_panels(len(cells), columns=min(len(config.search), 4))
     for (k, key), axes in zip(cells, panels, strict=True):
@@ -146,7 +146,7 @@ def _groups(
 
 
 def _format_axis(axis: Any, objective: str) -> None:
-    """Labels an axis with an objective and formats its ticks with the unit."""
+    """Labels an axis with an objective and formats its tick labels in the unit of the objective."""
     unit_axis(axis, objective)
     if axis.get_scale() == "linear":
         axis.set_major_locator(MaxNLocator(4))  # few ticks, as their labels are long

@@ -1,4 +1,4 @@
-"""Text for the results of a study: names and values of metrics, and sentences."""
+"""Text of the study report: metrics, confidence intervals, and the sentences that summarise the results."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _METRIC_NAMES = {
 
 
 def metric_name(metric: str) -> str:
-    """Returns the name of a metric in words, or its dotted name if there is none."""
+    """Returns the readable name of a metric, e.g. "map height error (LE90)", or else its dotted name."""
     return _METRIC_NAMES.get(metric, metric)
 
 
 def metric_value(metric: str, value: float | None) -> str:
-    """Returns the value of a metric with its unit; `risk` is a fraction."""
+    """Returns the value of a metric with its unit; `risk` in percent."""
     if metric == "risk":
         return percent(value)
     if value is None or not np.isfinite(value):
@@ -49,7 +49,7 @@ def metric_interval(metric: str, interval: Interval) -> str:
 
 
 def metric_heading(metric: str) -> str:
-    """Returns the name of a metric with a capital initial."""
+    """Returns the readable name of a metric with a capital first letter."""
     name = metric_name(metric)
     return name[:1].upper() + name[1:]
 
@@ -67,12 +67,12 @@ def percent_interval(interval: Interval) -> str:
 
 
 def confidence(interval: Interval) -> str:
-    """Returns a fraction in percent with its labelled confidence interval."""
+    """Returns a fraction in percent with its confidence interval and confidence level in brackets."""
     return f"{percent(interval.value)} ({_labelled(percent(interval.low), percent(interval.high))})"
 
 
 def headline(study: Study, analysis: StudyAnalysis) -> str:
-    """Returns the main result: threshold of the `seek` key, pass probability, and whether the requirement is met."""
+    """Returns the main results of a study: threshold of the `seek` key, pass probability, requirement met or not."""
     n = int(analysis.evaluated.sum())
     if n == 0:
         return "No survey could be evaluated." + _failed(analysis)
@@ -102,7 +102,7 @@ def _labelled(low: str, high: str) -> str:
 
 
 def _threshold(study: Study, analysis: StudyAnalysis) -> str:
-    """Returns the values of the `seek` key for which enough surveys pass."""
+    """Returns a sentence on the values of the `seek` key at which the required fraction of surveys pass, or ""."""
     if analysis.threshold is None:
         return ""
     limit, rising = analysis.threshold
@@ -123,7 +123,7 @@ def _warnings(analysis: StudyAnalysis) -> str:
 
 
 def _main_reason(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on the most frequent reason of failure if no survey passed, else ""."""
+    """Returns a sentence with the most frequent reason of failure if no survey passed, else ""."""
     if analysis.passed.any() or not analysis.failure_reasons:
         return ""
     return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
@@ -140,7 +140,7 @@ def limit_relation(metric: str) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on whether the required pass probability is met, and whether the interval is conclusive."""
+    """Returns a sentence on whether the pass probability reaches the required one, and whether this is certain."""
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None or analysis.study.seek is not None:
         return ""
@@ -156,13 +156,13 @@ def _failed(analysis: StudyAnalysis) -> str:
         return ""
     lowest = percent(float(analysis.passed.sum()) / len(analysis.passed))
     return (
-        f" {n} more surveys failed because of the computer or the program and are not counted; if none of them would "
-        f"have passed, the pass probability would be {lowest}. Use --resume to fly them again."
+        f" {n} more surveys failed because of the computer or the program and are not counted; if none of them had "
+        f"passed, the pass probability would be {lowest}. Use --resume to fly them again."
     )
 
 
 def superiority(comparison: KeyComparison) -> str:
-    """Returns a phrase on how well a key separates the surveys that did not pass from those that passed."""
+    """Returns a phrase on how the values of a key differ between surveys that did not pass and surveys that did."""
     higher = comparison.superiority >= 0.5
     probability = comparison.superiority if higher else 1 - comparison.superiority
     if probability < 0.6:
@@ -189,6 +189,6 @@ def seeds_note(study: Study) -> str:
         return "Each design point has its own seeds, i.e. its own floor and noise."
     same = f"the same {sampling.seeds} seeds" if sampling.seeds > 1 else f"the same seed ({sampling.seed})"
     return (
-        f"All samples use {same}, so that they are compared on the same floor and with the same noise; more seeds show "
+        f"All samples use {same}, so they are compared on the same floor and with the same noise; more seeds show "
         "the variation between floors."
     )

@@ -1,7 +1,7 @@
 """Worker processes that run one task at a time, and a thread-safe pool of them.
 
-A survey renders with OpenGL and runs compiled code, which can terminate its process or hang where no exception can
-interrupt it. Every task therefore runs in a process that can be killed and replaced.
+A survey renders with OpenGL and runs compiled code, which can crash its process or hang without a way to interrupt it.
+Each task therefore runs in a worker process that can be killed and replaced.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-#: Environment of a worker: one thread per library, as there is one worker per core (LP_NUM_THREADS=0: Mesa renders in
-#: the calling thread).
+#: Environment of a worker: one thread per library, as there is one worker per core. With LP_NUM_THREADS=0, Mesa renders
+#: in the calling thread.
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -40,7 +40,7 @@ class TaskLimits(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """Reply of a worker: the value that the task returned, or the reason why there is none.
+    """Reply of a worker: the value that the task returned, or the reason why it returned none.
 
     `kind`: "done"; "raised" for an exception; "timeout"; "killed" if the process ended or was killed.
     """
@@ -69,7 +69,7 @@ class Worker:
         child_end.close()
 
     def run(self, request: bytes, timeout_s: float) -> Reply:
-        """Returns the reply to a pickled (function, task); the process is killed after a timeout."""
+        """Sends a pickled (function, task) and returns the reply; kills the process after a timeout."""
         try:
             self._pipe.send_bytes(request)
             if self._pipe.poll(timeout_s):
@@ -91,7 +91,7 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns the signal or exit status of the process, with the last line of its output."""
+        """Returns how the process ended (signal or exit status), with the last line of its first output paragraph."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -100,7 +100,7 @@ class Worker:
 
 
 class WorkerPool:
-    """Thread-safe pool of worker processes, which are reused; there are as many as there are concurrent tasks."""
+    """Thread-safe pool of worker processes, one per concurrent task; idle workers are reused."""
 
     def __init__(self, cores: Sequence[int | None] = ()) -> None:
         self._free_cores = list(cores)
@@ -120,7 +120,7 @@ class WorkerPool:
             worker.kill()  # its own thread closes the pipe: closing it twice could close a file of another thread
 
     def run(self, function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
-        """Returns the reply to a task and the number of attempts; only a killed process leads to another attempt."""
+        """Runs a task and returns its reply and the number of attempts; only a task whose process died is retried."""
         request = pickle.dumps((function, task))
         attempts = 0
         while True:
@@ -144,7 +144,7 @@ class WorkerPool:
             else:
                 self._free_cores.append(worker.core)
         if not reusable:
-            worker.close()  # also after an exception, which may leave the process in an undefined state
+            worker.close()  # even after an exception, which may leave the process in an undefined state
         return reply
 
 
@@ -174,7 +174,7 @@ def _run_request(request: bytes) -> bytes:
     try:
         function, task = pickle.loads(request)
         return pickle.dumps(Reply("done", function(task)))
-    except BaseException as error:  # any failure is a reply: the process must survive it
+    except BaseException as error:  # every failure becomes a reply; the process must survive
         return pickle.dumps(Reply("raised", reason=describe_exception(error)))
 
 

@@ -1,6 +1,6 @@
-"""Error model of the surrogate: standard errors and success rates of the image measurements of a survey.
+"""Error model of the surrogate: error statistics and success rates of the image measurements of a survey.
 
-Most of them are functions of one number, the Cramer-Rao lower bound of a patch's position in an image
+Most are functions of one number, the Cramer-Rao lower bound on the standard deviation of a matched patch's position
 (see `matchability`). The parameters are fitted to rendered surveys.
 """
 
@@ -12,28 +12,28 @@ import numpy as np
 
 
 class SigmaLaw(NamedTuple):
-    """Standard deviation as a function of the Cramer-Rao bound c: sqrt(floor_px^2 + (slope c)^2).
+    """Standard deviation as a function of the Cramer-Rao bound c [px]: sqrt(floor_px^2 + (slope c)^2).
 
     Args:
         floor_px: standard deviation in noise-free images [px].
-        slope: asymptotic ratio of the standard deviation to the bound.
+        slope: ratio of the standard deviation to the bound where the bound is large.
     """
 
     floor_px: float
     slope: float
 
     def __call__(self, bound_px: float) -> float:
-        """Returns the standard deviation [px]."""
+        """Returns the standard deviation [px] at a Cramer-Rao bound [px]."""
         return float(np.hypot(self.floor_px, self.slope * bound_px))
 
 
 class FractionLaw(NamedTuple):
-    """Fraction as a function of the Cramer-Rao bound c: maximum / (1 + (c / half_px)^exponent).
+    """Fraction as a function of the Cramer-Rao bound c [px]: maximum / (1 + (c / half_px)^exponent).
 
     Args:
         maximum: fraction in noise-free images.
         half_px: bound at which the fraction is half the maximum [px].
-        exponent: steepness of the decrease.
+        exponent: steepness of the decrease with c.
     """
 
     maximum: float
@@ -41,50 +41,53 @@ class FractionLaw(NamedTuple):
     exponent: float
 
     def __call__(self, bound_px: float) -> float:
-        """Returns the fraction, 0 to 1."""
+        """Returns the fraction (0 to 1) at a Cramer-Rao bound [px]."""
         return float(self.maximum / (1 + (bound_px / self.half_px) ** self.exponent))
 
 
 class ErrorModel(NamedTuple):
     """Parameters of the measurement errors.
 
-    An estimator reports a standard deviation (sigma) that may differ from the standard deviation of its errors. Fields
-    named `..._sigma_px` model the reported one, fields named `..._error_ratio` the ratio of the true one to it.
+    The standard deviation (sigma) that an estimator reports may differ from that of its errors. Fields named
+    `..._sigma_px` model the reported standard deviation, and fields named `..._error_ratio` the ratio of the true to
+    the reported one.
 
     Args:
-        bound_range_px: smallest and largest Cramer-Rao bound of the surveys that the model was fitted to.
+        bound_range_px: smallest and largest Cramer-Rao bound of the surveys to which the model was fitted.
         point_fraction: number of matched stereo points of a keyframe, as a fraction of `estimate.points`.
         match_sigma_px: reported standard deviation of a patch's position in one image.
         match_error_ratio: ratio of the true to the reported standard deviation of a patch's position in one image.
-        lamp_error_growth: growth of the match error in the light of the lamps on the vehicle: the square of
-            `match_error_ratio` is multiplied by 1 + (lamp_error_growth * lamp_share)^2, with
-            lamp_share the fraction of the reflected light that comes from the lamps.
-        match_fraction: fraction of the points in view of another keyframe that are matched there.
+        lamp_error_growth: growth of the match error due to the lamps on the vehicle: the square of `match_error_ratio`
+            is multiplied by 1 + (lamp_error_growth * lamp_share)^2, where lamp_share is the fraction of the reflected
+            light that comes from the lamps.
+        match_fraction: fraction of a keyframe's points in the field of view of another keyframe that are matched there.
         match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
             correlated; see `matching.variance_inflation`.
-        match_bias_fraction: fraction of the standard deviation in the earlier stereo pair of a link that is a bias of
-            that pair, common to all of its links. The remainder is independent from link to link.
+        match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link: with unit
+            variance, the error is r b + sqrt(1 - r^2) e, where b is common to all links to that pair and e is
+            independent from link to link.
         distance_growth: growth of the reported match variance with the distance between two keyframes: the variance
             is multiplied by 1 + (distance_growth * distance / depth)^2.
-        relief_gain: error of a match due to relief within the patch, per pixel of unevenness (see `matchability`) and
-            per unit of distance / depth. The error is the same for all matches of one patch of floor, so it accumulates
-            along a path. With g the image gradient and d the parallax of a pixel relative to the patch's plane, least
-            squares matching shifts a patch by (sum g g')^-1 sum g g' d times the baseline. Stereo matching weights d
-            by the squared row component of g and thereby explains the column shift due to a baseline along the rows.
-            The remainder is a shift across the baseline, of equal gain for both directions, and a row shift due to a
-            baseline across the rows, of twice that gain for isotropic texture.
-        common_bias_px: standard deviation of a bias that all points of a link share [px].
-        f2f_sigma_px: reported standard deviation of a frame-to-frame flow vector.
+        relief_gain: standard deviation of the match error due to relief within the patch, per pixel of unevenness (see
+            `matchability`) and per unit of distance / depth. The error is the same for all matches of one patch of
+            floor, so it accumulates along a path. Let g = (g_x, g_y) be the image gradient along rows and columns, t
+            the translation between the images, and d the parallax of a pixel relative to the patch's plane per unit
+            of t. Least-squares matching then displaces the patch by (sum g g')^-1 (sum g g' d) t. Stereo matching,
+            with its baseline along x, averages d with the weights g_x^2, which predicts the displacement in x due to
+            t_x. Three terms remain: the displacement in x due to t_y and the one in y due to t_x, both with the gain
+            `relief_gain`, and the displacement in y due to t_y, with twice this gain for isotropic texture.
+        common_bias_px: true standard deviation of the bias that all points of a link share [px].
+        f2f_sigma_px: reported standard deviation of a flow vector of frame-to-frame tracking.
         f2f_error_ratio: ratio of the true to the reported standard deviation of a frame-to-frame motion.
-        f2f_anticorrelation: fraction of a frame's error that the next frame cancels (a moving-average process of order
-            one), because both motions are measured relative to the same points.
-        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
-            deviation of a flow vector, for as many flow vectors as in F2F.
+        f2f_anticorrelation: fraction of the independent error of a frame-to-frame motion that the next motion cancels
+            (a first-order moving average), because both motions are measured relative to the same points.
+        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as that of a flow
+            vector if the registration used as many flow vectors as F2F.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_sigma_px: reported standard deviation of a pixel's filtered depth [px of disparity].
+        depth_sigma_px: reported standard deviation of a pixel's depth after the Kalman depth filter [px of disparity].
         depth_error_ratio: ratio of the true to the reported standard deviation of a pixel's filtered depth.
-        lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all views of it.
-        map_completeness: fraction of the map cells in view for which the depth filter provides a depth.
+        lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
+        map_completeness: fraction of the map cells in view for which the Kalman depth filter provides a depth.
     """
 
     bound_range_px: tuple[float, float] = (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""TOML file of an error model: its parameters, the number of surveys that it was fitted to, and the misfit."""
+"""TOML file of an error model: parameters, number of surveys to which they were fitted, and misfit of the fit."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from twin.errors import TwinError
 from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_RANGE_FACTOR = 1.5  # factor by which a bound may lie outside the fitted range without a warning
-#: Renamed keys: former name to current name.
+_RANGE_FACTOR = 1.5  # factor by which a Cramer-Rao bound may exceed the fitted range without a warning
+#: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
     "bound_px": "bound_range_px",
@@ -49,8 +49,8 @@ class FittedErrorModel:
 
     Args:
         model: fitted parameters.
-        n_surveys: number of rendered surveys that the model was fitted to.
-        misfit: root mean square over the surveys of ln(measured / model), by the name of the parameter.
+        n_surveys: number of rendered surveys to which the model was fitted.
+        misfit: root mean square over the surveys of ln(reported / modelled standard deviation), by model parameter.
     """
 
     model: ErrorModel
@@ -69,10 +69,13 @@ class FittedErrorModel:
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
-    """Reads an error model from a file; None reads the error model supplied with this package.
+    """Reads an error model from a file.
+
+    Args:
+        path: TOML file; None for the error model supplied with this package.
 
     Raises:
-        TwinError: the file does not exist, is not an error model, or uses former names.
+        TwinError: the file does not exist, is not an error model, or contains renamed keys.
     """
     path = DEFAULT_FILE if path is None else Path(path)
     try:
@@ -100,7 +103,7 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
 
 
 def _check_names(path: Path, tree: Mapping[str, Any]) -> None:
-    """Raises an error that lists the keys of a file that were renamed."""
+    """Raises a TwinError that lists the renamed keys in a file, if there are any."""
     renamed = [f"{name} was renamed to {_RENAMED[name]}" for name in dict.fromkeys(_keys(tree)) if name in _RENAMED]
     if renamed:
         raise _invalid(path, ", ".join(renamed))
@@ -125,7 +128,7 @@ def _value(name: str, given: Any) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Returns a parameter as TOML."""
+    """Returns the value of a parameter in TOML syntax."""
     if isinstance(value, SigmaLaw | FractionLaw):
         return "{ " + ", ".join(f"{key} = {number:.4g}" for key, number in value._asdict().items()) + " }"
     return str([float(f"{v:.4g}") for v in value]) if isinstance(value, tuple) else f"{value:.4g}"

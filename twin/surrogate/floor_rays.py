@@ -1,4 +1,4 @@
-"""Ray casting against the floor without OpenGL, for the few hundred rays that a surrogate keyframe needs."""
+"""Ray casting against the floor without OpenGL, for surrogate surveys."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from twin.core.records import StereoRig
 Depth = NDArray[np.float32]
 
 _MAX_STEPS = 200
-_TOLERANCE_M = 1e-4  # a ray intersects the floor where its height above the floor is less than this
+_TOLERANCE_M = 1e-4  # a ray intersects the floor where it is less than this height above it
 
 
 class FloorRayCaster:
     """Ray caster against the triangles of a terrain.
 
-    Sphere tracing over a height field (Hart 1996): each step is the height of the ray above the floor, divided by the
-    fastest rate at which this height can shrink for the steepest slope of the terrain, so that no step crosses the
-    floor.
+    Sphere tracing over a height field (Hart 1996). The length of a step is the height of the ray above the floor,
+    divided by the largest rate at which this height can decrease, which follows from the steepest slope of the
+    terrain. Hence no step passes through the floor.
     """
 
     def __init__(self, terrain: Terrain):
@@ -37,7 +37,7 @@ class FloorRayCaster:
         return _depth_at(self._height_field, pixels, world_from_camera, rig.focal_px, rig.cx_px, rig.cy_px)
 
     def depth(self, world_from_camera: Array, rig: StereoRig) -> Depth:
-        """Returns the depth image (height_px, width_px) along the optical axis [m]; inf where a ray hits nothing."""
+        """Returns the depth image (height_px, width_px) along the optical axis [m]; inf where rays miss the floor."""
         grid = np.indices((rig.height_px, rig.width_px), dtype=np.float64)
         pixels = np.stack([grid[1].ravel(), grid[0].ravel()], axis=1)
         depth = self.depth_at(pixels, world_from_camera, rig)

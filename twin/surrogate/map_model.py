@@ -1,7 +1,7 @@
-"""Model of the depth map: the grid cells that a keyframe sees, and the heights that its depth filter estimates.
+"""Model of the elevation map: the grid cells that a keyframe sees, and the heights that its depth filter estimates.
 
-A grid cell represents the pixels that show it. A cell is visible if it projects into both images; occlusion by relief
-is not modelled.
+One sample per grid cell stands for all pixels that show the cell. A cell is visible if its centre projects into both
+images; occlusion by relief is not modelled.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ Map = NDArray[np.float32]
 
 
 class CellErrors(NamedTuple):
-    """Random numbers and standard deviations of the errors of the filtered depth.
+    """Errors of the filtered depth: random numbers and standard deviations.
 
     Args:
-        lateral_noise: (rows, cols) standard normal numbers of the lateral error that all views of a cell share.
+        lateral_noise: (rows, cols) standard normal numbers of the lateral error, shared by all views of a cell.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the arrays below are tabulated [m].
+        depths_m: (m,) ascending depths of the tabulated values below [m].
         depth_error_px: (m,) true standard deviation of the depth [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth [px of disparity].
-        completeness: (m,) fraction of the cells whose depth is known.
+        completeness: (m,) fraction of the cells in view for which the filter provides a depth.
     """
 
     lateral_noise: Map
@@ -44,15 +44,15 @@ class CellErrors(NamedTuple):
 
 
 class MapModel:
-    """True floor as a grid, from which the height patches of keyframes are sampled.
+    """Samples the height patches of keyframes from the true heights of the floor.
 
     Args:
         grid: grid of the map.
-        height_m: (rows, cols) true height at the cell centres.
+        height_m: (rows, cols) true height at the cell centres [m].
         rig: true calibration.
 
     Attributes:
-        seen: (rows, cols) cells that at least one keyframe observed; modified in place by `mark_seen`.
+        seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
     """
 
     def __init__(self, grid: MapGrid, height_m: Map, rig: StereoRig):
@@ -67,11 +67,11 @@ class MapModel:
 
     @property
     def steepness(self) -> Map:
-        """Returns the magnitude of the floor's gradient (rows, cols)."""
+        """Returns the magnitude of the slope of the floor (rows, cols) [m/m]."""
         return np.hypot(*np.moveaxis(self._slope, -1, 0))
 
     def mark_seen(self, world_from_camera: Array) -> None:
-        """Marks the cells that both cameras of a keyframe at this true pose (4, 4) see."""
+        """Marks the cells that both cameras see from the true pose (4, 4) of a keyframe."""
         window = self._window(world_from_camera)
         camera_from_world = geometry.inverse(world_from_camera)
         _mark(self.seen, self.height_m, self._geotransform, self._camera, camera_from_world, *window)
@@ -85,18 +85,18 @@ class MapModel:
         errors: CellErrors,
         rng: np.random.Generator,
     ) -> HeightPatch | None:
-        """Samples the height patch of a keyframe: the cells that it sees and the next keyframe does not see.
+        """Samples the height patch of a keyframe: the heights of the cells that it sees and the next keyframe does not.
 
         Args:
             true: (4, 4) true pose of the keyframe.
             next_true: (4, 4) true pose of the next keyframe; None for the last one.
             estimated: (4, 4) estimated pose of the keyframe.
-            cov: (6, 6) covariance of the estimated pose.
+            cov: (6, 6) covariance of the estimated pose, in camera axes.
             errors: errors of the filtered depth.
-            rng: random generator of the errors of this view alone.
+            rng: random generator of the errors that are independent between keyframes.
 
         Returns:
-            The patch, or None if the view does not overlap the grid.
+            The patch, or None if the field of view does not overlap the grid.
         """
         row, end_row, col, end_col = self._window(true)
         if row >= end_row or col >= end_col:
@@ -117,7 +117,7 @@ class MapModel:
         return HeightPatch(row, col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral)
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the view's footprint at the lowest floor height."""
+        """Returns (first row, end row, first column, end column) of the footprint at the lowest height of the floor."""
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -135,7 +135,7 @@ def _window(pose, camera, geotransform, lowest, size):
         dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
         dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
         dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
-        if dz >= -0.1:  # the horizon is in view: take the whole grid
+        if dz >= -0.1:  # the view (nearly) reaches the horizon: take the whole grid
             return 0, rows, 0, cols
         far = (lowest - pose[2, 3]) / dz
         x_low, x_high = min(x_low, pose[0, 3] + far * dx), max(x_high, pose[0, 3] + far * dx)
@@ -147,7 +147,7 @@ def _window(pose, camera, geotransform, lowest, size):
 
 @njit(cache=True, nogil=True, inline="always")
 def _depth_in(camera_from_world, camera, x, y, z):
-    """Returns the depth of a point in the left camera; -1 if it is outside either image."""
+    """Returns the depth of a world point in the left camera; -1 if it is behind it or outside either image."""
     focal, cx, cy, right, bottom, baseline = camera
     m = camera_from_world
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -177,7 +177,7 @@ def _sample_patch(
     out, variance, systematic, height, slope, geotransform, camera, camera_from_world, is_last, estimated_from_true,
     position, cov, depth_noise, errors, row, col,
 ):  # fmt: skip
-    """Writes a patch: heights to `out`, variances to `variance` and `systematic`; returns the mean depth."""
+    """Writes heights to `out` and variances to `variance` and `systematic`; returns the mean depth [m]."""
     (west, north, cell), m = geotransform, estimated_from_true
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
@@ -191,7 +191,7 @@ def _sample_patch(
             if errors.dropout[i, j] > _interpolate(errors.completeness, k, fraction):
                 continue
             sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
-            # estimated position of this surface element, and the height of its plane at the cell's centre
+            # estimated position of the floor at this cell, and the height of its tangent plane at the cell's centre
             px = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
             py = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
             pz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -213,7 +213,7 @@ def _sample_patch(
 
 @njit(cache=True, nogil=True, inline="always")
 def _interval(ascending, value):
-    """Returns the index of the interval that contains a value, and the fraction within it, clamped to [0, 1]."""
+    """Returns the index of the interval that contains a value, and the relative position (0 to 1) within it."""
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1
@@ -222,5 +222,5 @@ def _interval(ascending, value):
 
 @njit(cache=True, nogil=True, inline="always")
 def _interpolate(values, k, fraction):
-    """Interpolates linearly within interval k."""
+    """Returns the tabulated value interpolated linearly at a relative position within interval k."""
     return (1 - fraction) * values[k] + fraction * values[k + 1]

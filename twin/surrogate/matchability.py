@@ -1,11 +1,11 @@
-"""Matchability of the floor: the Cramer-Rao bound of image matching, and the relief within a patch.
+"""Matchability of the floor: the Cramer-Rao bound of image matching, and the unevenness of the floor under a patch.
 
 The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. With g the
-gradient of the grey image along a row and s the standard deviation of its noise, the standard deviation of the shift
-between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao lower bound).
+gradient of the grey image along a row and s the standard deviation of its noise, the standard deviation of the measured
+shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao lower bound).
 
-Matching models the floor under a patch as a plane. Relief relative to that plane causes parallax and thereby a matching
-error; the unevenness is its magnitude.
+Matching models the floor under a patch as a plane. Relief relative to that plane causes parallax and thus a matching
+error. The unevenness is the RMS of this parallax, in pixels per unit of baseline / depth.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from twin.scenario.model import Scenario
 
 _DEPTHS = 6
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
-_SAMPLES = 9  # number of height samples along each side of a patch
+_SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
 
 
 class Matchability:
-    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated over the depths of a survey.
+    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated by depth of the floor.
 
     Attributes:
-        depths_m: (m,) depths of the floor [m].
-        bounds_px: (m,) Cramer-Rao bound at these depths [px].
+        depths_m: (m,) ascending depths of the floor in the camera [m].
+        bounds_px: (m,) Cramer-Rao bound c at these depths [px].
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
-        lamp_share: fraction of the reflected light that comes from the lamps.
+        lamp_share: fraction of the light reflected by the floor that comes from the lamps.
     """
 
     def __init__(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain):
@@ -73,9 +73,9 @@ def lamp_share(scenario: Scenario, illumination: Illumination, terrain: terrains
 
 
 def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
-    """Returns the mean light per colour band that a white floor at the planned altitude reflects to the camera.
+    """Returns the light that a white floor at the planned altitude reflects to the camera, mean over bands [cd/m2].
 
-    It is the difference between the images of a white and a black floor, in photometric units [cd/m2].
+    It is the mean difference between the images of a white and a black floor, which removes the veil.
     """
     scenario = _without_unmodelled_effects(scenario)
     formation = ImageFormation(scenario, illumination, terrain, np.random.default_rng(0))
@@ -86,7 +86,7 @@ def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain:
 
 
 def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose]:
-    """Returns the depth image of a level floor at the given depth, and the camera pose at the planned altitude."""
+    """Returns the image of a constant depth [m], as of a level floor, and a camera pose at the planned altitude."""
     rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
     world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
     return np.full((rig.height_px, rig.width_px), depth_m, np.float32), StampedPose(world_from_left, 0.0)
@@ -100,10 +100,10 @@ def _without_unmodelled_effects(scenario: Scenario) -> Scenario:
 
 
 def unevenness_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array) -> Array:
-    """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], averaged over the planned area.
+    """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], RMS over the planned area.
 
     It is the parallax relative to the best-fit plane, in pixels per unit of baseline / depth: f rms(z) / depth, with z
-    the height above that plane and f the focal length.
+    the height above that plane [m] and f the focal length [px].
     """
     focal_px, patch_px = scenario.believed_rig().focal_px, scenario.estimate.patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
@@ -128,7 +128,7 @@ def _bound_px(
     depth_m: float,
     rng: np.random.Generator,
 ) -> float:
-    """Returns the Cramer-Rao bound [px] for a level floor with the given albedo image at a depth."""
+    """Returns the Cramer-Rao bound [px] for a level floor at the given depth, with the given albedo image."""
     depth, camera_pose = _level_floor(scenario, depth_m)
     radiance = formation.radiance(albedo, depth, 0, camera_pose)
     sensor = sensor_of(scenario, rig)
@@ -141,12 +141,12 @@ def _bound_px(
 
 
 def _gray(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Converts an image to grey and smooths it as the estimators do."""
+    """Returns the grey image, smoothed as in the estimators."""
     return np.asarray(cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0.5), np.float32)
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns the texture of a terrain file, or one generated for the given extent, and its texel size [m]."""
+    """Returns a texture and its texel size [m]: that of the terrain file, or one generated for a square floor."""
     t = scenario.terrain
     if t.kind == "file":
         return terrain.texture, terrain.texture_px_m
@@ -158,7 +158,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
 
 
 def _albedo(texture: Image, texel_m: float, rig: StereoRig, depth_m: float) -> Image:
-    """Returns the centre of the texture resampled to the camera's pixels, (height_px, width_px, 3)."""
+    """Returns the centre of the texture as the camera images it at a depth, (height_px, width_px, 3)."""
     texels_per_px = depth_m / rig.focal_px / texel_m
     height, width = texture.shape[:2]
     rows, cols = (min(round(n * texels_per_px), most) for n, most in ((rig.height_px, height), (rig.width_px, width)))

@@ -1,4 +1,4 @@
-"""Model of the mosaic: the first keyframe that shows each floor cell, as the mosaic keeps the oldest view."""
+"""Model of the mosaic: the first keyframe that shows each floor cell, because the mosaic keeps the oldest view."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 
 _CELL_M = 0.1
-_MIN_COVERAGE = 0.1  # fraction of the view that the mosaic has to cover for a registration
+_MIN_COVERAGE = 0.1  # smallest fraction of a view that the mosaic must cover for a registration
 
-Cells = NDArray[np.int64]  #: floor cells: column and row packed into one integer
+Cells = NDArray[np.int64]  #: floor cells, each with column and row packed into one integer
 
 
 @njit(cache=True, nogil=True)
 def floor_cells(pose, points, baseline):
-    """Returns the floor cells (n,) of points (n, 3): normalised (x, y, disparity) in a camera at `pose` (4, 4)."""
+    """Returns the floor cells (n,) of points (n, 3), normalised (x, y, disparity) in a camera at pose (4, 4)."""
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -31,12 +31,12 @@ def floor_cells(pose, points, baseline):
 
 
 class MosaicView(NamedTuple):
-    """Keyframes that make up the mosaic within a view.
+    """Keyframes that the mosaic shows within a view.
 
     Args:
         numbers: (n,) numbers of the keyframes, ascending.
-        estimated: (n, 4, 4) poses at which they were added to the mosaic.
-        fractions: (n,) fraction of the mosaic in view that each of them covers.
+        estimated: (n, 4, 4) estimated poses at which they were added to the mosaic.
+        fractions: (n,) fraction of the mosaic in view that each of them covers; sums to 1.
     """
 
     numbers: list[int]
@@ -63,7 +63,7 @@ class MosaicModel:
             self._first_keyframe.setdefault(cell, number)
 
     def view(self, cells: Cells) -> MosaicView | None:
-        """Returns the keyframes that the mosaic shows in these cells; None if it covers too few of them."""
+        """Returns the keyframes that the mosaic shows in these cells, or None if it covers too few cells."""
         counts = Counter(map(self._first_keyframe.get, cells.tolist()))
         counts.pop(None, None)
         if counts.total() < _MIN_COVERAGE * len(cells):

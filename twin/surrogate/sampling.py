@@ -1,4 +1,4 @@
-"""Sampling of measured motions: frame to frame, between keyframes, and relative to the mosaic (compiled)."""
+"""Sampling of measured motions (compiled): between frames, between keyframes, and relative to the mosaic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
 
-MIN_POINTS = 6  # smallest number of points that determine a motion
+MIN_POINTS = 6  # smallest number of points from which a motion is estimated
 
 
 @njit(cache=True, nogil=True)
@@ -17,8 +17,9 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     """Samples the frame-to-frame motion (4, 4) between two true poses (4, 4).
 
     Args:
-        errors: distribution of the errors, a `FrameErrors`.
-        normals, previous_normals: (6,) standard normal numbers of this motion and of the one before it.
+        errors: distribution of the errors, a `vision.FrameErrors`.
+        previous_pose, pose: true poses of the left camera at the two frames.
+        normals, previous_normals: (6,) standard normal numbers of this motion and of the motion before it.
     """
     error = np.zeros(6)
     for i in range(6):
@@ -32,27 +33,31 @@ def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
     bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation,
 ):  # fmt: skip
-    """Samples the motion between two keyframes.
+    """Samples the motion between two keyframes from noisy points, with the equations used for matched points.
+
+    Standard deviations and covariances are in normalised coordinates. Parameters not explained here are those of
+    `ErrorModel`.
 
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
         later_noise: (n, 3) standard normal numbers of the later stereo pair's errors at these points.
         earlier_noise: (rows, cols, 3) standard normal numbers of the earlier stereo pair's biases, over its image.
-        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, repeated every f floor cells.
-        normals: (n + 1, 3) standard normal numbers of this link alone: of its points, and of their common bias.
+        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, with a period of f floor cells.
+        normals: (n + 1, 3) standard normal numbers of this link alone: n for its points, one for their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
-        cov: (3, 3) reported covariance of a point (x, y, disparity) in each stereo pair.
-        error_root: (3, 3) square root of the true covariance of a point in each stereo pair.
-        bias_fraction: fraction of the earlier stereo pair's standard deviation that is common to all of its links.
-        relief_sigma: standard deviation of the error due to relief per unit of distance / depth.
+        cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
+        error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
+        bias_fraction: `match_bias_fraction`.
+        relief_sigma: standard deviation of the error due to relief, per unit of distance / depth.
         common_bias: true standard deviation of the common bias.
-        distance_growth: growth of the reported variance with distance / depth, see `ErrorModel`.
+        distance_growth: growth of the reported variance with distance / depth.
         common_sigma: reported standard deviation of the common bias.
-        inflation: factor on the reported covariance due to correlated matches.
+        inflation: factor on the reported covariance, because matches are correlated.
 
     Returns:
-        Number of points that both keyframes see, motion earlier_from_later (4, 4), its reported covariance (6, 6).
+        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6),
+        which are valid only with at least `MIN_POINTS` points.
     """
     focal, cx, cy, width, height, margin, baseline = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
@@ -93,7 +98,7 @@ def sample_link(
 
 @njit(cache=True, nogil=True, inline="always")
 def _floor_cell(pose, point, baseline, cell_m, n):
-    """Returns row and column, modulo n, of the floor cell that contains a point (x, y, disparity) seen from `pose`."""
+    """Returns row and column (modulo n) of the floor cell of a point (x, y, disparity) in a camera at `pose`."""
     depth = baseline / point[2]
     x = pose[0, 3] + depth * (pose[0, 0] * point[0] + pose[0, 1] * point[1] + pose[0, 2])
     y = pose[1, 3] + depth * (pose[1, 0] * point[0] + pose[1, 1] * point[1] + pose[1, 2])
@@ -102,10 +107,11 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 
 @njit(cache=True, nogil=True)
 def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple[Array, Array]:
-    """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its square root.
+    """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its lower Cholesky factor.
 
-    Least squares of Negahdaripour & Madjidi (2003), eq. (2), with `n_effective` flow vectors of unit standard deviation
-    distributed over the image and in depth like `points` (n, 3), normalised (x, y, disparity).
+    The motion is that of Negahdaripour & Madjidi (2003), eq. (2), by least squares from `n_effective` flow vectors of
+    unit standard deviation. These are distributed over the image and in depth like `points` (n, 3), normalised
+    (x, y, disparity).
     """
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
@@ -116,14 +122,14 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
 
 @njit(cache=True, nogil=True)
 def mosaic_correction(estimated, true, fractions, true_pose, predicted_pose):
-    """Returns the correction (6,) of a predicted pose that an error-free registration with the mosaic would give.
+    """Returns the correction (6,) of a predicted pose that a registration without matching errors would give.
 
-    In the mosaic, each keyframe is displaced by the error of the pose at which it was added; the correction is the
+    In the mosaic, each keyframe is displaced by the error of the pose at which it was added. The correction is the
     mean over the keyframes in view, weighted by `fractions`.
 
     Args:
         estimated, true: (n, 4, 4) estimated and true poses of the keyframes in view.
-        fractions: (n,) fraction of the view that each of them covers.
+        fractions: (n,) fraction of the mosaic in view that each of them covers.
         true_pose, predicted_pose: (4, 4) true and predicted pose of the frame to register.
     """
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)

@@ -1,4 +1,4 @@
-"""Simulated world without images; vehicle, sensors and floor are those of `RenderedWorld`."""
+"""Simulated world without images; vehicle, sensors and floor are modelled as in `RenderedWorld`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from twin.world.mission import Mission, Step
 from twin.world.pilot import PilotOfEstimates, RovPilot
 from twin.world.world import CameraImages, FastForward, World, left_camera, streams
 
-_BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # image without pixels
+_BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # placeholder: an image without pixels
 
 
 class SurrogateWorld(World):
-    """World in which visual measurements are sampled from an error model.
+    """World whose visual measurements are sampled from an error model.
 
     Attributes:
         vision: source of the sampled visual measurements.
@@ -57,7 +57,7 @@ class SurrogateWorld(World):
         self.warnings = (f"surrogate: {warning}",) if warning else ()
 
     def close(self) -> None:
-        """Does nothing: there is nothing to release."""
+        """Does nothing, as there are no resources to release."""
 
     def capture(self, step: Step) -> CameraImages:
         pose, rig = self.world_from_camera, self.mission.rig
@@ -79,10 +79,10 @@ class SurrogateWorld(World):
 def surrogate_vision(
     mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer
 ) -> SurrogateVision:
-    """Returns a `Vision` that samples the visual measurements of a mission.
+    """Returns the `SurrogateVision` of a mission.
 
     Args:
-        true_pose: returns the true world_from_camera (4, 4) of the left camera.
+        true_pose: function that returns the true world_from_camera (4, 4) of the left camera.
     """
     scenario, terrain = mission.scenario, mission.terrain
     map_model = MapModel(mission.grid, true_heights(mission.grid, terrain.height_at), mission.rig)

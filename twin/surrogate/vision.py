@@ -1,9 +1,10 @@
 """Visual measurements of a surrogate survey: true values with errors sampled from an error model.
 
-The surrogate is part of the simulated world: it has access to the truth and returns measurements only, each with the
-covariance that the image-based estimators would report. A raster of points represents all matched points of a keyframe;
-its noise is reduced to account for their larger number. Links are computed from these points by the same equations as
-from images. The stereo noise of a keyframe is sampled once and is common to all of its links.
+The surrogate is part of the simulated world: it uses the truth and returns only measurements, each with the covariance
+that the image-based estimators would report. A raster of points represents all matched points of a keyframe; its noise
+is reduced because the matched points outnumber the raster points. Links are computed from the raster points by the same
+equations as from matched points. The noise of a stereo pair is sampled once and enters all links of the keyframe: in
+full if the keyframe is the later one of the link, otherwise with the fraction `ErrorModel.match_bias_fraction`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from twin.surrogate.map_model import CellErrors, MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
-_RASTER = (6, 8)  # rows and columns of points
+_RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # period of the errors due to relief, in floor cells
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
@@ -47,13 +48,13 @@ class _KeyframeTruth(NamedTuple):
     Args:
         pose: (4, 4) true pose.
         points: (n, 3) points of the raster on the floor, normalised (x, y, disparity).
-        raster_indices: (n,) indices of these points in the raster.
-        noise: (rows, cols, 3) standard normal numbers of the stereo errors, over the raster.
+        raster_indices: (n,) index of each point in the raster.
+        noise: (rows, cols, 3) standard normal numbers of the stereo errors of the raster points.
         bound_px: Cramer-Rao bound of a patch's position [px].
-        unevenness_px: unevenness of the floor under a patch, see `matchability`.
-        n_points: number of matched points that the raster represents.
+        unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
+        n_points: number of matched points that the raster points represent.
         unit_cov: (6, 6) covariance of a motion estimated from flow of unit standard deviation and known depth.
-        unit_root: (6, 6) square root of `unit_cov`.
+        unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
         cells: (n,) floor cells of the points.
     """
 
@@ -73,9 +74,9 @@ class FrameErrors(NamedTuple):
     """Distribution of the errors of frame-to-frame motions since the last keyframe.
 
     Args:
-        root: (6, 6) square root of the true covariance of the independent part of a motion's error.
+        root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
         cov: (6, 6) reported covariance of a motion.
-        anticorrelation: fraction of a frame's error that the next frame cancels.
+        anticorrelation: fraction of the independent error of a motion that the next motion cancels.
     """
 
     root: Array
@@ -84,10 +85,10 @@ class FrameErrors(NamedTuple):
 
 
 class TrueScene(NamedTuple):
-    """True scene that measurements are sampled from.
+    """True scene from which measurements are sampled.
 
     Args:
-        left_camera: returns the present true pose (4, 4) of the left camera.
+        left_camera: function that returns the current true pose (4, 4) of the left camera.
         floor: ray caster against the true floor.
         matchability: Cramer-Rao bound and unevenness of the floor.
         map_model: true heights on the grid of the map.
@@ -105,14 +106,14 @@ class SurrogateVision:
     Args:
         rig: true calibration.
         settings: settings of the estimators.
-        model: error model.
+        model: error model of the measurements.
         scene: true scene.
         rng: random generator of all errors.
         stopwatch: timer of the stages.
 
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
-        last_normals: (6,) standard normal numbers of the last frame-to-frame motion.
+        last_normals: (6,) standard normal numbers of the last frame-to-frame motion; 0 after each keyframe.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
@@ -149,7 +150,7 @@ class SurrogateVision:
         self._normals, self._n_used = np.zeros((0, 6)), 0
         self._relief_noise = rng.standard_normal((_RELIEF_CELLS, _RELIEF_CELLS, 2))
         origin = np.zeros((1, 2))
-        # covariance of a stereo point for a position error of one pixel (standard deviation) in each image
+        # covariance of a stereo point for a standard deviation of one pixel of a position in each image
         self._unit_cov = stereo.fuse(origin, origin, np.eye(2)[None], rig)[1][0]
         self._unit_root = np.linalg.cholesky(self._unit_cov)
 
@@ -172,12 +173,12 @@ class SurrogateVision:
 
     @property
     def raster_fraction(self) -> float:
-        """Returns the number of raster points of the last keyframe per matched point that they represent."""
+        """Returns the number of raster points divided by the number of matched points, for the last keyframe."""
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
     def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the length of a motion's (4, 4) translation, divided by the mean depth of the last keyframe."""
+        """Returns the translation length of a motion (4, 4) times the mean inverse depth of the last keyframe."""
         assert self._latest is not None
         return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._latest.points[:, 2]) / self.rig.baseline_m)
 
@@ -195,7 +196,7 @@ class SurrogateVision:
 
     @property
     def frame_errors(self) -> FrameErrors | None:
-        """Returns the error distribution of F2F motions since the last keyframe; None if no points can be tracked."""
+        """Returns the error distribution of F2F motions since the last keyframe; None without points to track."""
         return self._f2f
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -231,7 +232,10 @@ class SurrogateVision:
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz)
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns which raster points (n,), of depth `depth_m[indices]`, lie well inside both images."""
+        """Returns which of the raster points with these indices (n,) lie well inside both images.
+
+        `depth_m` contains the depth of every raster point [m].
+        """
         shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[indices]
         left_px, right_px = self._pixels[indices], self._pixels[indices]
         right_px[:, 0] -= shift_px
@@ -247,7 +251,7 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns square root and covariance (6, 6) of a motion estimated from flow with a standard deviation [px]."""
+        """Returns the Cholesky factor and covariance (6, 6) of a motion for a standard deviation of flow [px]."""
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2
@@ -283,7 +287,7 @@ class SurrogateVision:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        """Samples the motions that `measure_motions` returns, from a given error model."""
+        """Samples the motions that `measure_motions` returns, for the given error model."""
         with self.stopwatch("network"):
             assert self._latest is not None
             later = self._keyframes.get(node.number, self._latest)
@@ -292,7 +296,7 @@ class SurrogateVision:
     def _sample_link(
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes by one least-squares step from the truth with noisy points.
+        """Samples the motion between two keyframes: one least-squares step from the true motion with noisy points.
 
         The random numbers depend on the two keyframe numbers only, not on the order in which links are measured.
         """
@@ -322,7 +326,7 @@ class SurrogateVision:
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns the standard normal numbers (n, 3) of a link between two keyframes."""
         state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
-        with self._link_lock:  # links may be measured in other threads
+        with self._link_lock:  # links may be measured in several threads at once
             self._link_rng.bit_generator.state = state
             return self._link_rng.standard_normal((n, 3))
 
@@ -349,7 +353,7 @@ class SurrogateVision:
         return mapper.result()
 
     def draw_normals(self, n: int) -> Array:
-        """Returns the next standard normal numbers (n, 6); they are generated in blocks."""
+        """Returns the next standard normal numbers (n, 6) of the stream, which is generated in blocks."""
         while self._n_used + n > len(self._normals):
             fresh = self._rng.standard_normal((_BLOCK, 6))
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
@@ -358,7 +362,7 @@ class SurrogateVision:
 
 
 def _raster(rig: StereoRig) -> Array:
-    """Returns the pixels (n, 2) of the raster points, evenly spaced over the image."""
+    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the image."""
     rows, cols = ((np.arange(n) + 0.5) / n for n in _RASTER)
     v, u = (a.ravel() for a in np.meshgrid(rows * rig.height_px, cols * rig.width_px, indexing="ij"))
     return np.column_stack([u, v]) - 0.5

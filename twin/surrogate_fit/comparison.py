@@ -1,8 +1,9 @@
-"""Comparison of measurements from images with those of the surrogate and with the truth, for the fit.
+"""Statistics that compare image measurements with surrogate measurements and with the truth, for the fit.
 
-During a rendered survey every measurement is made from the images and also sampled by the surrogate at the same true
-poses. The statistics are ratios of covariances reported from images to those of the surrogate, and errors relative to
-the truth. Images and surrogate measure the same geometry, so the ratios depend on the error model alone.
+During a rendered survey, every measurement is made in the images and is also sampled by the surrogate at the same true
+poses. The statistics are standard deviations reported for the image measurements, relative to those that the surrogate
+reports, and errors relative to the truth. Image and surrogate measurements have the same geometry, so the ratios depend
+on the error model alone.
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from twin.surrogate.error_model import ErrorModel, SigmaLaw
 from twin.surrogate.vision import SurrogateVision
 
 _MIN_CELLS = 300
-_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # a level cell has a smaller slope, a steep cell a larger one
+_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # rise over run; level cells are below the first, steep cells above the second
 _NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
 #: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
 
 
 class ComparisonVision:
-    """Implementation of `Vision` with images that also collects statistics of a comparison with a surrogate.
+    """Implementation of `Vision` that measures in images and collects statistics of a comparison with the surrogate.
 
     Args:
-        images: vision whose measurements are returned.
-        surrogate: vision to compare with.
-        true_pose: returns the present true pose (4, 4) of the left camera.
+        images: vision that measures in images; its measurements are returned.
+        surrogate: vision that samples the same measurements from an error model.
+        true_pose: returns the current true pose (4, 4) of the left camera.
 
     Attributes:
-        statistics: samples by name. Names that end in `sigma_ratio` are standard deviations reported from images over
-            those reported by the surrogate; `nees` are squared errors normalised by the covariance, per degree of
-            freedom.
+        statistics: samples by name. `..._sigma_ratio` is the ratio of the standard deviation reported for the image
+            measurement to the one that the surrogate reports. `..._nees...` is a squared error normalised by a reported
+            covariance, per degree of freedom.
     """
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
@@ -52,9 +53,9 @@ class ComparisonVision:
         self.statistics["lamp_share"] = [surrogate.lamp_share]
         self._poses: dict[int, Array] = {}
         self._last_node = -1
-        self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the last link along the path
+        self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the chain's previous link
         self._last_pose: Array | None = None
-        self._frames: list[tuple[Array, Array]] = []  # error and covariance of each frame since the last keyframe
+        self._frames: list[tuple[Array, Array]] = []  # error and covariance of each F2F motion since the last keyframe
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         (measured, status), (sampled, _) = self.images.track_frame(frame), self.surrogate.track_frame(frame)
@@ -111,7 +112,10 @@ class ComparisonVision:
         self.surrogate.discard(numbers)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Measures links in images; compares them with links sampled with all errors and with each error alone."""
+        """Returns the links measured in images; compares them with sampled links.
+
+        Links are sampled with all errors and with one error source at a time (`single_error_models`).
+        """
         measured = {"images": self.images.measure_motions(node, others)}
         models = {"all": self.surrogate.model, **single_error_models(self.surrogate.model)}
         measured |= {name: self.surrogate.sample_links(node, others, model) for name, model in models.items()}
@@ -125,10 +129,15 @@ class ComparisonVision:
         return measured["images"]
 
     def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
-        """Adds the statistics of a link from i to j with true motion (4, 4), with one motion per source in `links`.
+        """Adds the statistics of one link, measured in images and sampled from each error model.
 
-        Errors are normalised by the covariance that the surrogate reports. For two consecutive links along the path,
-        the normalised product of their errors is added as well: it is negative if the second cancels the first.
+        Errors are normalised by the covariance that the surrogate reports. For two consecutive links of the chain, the
+        normalised scalar product of their errors is added too; it is negative if the second error cancels the first.
+
+        Args:
+            i, j: numbers of the earlier and the later node.
+            links: motion from i to j by source: "images", or the name of an error model.
+            true: (4, 4) true motion from i to j.
         """
         measured, sampled = links["images"], links["all"]
         if measured is None or sampled is None:
@@ -149,7 +158,10 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images; compares it with maps sampled along the same path with each error alone."""
+        """Returns the map from images; compares it with sampled maps along the same path.
+
+        The sampled maps contain the pose errors alone, pose and depth errors, and pose and lateral errors.
+        """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         models = {
             "pose": model._replace(depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0),
@@ -166,7 +178,12 @@ class ComparisonVision:
         return elevation
 
     def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds robust variance of height errors and median reported variance [m^2], each for level and steep cells."""
+        """Adds robust variance of height errors and median reported variance [m^2], for level and for steep cells.
+
+        Args:
+            source: name of the map in the statistics.
+            elevation: the map to compare with the true heights.
+        """
         map_model = self.surrogate.scene.map_model
         error = elevation.height_m - map_model.height_m
         level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE
@@ -179,7 +196,7 @@ class ComparisonVision:
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
-    """Returns link models in which one error source acts alone: the matching of patches, or relief."""
+    """Returns two error models by name, each with one source of link errors: patch matching ("patches"), "relief"."""
     return {
         "patches": model._replace(
             match_error_ratio=1.0, lamp_error_growth=0.0, match_bias_fraction=BIAS_FRACTION, relief_gain=0.0
@@ -189,7 +206,7 @@ def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
 
 
 def _chi2(error: Array, cov: Array) -> float:
-    """Returns the squared Mahalanobis norm of an error."""
+    """Returns the squared Mahalanobis norm e' C^-1 e of an error e with covariance C."""
     return float(error @ np.linalg.solve(cov, error))
 
 

@@ -1,8 +1,8 @@
 """Fit of the error model to the statistics of rendered surveys.
 
-Reported standard deviations are fitted to the medians of their ratios to those of the surrogate, error ratios to the
-medians of squared errors normalised by the reported covariance. Medians are robust against a few failed measurements.
-Every survey has the same weight.
+The laws of the reported standard deviations are fitted to ratios between image measurements and surrogate. The error
+ratios are fitted to squared errors normalised by the reported covariance. Medians and trimmed means make the fit robust
+against a few failed measurements. Every survey has the same weight.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
 from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN
 
 _SOURCES = ("images", "patches", "relief")
-_RELATIVE_SIGMA = 0.1  # relative standard error of the mean squared error of a third of a survey's links
+_RELATIVE_SIGMA = 0.1  # assumed relative standard error of the mean squared error over a third of a survey's links
 
-#: Samples of one survey by name, see `ComparisonVision`.
+#: Samples of each statistic of one survey, by name; see `ComparisonVision.statistics`.
 SurveyStatistics = Mapping[str, Sequence[float]]
 
 
 def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> ErrorModel:
-    """Returns the error model that reproduces the measurements of rendered surveys.
+    """Returns the error model that reproduces the statistics of rendered surveys.
 
     Args:
         surveys: statistics of each survey.
-        compared: error model of the surrogate that the surveys were compared with.
+        compared: error model of the surrogate with which the surveys were compared.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
 
@@ -76,7 +76,13 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
 
 
 def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted: ErrorModel) -> dict[str, float]:
-    """Returns the root mean square over surveys of ln(reported / fitted standard deviation), by field of the model."""
+    """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field.
+
+    Args:
+        surveys: statistics of each survey.
+        compared: error model of the surrogate with which the surveys were compared.
+        fitted: error model fitted to the surveys.
+    """
     ratios = {
         "match_sigma_px": "match_sigma_ratio",
         "f2f_sigma_px": "f2f_sigma_ratio",
@@ -89,14 +95,14 @@ def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted
 
 
 def _rms_log_ratio(surveys: Sequence[SurveyStatistics], ratio: str, compared: SigmaLaw, fitted: SigmaLaw) -> float:
-    """Returns the root mean square over surveys of ln(reported / fitted standard deviation)."""
+    """Returns the RMS over surveys of ln(reported / fitted standard deviation) for the statistic named `ratio`."""
     bounds = [np.median(s["bound_px"]) for s in surveys]
     logs = [np.log(np.median(s[ratio]) * compared(b) / fitted(b)) for s, b in zip(surveys, bounds, strict=True)]
     return float(np.sqrt(np.mean(np.square(logs))))
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Fits a law to the standard deviations (n,) at bounds (n,) by least squares of their logarithms."""
+    """Fits a law to standard deviations (n,) [px] at Cramer-Rao bounds (n,) [px] by least squares of log ratios."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
@@ -106,7 +112,7 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
 
 
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
-    """Fits maximum and half-maximum bound of a law with exponent 4 to the fractions (n,) at bounds (n,)."""
+    """Fits `maximum` and `half_px` of a law with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px]."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
@@ -118,10 +124,10 @@ def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
 
 
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
-    """Fits the anticorrelation of consecutive frames to the error of the motion over n frames.
+    """Fits the anticorrelation u of consecutive frame-to-frame motions to the error accumulated over n frames.
 
-    If each frame cancels the fraction u of the previous error, the variance over n frames is
-    (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) of that of n independent frames.
+    If each frame cancels the fraction u of the previous frame's error, the variance over n frames is
+    (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) times the variance over n independent frames.
     """
     n = float(np.median(statistics["f2f_interval_frames"]))
     ratio = np.median(statistics["f2f_interval_nees"]) / np.median(statistics["f2f_nees"])
@@ -130,22 +136,24 @@ def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
 
 
 def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) -> tuple[np.ndarray, float, float]:
-    """Separates the errors of links into those of patch matching, of relief, and of the bias of a keyframe.
+    """Separates link errors into contributions of patch matching, of relief and of a bias of each keyframe.
 
-    Errors due to relief grow with the distance between the keyframes, errors of patch matching do not: the squared
-    errors of each survey are averaged over thirds of the links by distance, and the gain of relief is fitted to all
-    thirds of all surveys. Over a smooth floor the errors do not determine this gain, so the gain of the
-    compared model enters as one more observation. The bias of a keyframe makes the errors of consecutive links cancel,
-    because the keyframe is the later one of the first link and the earlier one of the second; relief makes these errors
-    equal. (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated
-    errors.)
+    Errors due to relief grow with the distance between the keyframes; errors of patch matching do not. The links of
+    each survey are therefore sorted by distance and divided into thirds, and one relief gain is fitted to the mean
+    squared errors of all thirds of all surveys. Over a smooth floor the errors do not determine the relief gain, so
+    the gain of the compared model is added as an observation.
+
+    A keyframe's bias makes the errors of two consecutive links cancel, because the keyframe ends the first link and
+    starts the second. Relief makes the two errors equal. The bias fraction is fitted to the products of such errors.
+    (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated errors.)
 
     Args:
         surveys: statistics of n surveys.
         compared_gain: relief gain of the compared model.
 
     Returns:
-        Ratio (n,) of the patch errors to those of the model with patch errors alone, relief gain, bias fraction.
+        For each survey, the ratio (n,) of the errors of patch matching to those of the "patches" model of
+        `single_error_models`; the relief gain; the bias fraction.
     """
     thirds = np.array([_squared_errors_by_distance(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
@@ -164,10 +172,13 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
 
 
 def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """Returns the error ratio of patches without lamps, and its growth with `lamp_share`.
+    """Fits `match_error_ratio` (without lamps) and `lamp_error_growth` of the error model.
 
-    Both are fitted to the squared error ratios (n,) by least squares of their relative errors. `lamp_share` (n,) is
-    the fraction of the reflected light that comes from the lamps.
+    Both are fitted to the squared error ratios by least squares of relative residuals.
+
+    Args:
+        error_ratios: (n,) ratio of the true to the reported standard deviation of a match, one per survey.
+        lamp_share: (n,) fraction of the reflected light that comes from the lamps, one per survey.
     """
     effects = np.column_stack([np.ones_like(error_ratios), lamp_share**2]) / error_ratios[:, None] ** 2
     constant, growth = nnls(effects, np.ones(len(error_ratios)))[0]
@@ -188,11 +199,13 @@ def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
 def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: float) -> tuple[float, np.ndarray]:
     """Fits the growth of the reported link covariance with the distance between the keyframes.
 
-    A link joins two stereo pairs of equal variance. That of the earlier pair grows with the distance, so the variance
-    of the link is multiplied by 1 + (growth * distance)^2 / 2.
+    At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
+    multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
+    1 + (growth * distance)^2 / 2. The distance is in units of the mean depth.
 
     Returns:
-        Growth, and for each survey the ratio (n,) of the reported standard deviations at distance zero.
+        Growth, and for each of n surveys the ratio of the standard deviation reported for links from images to the one
+        that the surrogate reports, at distance zero (n,).
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -212,7 +225,9 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
 
 def _fit_map_variances(statistics: SurveyStatistics, quantity: str) -> np.ndarray:
-    """Returns the factors (2,) on depth and lateral variance that reproduce the variances of level and steep cells.
+    """Returns factors (2,) on the surrogate's depth and lateral variances that reproduce the variances of the map.
+
+    The factors are fitted to the variances of level and of steep cells in the map from images.
 
     Args:
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.

@@ -1,4 +1,4 @@
-"""Rendered surveys that collect statistics of the comparison with the surrogate, and the fit to them."""
+"""Rendered surveys that collect comparison statistics, and the fit of the surrogate's error model to them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
     Args:
         surveys: statistics of each survey; aborted surveys are ignored.
-        compared: error model of the surrogate that the surveys were compared with.
+        compared: error model of the surrogate with which the surveys were compared.
 
     Raises:
         TwinError: too few surveys are complete.
@@ -41,12 +41,20 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Returns the statistics of a rendered survey; reads them from its folder if saved for the same error model."""
+    """Returns the comparison statistics of a rendered survey.
+
+    If the statistics for the same scenario and error model are in the folder, reads them; otherwise flies the survey.
+
+    Args:
+        scenario: description of the survey.
+        folder: run folder of the survey.
+        compared: error model of the surrogate to compare with.
+    """
     return _load(scenario, folder, compared) or _fly(scenario, folder, compared)
 
 
 def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics | None:
-    """Returns the statistics in a folder; None if there are none for this scenario and error model."""
+    """Returns the statistics saved in a folder; None if there are none for this scenario and error model."""
     try:
         saved = json.loads((folder / _FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):

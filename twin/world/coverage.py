@@ -1,4 +1,4 @@
-"""Map cells that at least one keyframe observed with both cameras, from the true depth images."""
+"""Map cells that both cameras observed in at least one keyframe, computed from true depth images."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid, StereoRig
 
-#: Four neighbouring pixels whose depths differ by more than this fraction span an occluding edge. At
-#: 0.2 deg per pixel, a slope of 86 deg is still a surface.
+#: Four neighbouring pixels whose depths differ by more than this fraction span an occluding edge. With pixels of
+#: 0.2 deg, a surface reaches this limit at 86 deg to the image plane.
 EDGE_SHARE = 0.05
 #: Tolerance of the left-right depth comparison, as a fraction of the depth.
 DEPTH_TOLERANCE = 0.005
@@ -21,8 +21,15 @@ _ROWS_PER_CALL = 64
 class Coverage:
     """Observed cells of a grid.
 
-    `seen` (rows, cols) bool is modified in place by `add`: a cell is observed if its centre lies within a quad of four
-    neighbouring left pixels that the right camera sees as well.
+    A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
+    left image, and both cameras see these points.
+
+    Args:
+        grid: grid of the map.
+        rig: calibration that applies to the depth images.
+
+    Attributes:
+        seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
     """
 
     def __init__(self, grid: MapGrid, rig: StereoRig) -> None:
@@ -30,7 +37,7 @@ class Coverage:
         self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
 
     def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
-        """Marks the cells that a keyframe observes.
+        """Marks the cells that are observed in a keyframe.
 
         Args:
             world_from_left: (4, 4) true pose of the left camera.
@@ -61,7 +68,8 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> N
 def _mark_seen(seen, raster, pose, camera, left, right):
     """Compiled kernel of `Coverage.add`.
 
-    Projects two image rows of pixels onto the grid at a time and marks the quads between four visible pixels.
+    Projects the pixels of two neighbouring image rows at a time onto the grid. Marks the cells in the quads between
+    four neighbouring pixels that both cameras see.
     """
     height, width = left.shape
     col, row = np.zeros((2, width)), np.zeros((2, width))
@@ -87,10 +95,10 @@ def _mark_seen(seen, raster, pose, camera, left, right):
 
 @njit(cache=True, nogil=True)
 def _in_both(u, v, left, right, camera):
-    """Returns whether both cameras see the point of a left pixel.
+    """Returns whether both cameras see the floor point at pixel (u, v) of the left image.
 
-    They do if its projection lies in the right image and its depth lies between the depths of the two right pixels
-    next to the projection, within the tolerance.
+    The right camera sees the point if its projection lies in the right image, and its depth lies between the depths of
+    the two right pixels next to the projection, within DEPTH_TOLERANCE.
     """
     z = left[v, u]
     if not (z > 0 and z < np.inf):
@@ -104,7 +112,7 @@ def _in_both(u, v, left, right, camera):
 
 @njit(cache=True, nogil=True)
 def _floor_cell(u, v, z, pose, camera, raster):
-    """Returns column and row of the point of a pixel (u, v) with depth z; integers are cell centres."""
+    """Returns column and row in the grid of the floor point at pixel (u, v) with depth z; integers are cell centres."""
     xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
     x = pose[0, 0] * xc + pose[0, 1] * yc + pose[0, 2] * z + pose[0, 3]
     y = pose[1, 0] * xc + pose[1, 1] * yc + pose[1, 2] * z + pose[1, 3]
@@ -113,7 +121,7 @@ def _floor_cell(u, v, z, pose, camera, raster):
 
 @njit(cache=True, nogil=True)
 def _is_surface(left, u, v):
-    """Returns whether the depths of four neighbouring pixels belong to one surface, without an occluding edge."""
+    """Returns whether the four pixels from (u, v) to (u + 1, v + 1) show one surface, without an occluding edge."""
     a, b, c, d = left[v, u], left[v, u + 1], left[v + 1, u], left[v + 1, u + 1]
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     return high - low <= EDGE_SHARE * low
@@ -121,7 +129,7 @@ def _is_surface(left, u, v):
 
 @njit(cache=True, nogil=True)
 def _mark_triangle(seen, ca, ra, cb, rb, cc, rc):
-    """Marks the cells whose centre lies in or on the edge of a triangle of points (column, row)."""
+    """Marks the cells whose centre lies inside or on the edge of a triangle a, b, c, given by columns and rows."""
     row0, row1 = max(0, int(np.ceil(min(ra, rb, rc)))), min(seen.shape[0] - 1, int(np.floor(max(ra, rb, rc))))
     col0, col1 = max(0, int(np.ceil(min(ca, cb, cc)))), min(seen.shape[1] - 1, int(np.floor(max(ca, cb, cc))))
     for r in range(row0, row1 + 1):

@@ -1,4 +1,4 @@
-"""The mission: scenario, floor, plan and map grid, checked before anything is flown."""
+"""Missions: scenario, floor, plan and map grid of a survey, checked before the flight."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from twin.judge.metrics import check_require
 from twin.scenario.model import BeaconConfig, CalibrationErrorConfig, Scenario, SensorConfig, Source
 from twin.simulate.autopilot import top_speed_mps
 
-#: Step along the path at which the clearance of a lamp above the floor is checked.
+#: Distance between the points of the path at which the height of a lamp above the floor is checked.
 LAMP_STEP_M = 0.02
 
 
@@ -43,7 +43,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """Sequence of consecutive planned frames; each item is a `Step`.
+    """Sequence of n consecutive planned frames; item k is the `Step` of frame k.
 
     Args:
         reference: planned pose and velocity of the left camera at each frame.
@@ -73,7 +73,7 @@ class Mission:
         rig: calibration that the estimators use.
         grid: cells of the map.
         true_cameras: true parameters of the cameras.
-        illumination: water and daylight.
+        illumination: optical properties of the water, and daylight.
     """
 
     scenario: Scenario
@@ -86,21 +86,24 @@ class Mission:
 
     @property
     def start(self) -> Array:
-        """(4, 4) world_from_camera at the start of the survey, with the vehicle level and its bow to the east."""
+        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow to the east."""
         return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
 
     @property
     def start_of_body(self) -> Array:
-        """(4, 4) world_from_body at the start of the survey."""
+        """Returns world_from_body (4, 4) at the start of the survey."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
     def fly(self, track: int) -> Course:
-        """Returns the frames of a track (from 1); every N-th frame and the last one are keyframes."""
+        """Returns the course along a track (numbered from 1); every N-th frame and the last one are keyframes."""
         times_s, keyframes = self.plan.frames_of_track(track)
         return Course(self.plan.references(track, times_s), keyframes, holding=False)
 
     def hold(self, track: int) -> Course:
-        """Returns the frames of one half of the station keeping after a track (from 1)."""
+        """Returns the course of half the station keeping after a track (numbered from 1).
+
+        It is flown twice, before and after the global alignment.
+        """
         n = self._n_holding
         end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
         return Course(end, np.zeros(n, np.bool_), holding=True)
@@ -111,12 +114,12 @@ class Mission:
 
     @property
     def n_frames(self) -> int:
-        """Number of frames of the whole survey."""
+        """Returns the number of frames of the whole survey, with station keeping."""
         return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
     @property
     def tracks(self) -> range:
-        """Numbers of the tracks, from 1."""
+        """Returns the numbers of the tracks, from 1."""
         return range(1, self.plan.n_tracks + 1)
 
 
@@ -124,7 +127,7 @@ def prepare(scenario: Scenario) -> Mission:
     """Loads the floor, plans the survey and checks both.
 
     Raises:
-        ScenarioError: every reason why the survey cannot be flown, each with file and line.
+        ScenarioError: the survey cannot be flown; the error lists every reason with file and line.
     """
     errors: list[str] = []
     source = scenario.source
@@ -155,7 +158,7 @@ def prepare(scenario: Scenario) -> Mission:
 
 
 def _attempt(build, source: Source, errors: list[str]):
-    """Returns the result of `build`; if it raises an error, appends the error to the list and returns None."""
+    """Returns the result of `build`; if it raises TwinError, appends the description to `errors` and returns None."""
     try:
         return build()
     except TwinError as error:
@@ -178,7 +181,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
                 f"has no effect on a generated floor (terrain.kind = {t.kind!r})",
                 'terrain.kind = "file"',
             )
-        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # no image, no texture
+        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # unused without images
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
@@ -205,7 +208,7 @@ def make_plan(scenario: Scenario) -> SurveyPlan:
 
 
 def _check_speed(scenario: Scenario) -> None:
-    """Checks that the thrusters reach the planned speed: along the bow, and on loops in every direction."""
+    """Checks that the thrusters reach the planned speed: ahead, and for loops in every horizontal direction."""
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
@@ -235,7 +238,7 @@ def _check_beacons_listed(scenario: Scenario) -> None:
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
-    """Checks that a beacon is on the floor or above it."""
+    """Checks that a beacon lies within the terrain, on or above the floor."""
     x, y, z = beacon.position_m
     floor_m = float(terrain.height_at(x, y))
     if np.isnan(floor_m):
@@ -249,7 +252,7 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
 
 
 def _check_current(scenario: Scenario) -> None:
-    """Rejects a current on a kinematic vehicle, which it does not move."""
+    """Raises TwinError if a kinematic vehicle has a current: a current has no effect on kinematic motion."""
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
         raise TwinError(
             "current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
@@ -257,14 +260,18 @@ def _check_current(scenario: Scenario) -> None:
 
 
 def _illumination(scenario: Scenario) -> Illumination:
-    """Returns water and daylight; raises TwinError where they or the beam of a lamp are invalid."""
+    """Returns the optical properties of the water and the daylight.
+
+    Raises:
+        TwinError: water, daylight or the beam of a lamp is invalid.
+    """
     illumination = illumination_of(scenario)
     light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
     return illumination
 
 
 def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Checks that a lamp stays above the floor along the whole path, bow to the east."""
+    """Checks that a lamp stays above the floor along the whole path, with the bow to the east."""
     corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
     offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
@@ -279,7 +286,7 @@ def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan
 
 
 def _check_exposure(sensor: SensorConfig) -> None:
-    """Checks the order of the exposure limits."""
+    """Checks that the shortest exposure is not longer than the longest."""
     if sensor.exposure_min_ms > sensor.exposure_max_ms:
         raise TwinError(
             "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
@@ -288,7 +295,7 @@ def _check_exposure(sensor: SensorConfig) -> None:
 
 
 def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
-    """Checks that a time of the sensor fits into the frame interval."""
+    """Checks that the sensor time `sensor.<key>` is at most one frame interval."""
     if time_ms > 1000 / frame_rate_hz:
         raise TwinError(
             f"sensor.{key}", f"{time_ms:g}: longer than a frame",
@@ -297,7 +304,7 @@ def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
 
 
 def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Checks that the path stays over the terrain with enough clearance."""
+    """Checks that the path stays over the terrain, with at least the required clearance."""
     size = terrain.size_m
     if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
         shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
@@ -318,7 +325,7 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
-    """Returns the grid of the map: the part of the reference plane in view along the path, plus a margin of 0.5 m."""
+    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
     corners = plan.outline()[:, :2]
     across_m, along_m = plan.footprint_m
     margin = np.array([along_m, across_m]) / 2 + 0.5

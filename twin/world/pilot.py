@@ -1,4 +1,4 @@
-"""Pilot, which computes the vehicle command from the online estimate of the camera pose."""
+"""Pilot: computes the vehicle command from the online estimate of the camera's pose and velocity."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from twin.core.records import Estimate
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
 
-_VELOCITY_SMOOTHING_S = 0.1  # frame-to-frame velocity is noisy; the true velocity changes more slowly
+_VELOCITY_SMOOTHING_S = 0.1  # time constant: velocity from F2F is noisy, the true velocity changes more slowly
 
 
 PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot: a function from estimate and reference of the left camera to the command of the vehicle."""
+    """Returns the pilot, which maps the estimate and the reference of the left camera to the vehicle command."""
     return RovPilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
 
 
 def _carrier_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot of a kinematic vehicle, whose command is a velocity (3,) in the world [m/s]."""
+    """Returns the pilot of a kinematic vehicle; a command is a velocity (3,) in the world [m/s]."""
     frequency = mission.scenario.control.natural_frequency_radps
 
     def command(estimate: Estimate, reference: Reference) -> Array:
@@ -44,9 +44,9 @@ class PilotState(NamedTuple):
         camera_from_body: (4, 4) pose of the body in the left camera.
         body_from_camera_twist: (6, 6) adjoint that transforms a twist of the camera to the body.
         lever_arm_m: (3,) position of the camera in the body [m].
-        smoothing: weight of a new velocity in the moving average.
+        smoothing: weight of a new twist in the exponential moving average.
         twist: (6,) smoothed twist of the body [rad/s, m/s].
-        controller: state of the body's controller.
+        controller: state of the pose controller.
     """
 
     camera_from_body: Array
@@ -58,7 +58,7 @@ class PilotState(NamedTuple):
 
 
 class RovPilot:
-    """Pilot of the ROV; a command (8,) holds one value from -1 to 1 for each thruster."""
+    """Pilot of the ROV; a command (8,) has one value in [-1, 1] per thruster."""
 
     def __init__(self, mission: Mission):
         rig = mission.rig
@@ -80,7 +80,15 @@ class RovPilot:
 
 @njit(cache=True, nogil=True)
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
-    """Returns the thruster commands (8,) for an estimated pose (4, 4) and twist (6,) of the camera and a reference."""
+    """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
+
+    Args:
+        state: state of the pilot.
+        world_from_camera: (4, 4) estimated pose of the left camera.
+        camera_velocity: (6,) estimated twist of the left camera [rad/s, m/s].
+        position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].
+        yaw: reference yaw [rad].
+    """
     geometry.copy_into(
         state.twist,
         state.twist + state.smoothing * (state.body_from_camera_twist @ camera_velocity - state.twist),

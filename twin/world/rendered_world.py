@@ -22,7 +22,7 @@ from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
-    """World whose images are rendered by MuJoCo and lit by the optics of `twin.imaging`; owns an OpenGL context."""
+    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water. Owns a GL context."""
 
     def __init__(self, mission: Mission, stopwatch: StageTimer):
         scenario, cameras = mission.scenario, mission.true_cameras

@@ -26,10 +26,11 @@ if TYPE_CHECKING:
 
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
-#: Random streams in the order in which seeds are spawned: a stream added at the end leaves the others unchanged.
+#: Names of the random streams, in the order in which their seeds are spawned: a stream added at the end leaves the
+#: others unchanged.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
 
-#: Advances the closed loop from frame k of a course towards the next keyframe; returns the index of the next frame.
+#: Simulates frames of a course from index k, at most up to the next keyframe; returns the index of the next frame.
 FastForward = Callable[[Course, int], int]
 
 
@@ -50,7 +51,7 @@ class World(ABC):
     """The simulated world of a mission. Use as a context manager.
 
     Attributes:
-        warnings: limitations of this world that the user should know.
+        warnings: limitations of this world that the user should know about.
     """
 
     warnings: tuple[str, ...] = ()
@@ -86,11 +87,14 @@ class World(ABC):
 
     @property
     def world_from_camera(self) -> Array:
-        """(4, 4) true pose of the left camera."""
+        """Returns the true pose (4, 4) of the left camera."""
         return left_camera(self.vehicle, self.mission.rig)
 
     def start_course(self, course: Course, track: int) -> None:
-        """Starts a course, to which the next frames belong. The course is completed unless the survey is aborted."""
+        """Starts the next course (sequence of planned frames) of a track.
+
+        The caller must simulate all frames of a course before it starts another one, unless the survey is aborted.
+        """
         self._courses.append((course.reference.position, course.holding, track))
 
     def observe(self, step: Step) -> Frame:
@@ -116,9 +120,9 @@ class World(ABC):
         self._true_poses.append(poses)
 
     def fast_forward(self, navigator: Any, pilot: PilotOfEstimates) -> FastForward:
-        """Returns a function that advances the closed loop over frames without images.
+        """Returns a function that simulates frames between keyframes quickly, without images.
 
-        The function of this base class advances no frame; `SurrogateWorld` overrides it.
+        In this base class, the returned function simulates no frames; `SurrogateWorld` overrides the method.
 
         Args:
             navigator: the estimator in the loop.

@@ -1,12 +1,14 @@
 """Supernodal Cholesky factorisation of a sparse symmetric matrix of 6 x 6 blocks, and blocks of its inverse.
 
-Factorisation is right-looking (Davis 2006, chapter 4): a finished panel subtracts its outer product from the panels
-after it, so no memory is needed in addition to the panels. A finished panel stores L1^-1 above L2, where L1 is the
-lower triangle in the panel's own rows and L2 the rows below it.
+The columns are grouped into panels (see `elimination`). Factorisation is right-looking (Davis 2006, chapter 4): the
+outer product of a finished panel is subtracted from later panels, so no memory is needed in addition to the panels. A
+finished panel stores L1^-1 above L2, where L1 is the lower triangle in the panel's own rows, and L2 holds the nonzero
+rows below them.
 
-Blocks of the inverse follow Takahashi et al. (1973), from the last panel to the first. With W = L2 L1^-1,
-cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W. By then, all of cov(below) is stored in
-the later panels, where it has replaced the factor.
+Blocks of the inverse are computed from the last panel to the first (Takahashi et al. 1973). Let cov be the inverse,
+"own" the rows of the panel, "below" the rows of L2, and W = L2 L1^-1. Then cov(below, own) = -cov(below) W and
+cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold cov(below), which has replaced their part of the
+factor.
 
 In the kernels, s is the `SymbolicFactor`, p a panel and `_D` the size of a block.
 """
@@ -98,7 +100,7 @@ class BlockMatrix(NamedTuple):
         self.panels[:] = 0.0
 
     def add(self, first: int, blocks: Array) -> None:
-        """Adds blocks (k, 6, 6) to the off-diagonal blocks first, first + 1, ... in the order given to `analyse`."""
+        """Adds blocks (k, 6, 6) to the off-diagonal blocks `first` to `first` + k - 1, numbered as in `analyse`."""
         _add(self.symbolic, first, blocks, self.panels)
 
     def factorise(self, diagonal: Array) -> CholeskyFactor:
@@ -153,7 +155,7 @@ def _factorise(s, original, panels):
     """Replaces each panel by L1^-1 above L2. Returns False if the matrix is singular.
 
     Args:
-        original: (6 n,) diagonal entries of the matrix, by position.
+        original: (6 n,) diagonal entries of the matrix before elimination, by position.
     """
     for p in range(len(s.panel_start) - 1):
         n, panel = _D * (s.panel_start[p + 1] - s.panel_start[p]), _panel_matrix(s, panels, p)
@@ -175,11 +177,11 @@ def _factorise(s, original, panels):
 
 @njit(cache=True, nogil=True)
 def _invert_root(matrix, original, inverse):
-    """Computes the inverse of the Cholesky root of a dense matrix, row by row. Returns False if the matrix is singular.
+    """Inverts the lower Cholesky factor of a dense matrix, row by row. Returns False if the matrix is singular.
 
     Args:
         matrix: (n, n), only the lower triangle is read.
-        original: (n,) diagonal of the matrix before elimination; a pivot much smaller than this is rounding error.
+        original: (n,) diagonal of the matrix before elimination; a pivot much smaller than its entry is rounding error.
         inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
     root = np.zeros_like(matrix)
@@ -212,7 +214,7 @@ def _next_ancestor(s, positions, start):
         positions: (m,) positions below a panel, ascending.
 
     Returns:
-        end: positions[start:end] belong to the panel itself, the others are below it.
+        end: positions[start:end] are the panel's own positions; later ones are below the panel.
         panel: number of that panel.
         at: (m - start,) block row of each remaining position in that panel.
     """
@@ -235,7 +237,7 @@ def _subtract(product, at, panel):
     """Subtracts the lower triangle of `product` from a panel.
 
     Args:
-        product: (6 m, 6 w) blocks.
+        product: (6 m, 6 w), m x w blocks.
         at: (m,) block rows in the panel; the first w are also the block columns.
     """
     for b in range(len(at)):

@@ -1,8 +1,8 @@
 """Solution of a pose graph without initial poses, by chordal initialisation (Carlone et al. 2015).
 
-Integrated odometry is a poor initial value on a graph with large rotation errors. Chordal initialisation first solves
-R_j = R_i R_ij for unconstrained 3 x 3 matrices by linear least squares, replaces them by the nearest rotations, and
-then solves p_j = p_i + R_i t_ij for the positions.
+Integrated odometry gives poor initial poses for a graph with large rotation errors. Chordal initialisation uses the
+rotation R_ij and the translation t_ij of each link. It first solves R_j = R_i R_ij for unconstrained 3 x 3 matrices by
+linear least squares, replaces them by the nearest rotations, and then solves p_j = p_i + R_i t_ij for the positions.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ANCHOR_SIGMA = 1e-6  # prior standard deviation of the first pose [rad, m]
 
 
 class PoseGraphSolution(NamedTuple):
-    """Optimal poses (4, 4) by node number, and the cost F at the optimum."""
+    """Optimal poses (4, 4) by node number, and their cost F as defined in `pose_graph`."""
 
     poses: dict[int, Array]
     cost: float
@@ -60,8 +60,8 @@ def solve_pose_graph(
 def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
     """Returns initial poses (4, 4) by node number, computed from the links alone.
 
-    The pose of the node with the lowest number is the identity. Links are weighted by the inverse of their mean
-    rotation variance and mean translation variance.
+    The pose of the node with the lowest number is the identity. A link is weighted by the inverse of its mean rotation
+    variance in the equations of the rotations, and of its mean translation variance in those of the positions.
     """
     columns = Links.from_sequence(links)
     numbers = np.unique(np.concatenate([columns.i, columns.j])).tolist()

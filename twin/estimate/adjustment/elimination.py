@@ -1,7 +1,7 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
-The order is SuperLU's multiple minimum degree on A' + A. Consecutive nodes of that order with nearly the same sparsity
-pattern below the diagonal form a supernode, which is stored as one dense matrix of their columns, a panel.
+The elimination order is SuperLU's multiple minimum degree order of A' + A. Consecutive nodes whose columns have nearly
+the same sparsity pattern below the diagonal form a supernode. Its columns are stored as one dense matrix, a panel.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ class SymbolicFactor(NamedTuple):
         permutation: (n,) position of each node.
         panel_start: (s + 1,) panel p holds the positions panel_start[p] to panel_start[p + 1] - 1.
         row_start, rows: the positions below panel p are rows[row_start[p] : row_start[p + 1]], ascending.
-        offset: (s + 1,) start of each panel in one long array; a panel is row-major, (own + below, own) blocks.
+        offset: (s + 1,) start of each panel in one long array; a panel is a row-major matrix whose rows are the panel's
+            own positions and those below it, and whose columns are its own positions.
         panel_of: (n,) panel of each position.
         off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
-        transposed: (m,) true where a block has to be transposed because its nodes are eliminated in reverse order.
+        transposed: (m,) true where block (i, j) has to be transposed because node i is eliminated before node j.
     """
 
     permutation: Indices
@@ -121,10 +122,10 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 
 @njit(cache=True, nogil=True)
 def _fill_in(n, start, later):
-    """Returns the rows of each column of the factor, fill-in included (Davis 2006, chapter 4).
+    """Returns the nonzero rows below the diagonal of each column of the factor (Davis 2006, chapter 4).
 
-    The rows of column k are below[at[k] : at[k + 1]], ascending: its own later neighbours, later[start[k] :
-    start[k + 1]], and the rows of its children in the elimination tree except k itself.
+    The rows of column k are below[at[k] : at[k + 1]], ascending. They are the later neighbours of node k in the matrix,
+    later[start[k] : start[k + 1]], and the rows of the children of k in the elimination tree except k (the fill-in).
 
     Returns:
         The arrays `at` (n + 1,) and `below`.

@@ -1,12 +1,13 @@
 """Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
-The cost is F(X) = sum over motions of rho(|log(Z_ij^-1 X_i^-1 X_j)|), with the residual whitened by the covariance of
-the measured motion Z_ij, plus the cost of factors of single poses. rho(r) is r^2 / 2 or Huber's loss. F is minimised
-by Gauss-Newton, with Levenberg-Marquardt damping after a step that increased the cost. Increments of poses are motions
-in the camera's own axes, X exp(d).
+The cost of the poses X is F(X) = sum over motions of rho(|log(Z_ij^-1 X_i^-1 X_j)|), where the residual is whitened by
+the covariance of the measured motion Z_ij, plus r^2 / 2 for each factor of a single pose with whitened residual norm r.
+rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt damping after a step that
+increased the cost. The increment d of a pose is a motion in the camera's own axes, X exp(d).
 
-One scalar parameter may be shared by all binary factors (the scale error of the DVL). It borders the normal equations
-of the poses by one row and column, which are eliminated by the Schur complement.
+One scalar parameter may be shared by all binary factors (the scale error of the DVL). It adds one row and one column,
+the border, to the normal equations of the poses. The bordered system is solved by the Schur complement of the block of
+the poses.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from twin.core.links import Link, Links, symmetric_inverses
 from twin.estimate.adjustment import block_cholesky, elimination
 from twin.estimate.adjustment.elimination import Indices
 
-#: A step that raises the cost by more than this is rejected. The search ends when the decrease by an undamped step
-#: agrees with the prediction of the linear model to this tolerance. The next step could then lower the cost by about
-#: this amount, which moves no pose by more than 0.05 of its standard deviation.
+#: A step that increases the cost by more than this is rejected. The iteration ends when the decrease of the cost by an
+#: undamped step agrees with the prediction of the linear model to this tolerance. The next step could then decrease the
+#: cost by about this amount, and would move no pose by more than 0.05 of its standard deviation.
 _COST_TOLERANCE = 5e-4
 _INITIAL_DAMPING, _MIN_DAMPING = 1e-4, 1e-6  # relative to the diagonal
-_BATCH = 4096  # binary factors whose Jacobians are in memory at a time
+_BATCH = 4096  # number of binary factors whose Jacobians are in memory at the same time
 
 
 class UnaryFactors(NamedTuple):
@@ -110,7 +111,7 @@ class _Evaluation(NamedTuple):
 
 
 class _NormalEquations(NamedTuple):
-    """Normal equations without the off-diagonal blocks of the poses.
+    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`.
 
     Args:
         diagonal: (n, 6, 6) diagonal blocks.
@@ -136,8 +137,8 @@ class Solution(NamedTuple):
         chi2: (m,) squared norms of the whitened residuals of each kind of binary factors, without robust weights.
         converged: false if the iterations ended before the minimum was reached.
         cholesky: factor of the normal matrix of the poses, undamped.
-        border: (n, 6) derivative of the poses with respect to the shared parameter, and the marginal information of
-            that parameter; None if there is no shared parameter.
+        border: (n, 6) derivative of the optimal poses with respect to the shared parameter, and the marginal
+            information of the shared parameter; None if there is no shared parameter.
     """
 
     state: GraphState
@@ -159,7 +160,7 @@ class Solution(NamedTuple):
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
     def _add_shared(self, covs: Array, rows: slice) -> Array:
-        """Adds to the covariances of the poses `rows` the part due to the uncertainty of the shared parameter."""
+        """Returns the covariances of the poses `rows` plus the part due to the uncertainty of the shared parameter."""
         if self.border is None:
             return covs
         by_shared, information = self.border
@@ -192,7 +193,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
             damping = max(10 * damping, _INITIAL_DAMPING)
         if converged or max_iterations <= 0:
             break
-    if step.damping:  # marginal covariances are those of the undamped equations
+    if step.damping:  # marginal covariances follow from the undamped equations
         step = _solve(matrix, _linearise(graph, current, matrix), 0.0)
     return Solution(current.state, current.cost, current.chi2, converged, step.cholesky, step.border)
 
@@ -215,7 +216,7 @@ class _Step(NamedTuple):
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
-    """Solves the bordered normal equations by the Schur complement of the corner. Overwrites the matrix."""
+    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites the matrix."""
     diagonal = equations.diagonal
     if damping:
         axes = np.arange(6)
@@ -295,9 +296,9 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
 
 @njit(cache=True, nogil=True)
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
-    """Adds the normal equations of binary factors to the diagonal blocks and the gradient of both poses.
+    """Adds the contributions of binary factors to the diagonal blocks and gradients of both poses.
 
-    The Jacobian with respect to the increment of pose i is that of pose j times -Ad(j_from_i).
+    The Jacobian J_i with respect to the increment of pose i is computed from that of pose j: J_i = -J_j Ad(j_from_i).
 
     Args:
         off_diagonal: (m, 6, 6), filled with the blocks (i, j).

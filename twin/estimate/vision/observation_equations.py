@@ -1,8 +1,8 @@
 """Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity is divided by f too, so that
-depth = baseline / disparity. A keyframe with five links needs 30 solutions with 500 points each, so the
-functions are compiled.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity is also divided by f, so
+depth = baseline / disparity. The functions are compiled, because a keyframe with five links needs 30 least-squares
+solutions (six iterations per link) with 500 points each.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class LinearisedObservations(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def image_jacobian(x, y, depth):
-    """Returns the Jacobian of image position with respect to the twist [w, t] (Negahdaripour & Madjidi 2003, eq. 1).
+    """Returns the Jacobian of normalised image positions with respect to the twist of the camera [w, t] (rad, m).
+
+    This is eq. 1 of Negahdaripour & Madjidi 2003.
 
     Args:
         x, y: (n,) normalised image coordinates.
@@ -188,8 +190,8 @@ def motion_normal_equations(observations, weight):
         weight: (n,) robust weights; points of weight 0 are skipped.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), and derivative of the right-hand side (6, 3) with respect to
-        a bias that all points share.
+        Normal matrix (6, 6), right-hand side (6,), and derivative (6, 3) of the right-hand side with respect to
+        a bias in (x, y, disparity) that all points share.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     normal, right, bias_jacobian = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))
@@ -216,11 +218,11 @@ def motion_normal_equations(observations, weight):
 
 @njit(cache=True, nogil=True)
 def adjust_structure(observations, measured, twist):
-    """Returns the adjusted points (n, 3) in b after an update of the motion by `twist` (6,).
+    """Returns the adjusted points (n, 3) in b, normalised (x, y, disparity), after the motion is updated by a twist.
 
     Args:
         observations: `LinearisedObservations`.
-        measured: `PairMeasurements` that the observations were linearised from.
+        measured: `PairMeasurements` from which `observations` were computed.
         twist: (6,) solution of the motion's normal equations.
     """
     b, cov_b = measured.b, measured.cov_b

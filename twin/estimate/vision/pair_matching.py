@@ -1,4 +1,4 @@
-"""Measurement of a link: matches the points of a keyframe in an earlier stereo pair and estimates the motion."""
+"""Measurement of a link: matches points of a keyframe in an earlier keyframe and estimates the motion between them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.observation_equations import PairMeasurements
 
-_LEVELS = 2  # pyramid levels above the full image: predictions may be wrong by 8 px
+_LEVELS = 2  # pyramid levels above the full image; predicted positions may be wrong by 8 px
 
 
 class PairMatcher:
     """Matches a node with earlier nodes and estimates the motions between them.
 
     Args:
-        rig: calibration at the scale of the spooled grey levels.
+        rig: calibration at the image scale of the grey levels in `spool`.
         spool: images of the keyframes.
         patch_px: side of the matched patches (odd).
     """
@@ -38,11 +38,11 @@ class PairMatcher:
         self._workers.shutdown()
 
     def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[PairMeasurements | None]:
-        """Matches the node's points in both images of each other pair, two pairs at a time.
+        """Matches the points of a node in both images of each of the other nodes; two nodes are matched in parallel.
 
         Returns:
-            Per other node, the points measured in its pair (a) and in the pair of `node` (b); None for all if the node
-            has no points.
+            For each of the other nodes, the points measured in its stereo pair (a) and in that of `node` (b); None for
+            every node if `node` has no points.
         """
         points = node.points
         if points is None:
@@ -58,9 +58,10 @@ class PairMatcher:
         templates: Sequence[patches.PatchTemplates],
         other: Keyframe,
     ) -> PairMeasurements:
-        """Returns the points that are matched in both images of another pair.
+        """Returns the points that were matched in both images of another node.
 
-        Matching starts at the positions predicted from poses and depth, with each patch warped by the plane under it.
+        Matching starts at positions predicted from the poses and the depth. Each patch is warped according to a plane
+        fitted to the disparities around its point.
         """
         rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
@@ -81,7 +82,7 @@ class PairMatcher:
         return PairMeasurements(measured, points.measured[ok], measured_cov, points.cov[ok])
 
     def _in_view(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
-        """Returns which points (n,) have their patch well inside both images of the other pair."""
+        """Returns a mask (n,) of the points whose patches are predicted well inside both images of the other node."""
         smoothed = np.column_stack([points.measured[:, :2], points.mean_disparity_px / self.rig.focal_px])
         expected, _, _ = observation_equations.transfer(smoothed, other_from_node, self.rig.baseline_m)
         left_px, shift_px = self._project(expected)
@@ -89,15 +90,15 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns the left pixels (n, 2) of normalised points (n, 3), and the displacements (n, 2) to the right image.
+        """Returns the positions (n, 2) of normalised points (n, 3) in the left image, and (disparity, 0) (n, 2) [px].
 
-        A displacement is (disparity, 0) [px]; it is subtracted from the left pixel.
+        The position in the right image is the first minus the second.
         """
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
     def motion(self, node: Keyframe, other: Keyframe, measured: PairMeasurements) -> two_view_motion.Motion | None:
-        """Estimates the pose of `node` in `other` from their matched points, jointly with the structure.
+        """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure.
 
         The estimate starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the predicted poses if
         the closed form fails.

@@ -2,18 +2,19 @@
 
 Systematic errors of patch matching, measured against the simulated truth, and their remedies here:
 
-- A patch shows a slanted surface, so it appears sheared in another camera. Matched as a square, it covers a different
-  part of the floor there and averages other relief (0.4 mrad between legs with patches of 21 px). The patch is
-  therefore warped by the plane that stereo measures under it, so that all images are matched over the same support.
-- The lamps move with the vehicle. A change of illumination across the patch shifts a match by about the squared
-  correlation length of the texture times the gradient of the change (0.01 px on a lamp-lit reef, always backwards). A
-  ramp of brightness and a ramp of contrast are therefore projected out.
-- Interpolation biases the sub-pixel position: 0.014 px with cubic convolution on a rendered reef. Cubic B-splines leave
-  0.0055 px on waves of 2.5 px and longer, and 0.004 px on slightly smoothed images (`matching.gray`).
-- Images normalised by their surroundings (`matching.normalise`) depend on the position in the image: near the border,
-  where the window is cut off, the matching error is 0.015 px over coarse texture, and each leg tilts by 0.3 mrad
-  relative to the next leg. Grey levels are therefore matched as they are; brightness and contrast are nuisance
-  parameters anyway.
+- A patch on a slanted surface appears sheared in another camera. A square window in that image covers a different part
+  of the floor with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
+  is therefore warped by the plane that stereo measures around its point, so that it covers the same part of the floor
+  in all images.
+- The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
+  the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
+  change (0.01 px on a lamp-lit reef, always backwards). Linear gradients of brightness and of contrast over the patch
+  are therefore nuisance parameters too.
+- Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. Cubic B-splines
+  leave 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images (`matching.gray`).
+- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
+  cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
+  Grey levels are therefore matched without normalisation; brightness and contrast are nuisance parameters anyway.
 
 Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
 fine, with cubic B-spline interpolation (Unser 1999).
@@ -37,25 +38,25 @@ Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _CONVERGED_PX = 0.002
-_COARSE_CONVERGED_PX = 0.1  # sufficient if a finer level follows
+_COARSE_CONVERGED_PX = 0.1  # convergence limit at the coarse levels, as a finer level follows
 _MAX_SHIFT_PX = 3.0
 _MIN_CORRELATION = 0.7  # patches of different floor rarely correlate by more than 0.5
-_NOISE_LOSS = 1.2  # interpolation smooths a third of the target's noise out of the residual, not out of the error
+_NOISE_LOSS = 1.2  # 2 / (1 + 2/3): interpolation hides a third of the target's noise variance in the residual
 _REASSOCIATE = {"reassoc", "contract", "nsz"}  # fastmath flags that let sums be vectorised
-_NUISANCES = 6  # brightness and contrast, and a ramp of each in both directions
+_NUISANCES = 6  # brightness, contrast, and the linear gradients of both along columns and rows
 
 
 class PatchTemplates(NamedTuple):
     """n patches of one image, prepared for matching, with m pixels each.
 
     Args:
-        half: half the side of a patch without its middle pixel: (side - 1) / 2 [px].
-        offset: (n, 2) patch centre minus the point that it represents [px of the full image].
+        half: half side of a patch, (side - 1) / 2 [px].
+        offset: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
         energy: (n,) sum of squared deviations from the patch's mean; 0 if the patch cannot be matched, because it is
             too uniform or extends beyond the image.
         gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
-        nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness and contrast, and a ramp of each in
-            both directions.
+        nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
+            of both along columns and rows.
     """
 
     half: int
@@ -70,9 +71,9 @@ class PatchMatches(NamedTuple):
 
     Args:
         points: (n, 2) positions in the target [px].
-        ok: (n,) bool, true if the match converged and correlates with the template.
-        cov: (n, 2, 2) covariance of a patch's position in one image, in pixels of the source [px^2], from the texture
-            of the patch and the noise in the difference of both images.
+        ok: (n,) bool, true if the match converged and its correlation with the template is high enough.
+        cov: (n, 2, 2) covariance of the position due to the noise of one of the two images, half that due to both, in
+            the axes of the source image [px^2]; estimated from the texture of the patch and the residual.
     """
 
     points: Array
@@ -121,12 +122,12 @@ def spline_coefficients(images: Sequence[Image]) -> list[Spline]:
 def match_templates(
     templates: Sequence[PatchTemplates], target: Sequence[Spline], guess: NDArray[np.floating], warp: Array
 ) -> PatchMatches:
-    """Matches patches of one image in another, from the coarsest level that both have down to the full image.
+    """Matches patches of one image in another, from the coarsest level of both pyramids down to the full image.
 
     Args:
         templates: patches per pyramid level (`extract_templates`).
         target: spline coefficients per pyramid level (`spline_coefficients`).
-        guess: (n, 2) expected positions in the target [px]; correct to about two pixels of the coarsest level.
+        guess: (n, 2) expected positions in the target [px]; accurate to about two pixels of the coarsest level.
         warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
     """
     points = guess.astype(np.float64)
@@ -139,7 +140,7 @@ def match_templates(
         centres, correlation, cov = _match(energy, gradient, nuisance, target[level], start, warp, half, tolerance)
         matched = correlation > _MIN_CORRELATION
         shift = centres * scale - offset - points
-        if level and matched.any():  # the patches cut off by the border probably have the same shift
+        if level and matched.any():  # unmatched patches, e.g. those cut off by the border, probably have the same shift
             shift[~matched] = np.median(shift[matched], axis=0)
             matched[:] = True
         points[matched] += shift[matched]
@@ -147,15 +148,15 @@ def match_templates(
 
 
 def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floating], patch_px: int) -> Array:
-    """Returns the slope of the plane through a disparity map under each patch.
+    """Returns the disparity gradient over each patch: the slope of a plane fitted to the disparities.
 
     Args:
-        disparity_px: (height, width), NaN where unknown.
+        disparity_px: (height, width) disparity map [px], NaN where unknown.
         points: (n, 2) whole pixels inside the map.
         patch_px: side of the patch.
 
     Returns:
-        (n, 2) slope with respect to column and row [px/px]; 0 where it is unknown.
+        (n, 2) derivative of the disparity with respect to column and row [px/px]; 0 where it is unknown.
     """
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 
@@ -261,7 +262,7 @@ def _prepare(source, u0, v0, half, rows):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_REASSOCIATE)
 def _dot(a, b):
-    """Returns the dot product, summed in double precision."""
+    """Returns the dot product of two vectors, summed in double precision."""
     total = 0.0
     for m in range(len(a)):
         total += float(a[m]) * float(b[m])
@@ -354,7 +355,7 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
         if converged and abs(u - guess[k, 0]) + abs(v - guess[k, 1]) < _MAX_SHIFT_PX:
             points[k, 0], points[k, 1] = u, v
             correlation[k] = similarity
-            variance = _NOISE_LOSS * noise / (n - _NUISANCES - 2) / 2 / det  # of one image: half that of the difference
+            variance = _NOISE_LOSS * noise / (n - _NUISANCES - 2) / 2 / det  # due to one image: half that due to both
             cov[k, 0, 0], cov[k, 1, 1] = variance * hvv, variance * huu
             cov[k, 0, 1] = cov[k, 1, 0] = -variance * huv
     return points, correlation, cov

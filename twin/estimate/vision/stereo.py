@@ -13,7 +13,7 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, patches
 
 _EPIPOLAR_PX = 1.0
-_BORDER_PX = 4  # two pixels for interpolation, and two that exceed the matching error
+_BORDER_PX = 4  # two pixels for interpolation and two for matching errors, which are smaller
 _MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
 
 
@@ -22,9 +22,9 @@ class StereoPoints(NamedTuple):
 
     Args:
         pixels: (n, 2) whole pixels in the left image.
-        disparity_slope: (n, 2) slope of the disparity around each point, with respect to column and row [px/px].
-        mean_disparity_px: (n,) mean disparity around each point [px]. It is free of the point's own noise and predicts
-            whether another image shows the point.
+        disparity_slope: (n, 2) derivative of the disparity around each point with respect to column and row [px/px].
+        mean_disparity_px: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of
+            the point and is used to predict whether the point lies inside another image.
         measured: (n, 3) normalised (x, y, disparity).
         cov: (n, 3, 3) covariance of each point in `measured`.
         xyz: (n, 3) positions in the left camera [m].
@@ -48,13 +48,13 @@ class StereoPoints(NamedTuple):
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
 
-    Disparity is the difference of two columns, one of which is x, so x and
-    disparity are correlated. The difference in row must be zero; this constraint is applied as a Kalman update, which
-    also corrects the columns where `cov` correlates them with the rows.
+    The left column determines x and is also part of the disparity, so x and disparity are correlated. The rows of both
+    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if their
+    errors are correlated with those of the rows.
 
     Args:
         left, right: (n, 2) positions [px].
-        cov: (n, 2, 2) covariance of a position in either image [px^2].
+        cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
         rig: calibration.
 
     Returns:
@@ -71,24 +71,24 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 
 
 def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Returns which matches (n, 2) [px] are possible in a rectified pair: equal rows, positive disparity."""
+    """Returns a mask (n,) of the matches (n, 2) [px] with equal rows, to within 1 px, and positive disparity."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
 def margin_px(patch_px: int) -> int:
-    """Returns the smallest accepted distance of a patch's expected centre from the image border [px]."""
+    """Returns the minimum distance of an accepted patch's predicted centre from the image border [px]."""
     return patch_px // 2 + _BORDER_PX
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
-    """Returns which patches lie so far inside the image that matching errors cannot move them out.
+    """Returns a mask (n,) of the patches so far inside the image that matching errors cannot move them out of it.
 
-    The test must use expected positions that are independent of the matching noise. A test of the measured positions
-    selects matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
-    it biased disparities at the border by -0.02 px and links over two keyframes by 0.16 mrad.
+    The test needs predicted positions that are independent of the matching errors. A test of the measured positions
+    prefers matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
+    this biased disparities near the border by -0.02 px and links over two keyframes by 0.16 mrad.
 
     Args:
-        pixels: (n, 2) expected patch centres [px].
+        pixels: (n, 2) predicted patch centres [px].
         rig: calibration, for the image size.
         patch_px: side of the patch.
     """
@@ -98,7 +98,7 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns well-textured whole pixels (n, 2) of the left image and their disparity (n,) [px] in a dense map."""
+    """Returns corners of the left image (n, 2), at whole pixels, and their disparities (n,) in a dense map [px]."""
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
@@ -119,7 +119,7 @@ def match_stereo_points(
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration.
-        count: largest number of corners.
+        count: maximum number of corners.
         patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
@@ -138,7 +138,7 @@ def match_stereo_points(
 
 
 def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
-    """Returns the mean of the known values of a disparity map (H, W) in the square around each pixel."""
+    """Returns the mean of the known disparities in a square around each pixel (H, W); 0 if none is known [px]."""
     known = np.isfinite(dense_px)
     total, count = (
         cv2.boxFilter(part, cv2.CV_32F, (side_px, side_px), normalize=False)

@@ -1,4 +1,4 @@
-"""Unbounded raster in square tiles: the most recently used tiles in memory, the others on disk."""
+"""Unbounded raster in square tiles: the most recently used tiles are kept in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class TiledRaster:
     Args:
         n_layers: number of values per cell.
         folder: folder of the tiles on disk; created when needed.
-        max_tiles: largest number of tiles in memory.
+        max_tiles: maximum number of tiles in memory.
     """
 
     def __init__(self, n_layers: int, folder: Path, max_tiles: int = _MAX_TILES):
@@ -75,7 +75,7 @@ class TiledRaster:
 def _overlapping_tiles(
     row: int, col: int, rows: int, cols: int
 ) -> Iterator[tuple[tuple[int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Yields, per tile that overlaps a window: its key, and the overlap as slices of the tile and of the window."""
+    """Yields the key of each tile that overlaps a window, and the overlap as slices of the tile and of the window."""
     for i in range(row // TILE_SIDE, -(-(row + rows) // TILE_SIDE)):
         for j in range(col // TILE_SIDE, -(-(col + cols) // TILE_SIDE)):
             top, left = max(row, i * TILE_SIDE), max(col, j * TILE_SIDE)

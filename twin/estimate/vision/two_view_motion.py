@@ -1,4 +1,4 @@
-"""Camera motion from flow and known depth, and jointly with structure from two stereo pairs.
+"""Estimation of camera motion: from flow with known depth, or jointly with the structure from two stereo pairs.
 
 A motion is the pose of the later camera in the earlier one, or its twist [w, t] (rad, m). Coordinates are normalised as
 in `observation_equations`. Equation numbers are those of Negahdaripour & Madjidi 2003.
@@ -33,8 +33,8 @@ class Motion(NamedTuple):
         a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
         cov: (6, 6) covariance of the motion [rotation, translation], in the axes of b (rad, m).
         n_points: number of inliers.
-        residual: robust scale of the residuals, in the units of the measurements, or relative to their expected
-            standard deviation (`pair_motion`).
+        residual: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), or divided by
+            its expected value (`pair_motion`).
         closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
             None if it started from another motion.
     """
@@ -47,14 +47,14 @@ class Motion(NamedTuple):
 
 
 class PairMotionSettings(NamedTuple):
-    """Stochastic model and iterations of `pair_motion`.
+    """Stochastic model and number of iterations of `pair_motion`.
 
     Args:
         common_sigma: standard deviation of a bias that all points share in each of x, y and disparity, normalised. Its
             effect does not average out over the points.
         variance_inflation: factor on the covariance for correlated points (`matching.variance_inflation`).
-        n_measured: number of coordinates that pair a measures per point: 3, or 2 if its disparity is unknown and has a
-            large variance in `cov_a`.
+        n_measured: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has
+            a large variance in `cov_a`.
         iterations: number of Gauss-Newton iterations.
     """
 
@@ -84,7 +84,7 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
 
 
 def frame_motion(points: Array, observed: Array, guess: Array, iterations: int = 4) -> Motion | None:
-    """Estimates the motion from points and their projections in the next frame.
+    """Estimates the motion from 3-D points in one camera and their image positions in the next frame.
 
     Iterates eq. (2) of Negahdaripour & Madjidi 2003 with Huber weights.
 
@@ -95,7 +95,7 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
         iterations: number of Gauss-Newton iterations.
 
     Returns:
-        The motion, or None if there are too few inliers.
+        The motion, or None if there are too few inliers or a point is behind the later camera.
     """
     if len(points) < _MIN_POINTS:
         return None
@@ -117,10 +117,10 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
 
 
 def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
-    """Estimates the motion between two stereo pairs with the depth of the later pair b taken as exact.
+    """Estimates the motion between two stereo pairs with the depth from the later pair b taken as exact.
 
     This is the closed form of Negahdaripour & Madjidi 2003 (eq. 2), iterated with Huber weights. It is fast, but
-    biased by the noise of the depth; the disparity in the earlier pair a is not used.
+    depth errors bias the estimate; the disparity in the earlier pair a is not used.
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
@@ -128,7 +128,7 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
         guess: (4, 4) initial pose of b in a.
 
     Returns:
-        (4, 4) pose of b in a, or None if there are too few inliers.
+        (4, 4) pose of b in a, or None if there are too few inliers or a point is behind camera a.
     """
     points = np.column_stack([b[:, :2], np.ones(len(b))]) * baseline_m / b[:, 2:]
     motion = frame_motion(points, a[:, :2], geometry.inverse(guess))
