@@ -24,17 +24,17 @@ from twin.estimate.alignment import AlignmentResult, align
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision_interface import Vision
 
-_REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the frame
+_REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
 _FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are fixed
-_START_NODES = 4  # first nodes, which stay in the window because loops return to the reference position
-_MOST_PENDING = 8  # largest number of nodes whose links are still being measured
+_START_NODES = 4  # number of first nodes; always link candidates, because loops return to the reference position
+_MOST_PENDING = 8  # largest number of nodes with link measurements in progress
 
 
 class LinkQueue:
-    """Link measurements in progress, in the order of their nodes.
+    """Queue of link measurements, in the order of their nodes.
 
     Args:
-        background: whether links are measured in a separate thread, which is faster with images; otherwise `collect`
+        background: true to measure links in a separate thread, which is faster with images; otherwise `collect`
             measures them.
     """
 
@@ -43,14 +43,14 @@ class LinkQueue:
         self._pending: deque[Callable[[], list[Link]]] = deque()
 
     def submit(self, measure: Callable[[], list[Link]]) -> None:
-        """Adds the measurement of the links of one node; `measure` returns these links."""
+        """Adds one node; `measure` is a function that measures and returns its links."""
         self._pending.append(self._executor.submit(measure).result if self._executor else measure)
 
     def collect(self, all_but: int = 0) -> Iterator[list[Link]]:
-        """Yields the links of the oldest nodes until at most `all_but` nodes are pending.
+        """Yields the links of one node at a time, oldest first, until at most `all_but` nodes are pending.
 
         Raises:
-            OSError: images could not be read or written; the measurements that are still pending are dropped.
+            OSError: images could not be read or written; all pending measurements are dropped.
         """
         while len(self._pending) > all_but:
             try:
@@ -73,8 +73,8 @@ class AlignmentHistory:
     """Record of the global alignments so far.
 
     Attributes:
-        alignments: cost and size of each alignment.
-        dropped: links rejected as outliers.
+        alignments: duration and size of each alignment.
+        dropped: links rejected as outliers by any alignment.
         before_ga: per track, positions (n, 3) of the keyframes just before the alignment of the track [m].
         after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
     """
@@ -89,7 +89,7 @@ class KeyframeNetwork:
     """Keyframes of a survey, the nodes among them, and the measured motions that link the nodes.
 
     Args:
-        vision: source of the visual measurements, which measures the links.
+        vision: source of the visual measurements, including the links.
         rig: believed calibration.
         noise: believed noise of the navigation sensors.
         settings: settings of the estimators.
@@ -118,7 +118,7 @@ class KeyframeNetwork:
         return np.array([k.world_from_camera for k in self.keyframes]).reshape(-1, 4, 4)
 
     def add(self, keyframe: Keyframe) -> None:
-        """Adds a keyframe; only the newest keyframe keeps its matched points in memory."""
+        """Adds a keyframe, and releases the matched points of the previous keyframe."""
         if self.keyframes:
             self.keyframes[-1].points = None  # links start from the points of the newer node
         self.keyframes.append(keyframe)
@@ -128,7 +128,7 @@ class KeyframeNetwork:
         return keyframe.number % self.settings.node_stride == 0
 
     def overlap_with_last(self, world_from_camera: Array) -> float:
-        """Returns the predicted overlap of the image at a pose (4, 4) with the last keyframe, 0 to 1."""
+        """Returns the predicted overlap, 0 to 1, of the last keyframe with the image at a pose (4, 4)."""
         last = self.keyframes[-1]
         poses = np.ascontiguousarray(world_from_camera[None])
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
@@ -146,13 +146,13 @@ class KeyframeNetwork:
     def connect(
         self, node: Keyframe, chain: Link | None, bridge: Link | None, displacement: Displacement | None
     ) -> None:
-        """Adds a node and links it to earlier ones; the links are measured in the background.
+        """Adds a node and queues the measurement of its links to earlier nodes.
 
         Args:
             node: the new node.
-            chain: measured motion from the last node.
-            bridge: F2F motion from the last node; used where `chain` could not be measured.
-            displacement: displacement since the last node, measured by the DVL.
+            chain: measured link from the last node; None if the measurement failed or this is the first node.
+            bridge: link from the last node by the F2F motion, which replaces a failed `chain`; otherwise None.
+            displacement: displacement since the last node, measured by the DVL; None if it was not measured.
         """
         s = self.settings
         with self.stopwatch("network"):
@@ -165,17 +165,18 @@ class KeyframeNetwork:
         # a copy, because the points of the node are released before its links are measured
         self._queue.submit(partial(self._links_of, replace(node), others, chain, bridge))
         self._collect_links(all_but=_MOST_PENDING)
-        node.dvl_displacement = displacement if chain else None  # otherwise the F2F motion includes it
+        node.dvl_displacement = displacement if chain else None  # `bridge` already includes it
         self.nodes.append(node)
         if len(self.nodes) > len(self._node_poses):
             self._node_poses = np.concatenate([self._node_poses, np.empty_like(self._node_poses)])
         self._node_poses[len(self.nodes) - 1] = node.world_from_camera
 
     def align_window(self, track: int) -> Array | None:
-        """Aligns the window of tracks that ends with this track, and rebuilds the mosaic from this track.
+        """Aligns the window of tracks that ends with `track`, and rebuilds the mosaic from the keyframes of `track`.
 
         Returns:
-            (6, 6) marginal covariance of the pose of the last node, in its camera axes; None if nothing was aligned.
+            (6, 6) marginal covariance of the pose of the last node [rotation, translation] (rad, m), in its camera
+            axes; None if the global alignment is switched off or there are fewer than two nodes.
         """
         if not self.settings.use_ga or len(self.nodes) < 2:
             return None
@@ -195,7 +196,8 @@ class KeyframeNetwork:
         """Aligns all nodes.
 
         Returns:
-            (n_keyframes, 6, 6) marginal covariance of the pose of each keyframe's node; None if nothing was aligned.
+            (n_keyframes, 6, 6) marginal covariance, for each keyframe, of the pose of the latest node up to this
+            keyframe; None if the global alignment is switched off or failed before, or with fewer than two nodes.
 
         Raises:
             SurveyAborted: the alignment failed; a second call returns None.
@@ -208,7 +210,7 @@ class KeyframeNetwork:
         return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
 
     def truncate(self, n_frames: int) -> None:
-        """Drops the keyframe of a frame that was interrupted, so that only the first `n_frames` frames are recorded."""
+        """Removes keyframes, nodes and links after the first `n_frames` frames, such as those of an aborted frame."""
         self._collect_links()
         self.keyframes = [k for k in self.keyframes if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
@@ -217,14 +219,14 @@ class KeyframeNetwork:
     def _links_of(
         self, node: Keyframe, others: list[tuple[Keyframe, float]], chain: Link | None, bridge: Link | None
     ) -> list[Link]:
-        """Returns all links of one new node."""
+        """Returns all links of one new node; the covariances of its measured links are inflated for shared noise."""
         measured = self._measure(node, others)
         return link_selection.inflate_for_shared_noise([*measured, chain] if chain else measured) + (
             [bridge] if bridge else []
         )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Measures the links from earlier nodes, given with their overlaps; returns those that succeeded."""
+        """Measures the links from earlier nodes, given with their overlaps; returns those that could be measured."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         return [
             link_selection.to_link(node, other, overlap, motion)
@@ -233,10 +235,10 @@ class KeyframeNetwork:
         ]
 
     def _collect_links(self, all_but: int = 0) -> None:
-        """Adds the measured links of the oldest pending nodes, until at most `all_but` nodes are pending.
+        """Adds the links of pending nodes to the network, oldest first, until at most `all_but` nodes are pending.
 
         Raises:
-            OSError: images could not be read or written; the incomplete network is not aligned any more.
+            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
         """
         try:
             for links in self._queue.collect(all_but):
@@ -246,8 +248,18 @@ class KeyframeNetwork:
             raise
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
-        """Aligns the last nodes; older nodes linked to them are fixed. Keyframes between nodes keep their pose relative
-        to the node before them.
+        """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
+
+        Older nodes that are linked to them are fixed. Keyframes between nodes keep their pose relative to the node
+        before them. Links rejected as outliers are removed from the network.
+
+        Args:
+            nodes: nodes to align, in the order of time, up to the newest node.
+            track: number of the track, for the record.
+            marginals: numbers of the nodes whose marginal covariances are computed; None for all nodes.
+
+        Raises:
+            SurveyAborted: the alignment failed.
         """
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)
@@ -272,7 +284,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets new poses of nodes by number; keyframes between nodes keep their pose relative to the node before."""
+        """Sets the poses of nodes, by number; keyframes between nodes keep their pose relative to the node before."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

@@ -1,7 +1,7 @@
 """Navigation pipeline, after Negahdaripour & Madjidi 2003.
 
 Frame-to-frame motion (F2F) is estimated at every frame. Stereo matching, registration with the mosaic (F2M) and the
-measurement of links follow at keyframes, the global alignment (GA) at the end of a track.
+measurement of links are done at keyframes, and the global alignment (GA) at the end of each track.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from twin.estimate.vision_interface import Vision
 
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
 _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
-_F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # resampling error of the mosaic [rad, m]
+_F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # standard deviation due to resampling in the mosaic [rad, m]
 _SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
 
 
@@ -43,7 +43,7 @@ class MotionSinceNode(NamedTuple):
     """Motion since the last node of the network.
 
     Args:
-        motion: (4, 4) pose of the present camera in the camera of the node.
+        motion: (4, 4) pose of the camera at the current frame in the camera at the node.
         cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m).
         cov_at_node: (6, 6) covariance of the online pose at the node.
     """
@@ -54,16 +54,16 @@ class MotionSinceNode(NamedTuple):
 
 
 class Navigator:
-    """Estimates the path of a stereo camera from frames alone. Use as a context manager.
+    """Estimates the trajectory of a stereo camera from its frames. Use as a context manager, or call `close`.
 
     Args:
         rig: believed calibration.
         settings: settings of the estimators.
         start: (4, 4) world_from_camera of the first frame, the reference position; by default the camera is at the
-            origin with its optical axis along -z of the world. Readings of height or attitude require a world whose
-            z axis points up.
+            origin with its optical axis along -z of the world. If the frames have readings of height or attitude, the
+            z axis of the world must point up.
         readings_noise: believed noise of the navigation sensors whose readings come with the frames.
-        vision: source of the visual measurements; by default they are computed from the images of the frames.
+        vision: source of the visual measurements; by default, these are computed from the images of the frames.
         folder: folder for keyframe images and the mosaic while the survey runs; by default a temporary folder.
         stopwatch: returns the context manager that times the stage of a given name.
     """
@@ -102,15 +102,15 @@ class Navigator:
         self._resources.close()
 
     def update(self, frame: Frame, track: int = 1) -> Estimate:
-        """Processes one frame.
+        """Processes one frame and returns its online estimate.
 
-        A frame with `keyframe` True becomes a keyframe, one with False does not; None leaves the choice to the
-        estimator: a stereo pair becomes a keyframe where its overlap with the last keyframe is below
-        `settings.keyframe_overlap`, or where tracking failed.
+        Only a frame with a stereo pair can become a keyframe. It becomes one if `frame.keyframe` is True. If
+        `frame.keyframe` is None, it becomes one if there is no keyframe yet, if tracking failed, or if its overlap with
+        the last keyframe is below `settings.keyframe_overlap`.
 
         Args:
             frame: images and sensor readings of the frame.
-            track: number of the track, from 1; tracks limit the window of `align_track`.
+            track: number of the track, from 1; `align_track` aligns a window of tracks.
         """
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
@@ -126,9 +126,9 @@ class Navigator:
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
 
     def align_track(self, track: int) -> None:
-        """Aligns the window of tracks that ends with this track, and corrects the online pose accordingly.
+        """Aligns the window of tracks that ends with `track`, and corrects the online pose.
 
-        The online pose receives the correction of the last keyframe.
+        The online pose receives the same correction as the last keyframe.
         """
         node_cov = self.network.align_window(track)
         if node_cov is not None:
@@ -141,7 +141,8 @@ class Navigator:
             The trajectories, the keyframes with their covariances, and the network.
 
         Raises:
-            SurveyAborted, OSError: the alignment or the measurement of links failed; a second call skips them.
+            SurveyAborted, OSError: the alignment or the measurement of links failed. A second call skips these steps
+                and returns the result without them.
         """
         self.network.truncate(len(self.log))
         keyframes, history, log = self.network.keyframes, self.network.history, self.log
@@ -172,14 +173,15 @@ class Navigator:
         """Builds the elevation map along the final trajectory.
 
         Heights are along z of the world if the optical axis of the first keyframe is within 45 degrees of straight
-        down, otherwise along this axis (`ElevationMap.map_from_world`).
+        down, otherwise along the optical axis, towards the camera (`ElevationMap.map_from_world`).
 
         Args:
+            result: result of the survey (`finish`).
             grid: grid of the map; by default it covers the images of all keyframes.
-            progress: called with the fraction done.
+            progress: called with the fraction of the keyframes that are done, 0 to 1.
 
         Returns:
-            The map, or None where there is no keyframe.
+            The map, or None if there is no keyframe.
         """
         n_keyframes = len(result.keyframe_rows)
         if n_keyframes == 0:
@@ -198,31 +200,31 @@ class Navigator:
 
     @property
     def dead_reckoning(self) -> DeadReckoningState:
-        """Dead-reckoning state, which `dead_reckon` advances by one frame."""
+        """Dead-reckoning state at the last frame; `dead_reckon` advances it by one frame."""
         online = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the models of the sensors that are read at every frame, for a given interval between frames [s]."""
+        """Returns the error models of the sensors read at every frame, for a given interval between frames [s]."""
         return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:
-        """Sets the poses and covariances to a dead-reckoning state."""
+        """Replaces the poses and covariances by those of a dead-reckoning state."""
         self.f2f_pose = state.f2f
         self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
     def _image_vision(self, folder: Path | None) -> StereoVision:
-        """Returns the source of visual measurements that works on images.
+        """Creates the source of visual measurements from images; `folder` None creates a temporary folder.
 
-        `close` releases it and its temporary folder.
+        `close` releases both.
         """
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
 
     def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s]; the nominal interval if only rounding of timestamps differs."""
+        """Returns the time since the last frame [s]; the nominal interval if the difference is only rounding."""
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
@@ -235,7 +237,11 @@ class Navigator:
         return self.network.overlap_with_last(self.filter.world_from_camera) < self.settings.keyframe_overlap
 
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
-        """Processes a keyframe: stereo, motion since the last node, F2M, mosaic, network; restarts F2F tracking."""
+        """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
+
+        Returns:
+            `status`, or the reason why the frame did not become a keyframe.
+        """
         row = len(self.log)
         points = self.vision.observe_stereo(frame, row)
         if points is None:
@@ -248,7 +254,7 @@ class Navigator:
         self.network.add(keyframe)
         is_node = self.network.is_node(keyframe)
         chain = self._follow_chain(keyframe) if is_node else None
-        self.filter.fuse_position_fixes(frame.readings)  # after the motion update, whose error the fixes correct
+        self.filter.fuse_position_fixes(frame.readings)  # after `_follow_chain`, to correct its error too
         with self.stopwatch("f2m"):
             self._register_with_mosaic(keyframe, chain)
             keyframe.world_from_camera = self.filter.world_from_camera
@@ -261,9 +267,12 @@ class Navigator:
     def _follow_chain(self, node: Keyframe) -> Link | None:
         """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
 
-        Two stereo pairs give the motion more accurately than the frames between them, and give the global alignment
-        better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by navigation sensors since the
-        last node are kept.
+        The motion from two stereo pairs is more accurate than the motion accumulated over the frames between them, and
+        gives the global alignment better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by
+        navigation sensors since the last node are kept.
+
+        Returns:
+            The link from the last node, or None if it could not be measured.
         """
         link = self.network.link_to_last_node(node)
         if link is None:
@@ -278,8 +287,8 @@ class Navigator:
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
         """Corrects the online pose by registration with the mosaic (F2M).
 
-        The mosaic carries the pose error of the keyframe that was added to it, so the correction is weighted by the
-        covariance of the motion since that keyframe only.
+        The compared part of the mosaic has the pose error of the keyframe that it was taken from, so the correction is
+        weighted by the covariance of the motion since that keyframe only.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
@@ -297,7 +306,7 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Links a new node to earlier nodes; the link to the last node is the F2F motion if `chain` is None."""
+        """Adds a node to the network; if `chain` is None, it is linked to the last node by the F2F motion."""
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
@@ -306,7 +315,7 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, node_cov: Array) -> None:
-        """Applies the correction that an alignment gave the last keyframe to the online pose.
+        """Applies to the online pose the correction that an alignment made to the last keyframe.
 
         Args:
             node_cov: (6, 6) covariance of the pose of the last keyframe's node [rotation, translation] (rad, m).

@@ -1,4 +1,4 @@
-"""Visual measurements from stereo images: the implementation of `Vision` on recorded or rendered frames."""
+"""Visual measurements from recorded or rendered stereo images: an implementation of `vision_interface.Vision`."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
-_MIN_POINTS = 12  # smallest number of matched points of a keyframe
+_MIN_POINTS = 12  # smallest number of matched points for a keyframe
 _SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
 
 
 class StereoVision:
-    """Visual measurements from images, at the image scale that suits the texture of the first keyframe.
+    """Visual measurements from images, at an image scale chosen from the texture of the first stereo pair.
 
     Use as a context manager, or call `close`.
 
     Args:
         rig: believed calibration.
         settings: settings of the estimators.
-        folder: folder for images of keyframes and tiles of the mosaic.
-        cell_m: cell size of the mosaic at full image size [m]; by default the ground sample distance of the first
-            keyframe.
+        folder: folder for the images of keyframes and the tiles of the mosaic.
+        cell_m: cell size of the mosaic at full image size [m], multiplied by the binning; by default the ground sample
+            distance of the first keyframe.
         stopwatch: returns the context manager that times the stage of a given name.
     """
 
@@ -75,7 +75,7 @@ class StereoVision:
         self.matcher.close()
 
     def _configure(self, binning: int) -> None:
-        """Creates the image spool, the tracker and the matcher for images with this binning."""
+        """Creates the image spool, the tracker and the matcher for images of this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
@@ -97,20 +97,20 @@ class StereoVision:
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
     def _interval_ratio(self, time_s: float) -> float:
-        """Returns the time since the last frame divided by the interval before that; 1 if only rounding differs."""
+        """Returns the time since the last frame divided by the previous interval; 1 if they differ by rounding only."""
         before, last = self._times_s
         self._times_s = last, time_s
         ratio = (time_s - last) / (last - before) if last > before else 1.0
         return ratio if abs(ratio - 1) > _SAME_INTERVAL else 1.0
 
     def _on_plane(self, world_from_camera: Array) -> Array:
-        """Returns a pose (4, 4) in the axes of the mosaic, which are chosen at the first keyframe."""
+        """Returns the pose (4, 4) in the axes of the mosaic, which are set at the first keyframe."""
         if self._plane_from_world is None:
             self._plane_from_world = viewing_plane(world_from_camera)
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Chooses the image scale from the first stereo pair, before anything is stored."""
+        """Sets the image scale from the first stereo pair, before any image is stored."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
@@ -119,7 +119,7 @@ class StereoVision:
             self.f2f.step(self._image)
 
     def _set_image(self, left: Image) -> None:
-        """Sets the current left image: its grey levels and the normalised image."""
+        """Computes the grey levels and the normalised image of the current left image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 
@@ -178,7 +178,7 @@ class StereoVision:
         return motions
 
     def discard(self, numbers: range) -> None:
-        """Does nothing, because the images are stored on disk."""
+        """Does nothing: the images are on disk, so there is no memory to release."""
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
@@ -197,9 +197,10 @@ class StereoVision:
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
-    """Returns half the side of the mosaic window [m]: 0.6 times the width of the view at the 90th percentile of depth.
+    """Returns half the side of the square of the mosaic that is used for registration [m].
 
-    The largest depth is not robust: one mismatch with a disparity of 0.5 px would require a mosaic of 20 GB.
+    This is 0.6 times the width of the footprint at the 90th percentile of depth. The largest depth is not robust: one
+    mismatch with a disparity of 0.5 px would require a mosaic of 20 GB.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 

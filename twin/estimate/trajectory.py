@@ -11,9 +11,10 @@ from twin.core.geometry import Array
 
 
 def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
-    """Interpolates between keyframes along the frame-to-frame motion.
+    """Interpolates the poses of keyframes to all frames along the frame-to-frame motion.
 
-    The misclosure between the frame-to-frame motion and the next keyframe is distributed linearly over the frames.
+    From each keyframe, the frame-to-frame motion is followed to the next one; its misclosure there is distributed
+    linearly over the frames between them.
 
     Args:
         f2f: (n, 4, 4) poses from frame-to-frame motion alone.
@@ -21,8 +22,8 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
         keyframe_poses: (m, 4, 4) aligned poses of these keyframes.
 
     Returns:
-        (n, 4, 4) poses of all frames, equal to `keyframe_poses` at the keyframes. Before the first and after the last
-        keyframe the frame-to-frame motion is followed without correction.
+        (n, 4, 4) poses of all frames, equal to `keyframe_poses` at the keyframes. Frames before the first and after the
+        last keyframe follow the frame-to-frame motion without correction. Without keyframes, a copy of `f2f`.
     """
     if len(rows) == 0:
         return f2f.copy()
@@ -44,7 +45,7 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
 def _distribute(world_from_start, f2f, misclosure, out):
     """Writes the poses `world_from_start` @ `f2f`, corrected for the misclosure (6,), to `out` (n, 4, 4).
 
-    Pose k receives the fraction k / n of the misclosure, so the next keyframe would receive all of it.
+    Pose k receives the fraction k / n of the misclosure; pose n, the next keyframe, would receive all of it.
     """
     step = 1 / len(f2f)
     for k in range(len(f2f)):

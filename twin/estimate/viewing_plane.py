@@ -1,4 +1,4 @@
-"""Reference plane of a mosaic or an elevation map."""
+"""Axes of a mosaic or an elevation map, in which heights are measured above the plane z = 0."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 
-_MAX_TILT_RAD = np.deg2rad(45.0)  # up to this angle from straight down, heights above z = 0 describe the scene well
+#: Largest angle from straight down for which heights along z of the world describe the scene well.
+_MAX_TILT_RAD = np.deg2rad(45.0)
 
 
 def viewing_plane(world_from_camera: Array) -> Array:
-    """Returns plane_from_world (4, 4): axes in which a camera looks down on the plane z = 0.
+    """Returns plane_from_world (4, 4), the transformation to axes in which a camera looks down on the plane z = 0.
 
-    This is the identity if the optical axis of the camera (4, 4) is within 45 degrees of straight down; otherwise it
-    is the smallest rotation about the origin that turns the optical axis to -z.
+    This is the identity if the optical axis of the camera is within 45 degrees of straight down; otherwise it is the
+    smallest rotation about the origin that turns the optical axis to -z.
+
+    Args:
+        world_from_camera: (4, 4) pose of the camera.
     """
     axis = world_from_camera[:3, 2]
     angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))

@@ -1,9 +1,9 @@
 """Kalman depth filter along the path: one scalar filter per pixel of the current keyframe.
 
 State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step
-propagates the state to the next keyframe and fuses it with the new stereo depth and with the depth from the motion
-between the two keyframes. Pixels that are not propagated leave the filter and are fused into the map (`elevation`),
-each exactly once.
+propagates the state to the next keyframe and fuses it with the stereo depth of that keyframe and with the depth from
+the motion between the two keyframes. Pixels that are not propagated leave the filter and are fused into the map
+(`elevation`), each exactly once.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Gate of the innovation, (z - h)^2 < GATE (P + R): 99.9 % quantile of chi-square with one degree of freedom.
+#: Gate of the innovation z - h of a depth z (variance R) measured where the filter has depth h (variance P):
+#: (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square with one degree of freedom.
 GATE = 10.83
-#: Pixels whose disparities differ by more than this [px] are on different surfaces; no interpolation between them.
+#: Neighbouring pixels whose disparities differ by more than this [px] are on different surfaces; depth is not
+#: interpolated between them.
 JUMP_PX = 1.2
-#: Standard deviation of depth from motion in addition to image noise [px of stereo disparity].
+#: Standard deviation of depth from motion due to errors other than image noise and pose [px of stereo disparity].
 MOTION_MIN_SIGMA_PX = 0.03
 
 
@@ -48,7 +50,7 @@ class PropagatedDepth(NamedTuple):
 
     Args:
         fused: depth map of the new keyframe.
-        inherited: (H, W) bool, pixels that contain information of the old map.
+        inherited: (H, W) bool, pixels whose depth contains information from the old map.
     """
 
     fused: DepthMap
@@ -66,8 +68,8 @@ def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
 def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
     """Fuses two depth maps of the same camera by scalar Kalman updates.
 
-    A pixel is updated if its innovation passes the gate (z - h)^2 < GATE (P + R); otherwise it keeps its prior. A pixel
-    that is known in only one of the maps is taken from that map.
+    A pixel is updated if its innovation passes the gate (see `GATE`); otherwise it keeps its prior depth. A pixel that
+    is known in only one of the maps is taken from that map.
     """
     depth, variance = prior.depth_m.copy(), prior.variance_m2.copy()
     _fuse(depth, variance, measured.depth_m, measured.variance_m2, GATE)
@@ -77,15 +79,16 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth.
 
-    The new stereo depth of each pixel is the point of linearisation. The old map is sampled bilinearly where this point
-    projects in the old image (backward warping: no holes, no rounding; not across depth discontinuities), and the
-    difference in depth is transferred along the surface. Pixels without new stereo depth are linearised at the old
-    depth that projects to them.
+    Each pixel is linearised at the point given by its new stereo depth. This point is projected into the old image,
+    where the old map is interpolated bilinearly, except across depth discontinuities (backward warping leaves no holes
+    and needs no rounding). The difference between the old depth and the depth of the point in the old camera is
+    converted to a difference in depth along the ray of the new pixel, with the surface normal at the point. Pixels
+    without new stereo depth are linearised at the old depth that projects to them.
 
     Args:
         old: filtered depth of the old keyframe.
         new: stereo depth of the new keyframe.
-        new_from_old: (4, 4) pose of the old camera in the new one.
+        new_from_old: (4, 4) pose of the old camera in the new camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
         rig: calibration.
     """
@@ -109,17 +112,18 @@ def motion_depth(
 
     The relative pose and the current depth predict the flow. The residual of the flow along the epipolar line is
     measured with the same window as stereo disparity, and is linear in inverse depth. The covariance of the relative
-    pose adds to the variance of the depth.
+    pose contributes to the variance of the depth.
 
-    On rendered strips (noise of 2 grey levels, true poses), the error of motion depth was 0.044 px on a reef and 0.063
-    px on a fractal floor, 0.9 times its standard deviation on both, with a bias of 0.001 px. It reduced the error of
-    the filter from 0.045 to 0.035 px (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is
-    not used: its bias of about 0.1 px is common to the image and would remain in the map.
+    In rendered sequences (noise of 2 grey levels, true poses), the error of depth from motion, expressed as stereo
+    disparity, was 0.044 px over a reef and 0.063 px over a fractal floor. Both values are 0.9 times the computed
+    standard deviation; the bias was 0.001 px. Fusing depth from motion reduced the error of the filter from 0.045 to
+    0.035 px (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is not used: its bias of
+    about 0.1 px is common to the whole image and would remain in the map.
 
     Args:
         gray, old_gray: (H, W) float32 left images.
         current: depth of the new keyframe, used as prediction.
-        old_from_new: (4, 4) pose of the new camera in the old one.
+        old_from_new: (4, 4) pose of the new camera in the old camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
         rig: calibration.
     """
@@ -160,7 +164,7 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 @njit(cache=True, nogil=True)
 def _forward_project(old, rotation, translation, guess, camera):
-    """Fills unknown pixels of `guess` (H, W) with the nearest old depth that projects to them."""
+    """Fills unknown pixels of `guess` (H, W), in place, with the smallest depth of the old points projected to them."""
     height, width = old.shape
     focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
@@ -181,7 +185,7 @@ def _forward_project(old, rotation, translation, guess, camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
-    """Returns the point of pixel (u, v) at a depth, in the other camera [m]."""
+    """Returns x, y, z, in the other camera [m], of the point at pixel (u, v) and `depth` in the first camera."""
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
@@ -194,8 +198,8 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
     """Returns depth and variance at pixel (x, y); NaN if its four neighbours are not on one surface.
 
-    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly, because errors
-    of neighbouring pixels are fully correlated: their windows overlap.
+    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly, as for fully
+    correlated errors, because the matching windows of neighbouring pixels overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -217,7 +221,7 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
 
-    The slope of inverse depth is taken as zero across a depth discontinuity.
+    The gradient of inverse depth is set to zero across a depth discontinuity.
     """
     height, width = depth.shape
     z = depth[v, u]
@@ -236,7 +240,7 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 @njit(cache=True, nogil=True)
 def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map at the pixels of the new map, linearised at `guess`."""
+    """Returns depth and variance (H, W) of the old map at the new image's pixels, linearised at the depth `guess`."""
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
@@ -282,9 +286,10 @@ def _quadratic(row, cov):
 
 @njit(cache=True, nogil=True)
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
-    """Returns the part of the variance (H, W) of disparity from motion that the relative pose causes: J cov J' [px^2].
+    """Returns the variance (H, W) of disparity from motion due to the error of the relative pose: J cov J' [px^2].
 
-    An error of the pose displaces the image point; its component along the epipolar line appears as a change of depth.
+    A pose error displaces the image point; the component of this displacement along the epipolar line has the same
+    effect as an error of depth.
     """
     height, width = disparity.shape
     focal, cx, cy = camera

@@ -1,4 +1,4 @@
-"""Fusion of height patches into the elevation map, with its uncertainty and the photo mosaic."""
+"""Fusion of height patches into the elevation map, its standard deviation and the orthomosaic."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from twin.estimate.mapping.surface import HeightPatch
 
 Map = NDArray[np.float32]
 
-#: The higher of two hypotheses is chosen if its variance is smaller by this factor.
+#: The higher of two hypotheses is chosen if the variance of the lower one is more than this many times larger.
 _VARIANCE_RATIO = 10.0
-#: Measured probability that the chosen hypothesis is wrong.
+#: Measured probability that the chosen hypothesis of a cell with two hypotheses is wrong.
 _WRONG_CHOICE = 0.16
-#: Connected groups with fewer cells than this are removed.
+#: Connected groups of known cells with fewer cells than this are removed.
 MIN_CELLS = 12
 
 
@@ -25,20 +25,23 @@ class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
     A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
-    at its upper edge in another. The height z in a patch updates the best-fitting hypothesis h if the innovation passes
-    the gate (z - h)^2 < GATE (P + R); otherwise z becomes the second hypothesis, or replaces the hypothesis with the
-    larger variance if the variance of z is smaller. The lower hypothesis is the result unless the higher one is much
-    more certain, because matching windows extend near surfaces over the floor behind them. Of the cells of the
-    horseshoe reef with two hypotheses, the lower one was right in 82 %, the more certain one in 67 %, and this rule in
-    84 %.
+    at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
+    variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes the second hypothesis,
+    or replaces the hypothesis with the larger variance if the variance of z is smaller. The lower hypothesis is the
+    result unless the variance of the higher one is at least ten times smaller, because matching windows extend near
+    surfaces over the floor behind them. In the cells of the horseshoe reef with two hypotheses, the lower one was right
+    in 82 %, the one with the smaller variance in 67 %, and the one chosen by this rule in 84 %.
 
-    The variance has two parts. The part due to depth is independent between patches and decreases with each fusion. The
-    part due to the pose and to smoothed slopes is common to all cells of a leg, and mostly to all legs; its weighted
-    mean over the patches is kept, so it never averages out. The result adds two terms: the lateral error times the
-    relief around the cell, and a fraction of the squared height step for cells that may be on the wrong side of an
-    edge. The fraction is the lateral error relative to the cell, for steps larger than a cell. Without this term,
-    the standard deviation was 1.9 times too small over the whole map of a reef, because 1 % of the cells, at the edges,
-    have the height of the wrong side.
+    The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their part
+    decreases with each fusion. Errors due to the pose and to the smoothing of slopes are common to all cells of a leg
+    and mostly to all legs; the weighted mean of their variances over the patches is kept, which does not decrease with
+    the number of patches.
+
+    The variance of the result has three further terms. With f the lateral error divided by two cell sizes, these are
+    f^2 times the squared range of heights around the cell, f times the squared height step across the cell (only for
+    steps larger than a cell, where the cell may be on the wrong side of an edge), and the variance due to the choice
+    between two hypotheses. Without the term for steps, the standard deviation was 1.9 times too small over the whole
+    map of a reef, because 1 % of the cells, all at edges, have the height of the wrong side.
 
     Args:
         grid: grid of the map.
@@ -56,13 +59,13 @@ class ElevationMapper:
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
-        A cell was propagated if the successor covers it with a pixel that inherited information and agrees in height.
-        So the information on a cell enters the map once, and none is lost between two patches.
+        A cell was propagated if the successor covers it with a pixel that inherited information, and the two heights
+        agree. The information on each cell therefore enters the map exactly once.
 
         Args:
             patch: heights of a keyframe.
             successor: heights of the next keyframe; None for the last one.
-            inherited: (H, W) bool, pixels of the next keyframe that contain information of this keyframe
+            inherited: (H, W) bool, pixels of the next keyframe whose depth contains information from this keyframe
                 (`depth_filter.PropagatedDepth`).
         """
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
@@ -73,17 +76,17 @@ class ElevationMapper:
         _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._systematic)
 
     def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
-        """Adds an image (H, W, 3) to the photo mosaic, a weighted mean with larger weights near the image centre.
+        """Adds an image to the orthomosaic, a weighted mean of the images with larger weights near their centres.
 
         Args:
             patch: heights of the keyframe, with the pixel of each cell.
-            rgb: left image of the keyframe.
+            rgb: (H, W, 3) left image of the keyframe.
             gain: (H, W, 3) factor that makes the illumination uniform.
         """
         _add_colours(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
 
     def result(self) -> ElevationMap:
-        """Returns the map: the chosen hypothesis of each cell, its standard deviation and the photo mosaic."""
+        """Returns the map: the chosen height of each cell, its standard deviation and the orthomosaic."""
         (low, high), gap = np.argsort(self._height, axis=0), self._height.max(axis=0) - self._height.min(axis=0)
         low_m2, high_m2 = (np.take_along_axis(self._variance, which[None], 0)[0] for which in (low, high))
         chosen = np.where(np.isfinite(gap) & (high_m2 * _VARIANCE_RATIO < low_m2), high, low)[None]
@@ -104,7 +107,10 @@ class ElevationMapper:
 
 
 def _small_groups(known: Mask) -> Mask:
-    """Returns the cells (rows, cols) in connected groups of fewer than `MIN_CELLS`: mismatches at image borders."""
+    """Returns a mask (rows, cols) of the cells in connected groups of fewer than `MIN_CELLS` known cells.
+
+    Such groups are usually mismatches at image borders.
+    """
     _, label, stats, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8), connectivity=8)
     small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < MIN_CELLS
     return known & small[np.asarray(label, np.int64)]
@@ -119,7 +125,7 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest second difference of height across each cell (rows, cols) [m]."""
+    """Returns the largest second difference of height across each cell (rows, cols), of four directions [m]."""
     step = np.zeros_like(height)
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
     for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):
@@ -133,7 +139,7 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets those cells of `remaining` (rows, cols) that were propagated to the successor to NaN."""
+    """Sets the cells of `remaining` (rows, cols) that were propagated to the successor to NaN, in place."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
@@ -146,7 +152,7 @@ def _remove_propagated(
 
 @njit(cache=True, nogil=True)
 def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances, systematics):
-    """Fuses a patch (rows, cols) into the two hypotheses per cell, arrays (2, grid rows, grid cols), in place."""
+    """Fuses a patch (rows, cols) into the two hypotheses of each cell (2, grid rows, grid cols), in place."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]
@@ -175,9 +181,9 @@ def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances
 
 @njit(cache=True, nogil=True)
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
-    """Adds the bilinear colour of each known cell, times its weight, to `colour` (grid rows, grid cols, 4), in place.
+    """Adds the interpolated image colour of each known cell, times its weight, to `colour` (grid rows, grid cols, 4).
 
-    The fourth layer is the sum of the weights.
+    The last channel of `colour` is the sum of the weights. `colour` is modified in place.
     """
     rows, cols = rgb.shape[0] - 1, rgb.shape[1] - 1
     for i in range(height.shape[0]):

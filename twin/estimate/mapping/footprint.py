@@ -1,4 +1,4 @@
-"""Map grid over the area that the keyframe images of a survey cover."""
+"""Grid of the map over the area that the keyframe images of a survey cover."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig, SurveyResult
 
-_CELL_PX = 3.0  # side of a map cell in pixels at the median depth: a height needs several disparities
+_CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that several disparities support each height
 
 
 def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = None) -> MapGrid:
-    """Returns the grid that covers the images of all keyframes, each at the median depth of its matched points.
+    """Returns the grid that covers the footprints of all keyframe images at the median depth of their matched points.
 
     Args:
         result: result of a survey with at least one keyframe.

@@ -1,4 +1,4 @@
-"""Builds the map from the stereo pairs along the final trajectory: depth filter, elevation map and photo mosaic."""
+"""Builds the map from the stereo pairs along the final trajectory: depth filter, elevation map and orthomosaic."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from twin.estimate.vision import disparity
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-#: Largest standard deviation of stereo disparity that enters the map [px]. Beyond it, where texture is as weak as
-#: noise, half of the pixels are mismatches: with a limit of 1 px, twice as many cells have errors above 0.1 m; with
-#: 0.35 px, a third as many.
+#: Largest standard deviation of a stereo disparity that enters the map [px]. Beyond this limit, texture is as weak as
+#: noise, and half of the pixels are mismatches. Twice as many cells have errors above 0.1 m with a limit of 1 px, and a
+#: third as many with a limit of 0.35 px.
 MAX_STEREO_SIGMA_PX = 0.5
 
 
@@ -39,13 +39,13 @@ class KeyframeImages(NamedTuple):
 
 
 class KeyframePath(NamedTuple):
-    """Poses of the n keyframes of a map, with their uncertainty.
+    """Poses of the n keyframes of a map, with their covariances.
 
     Args:
         world_from_camera: (n, 4, 4) poses of the left camera.
         pose_cov: (n, 6, 6) covariance of each pose [rotation, translation], in the camera (rad, m).
-        step_cov: (n, 6, 6) covariance of each pose relative to the previous one (the first is not used); None if the
-            relative poses are exact.
+        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in the camera (the first is not
+            used); None if the relative poses are exact.
     """
 
     world_from_camera: Array
@@ -54,12 +54,12 @@ class KeyframePath(NamedTuple):
 
 
 class _StereoDepth(NamedTuple):
-    """Stereo pair with its depth from stereo alone.
+    """Stereo pair and its depth from stereo alone, before it enters the filter.
 
     Args:
         pair: colour images.
         gray: (H, W) float32 grey levels of the left image.
-        depth: depth map of the left image.
+        depth: depth map of the left image, from stereo.
     """
 
     pair: KeyframeImages
@@ -74,7 +74,7 @@ class _FilterState(NamedTuple):
         depth: filtered depth map.
         gray: (H, W) float32 grey levels of the left image.
         pose: (4, 4) world_from_camera.
-        patch: heights of the depth map on the grid; None if it does not overlap the grid.
+        patch: heights of the depth map on the grid; None if the depth map does not overlap the grid.
     """
 
     depth: DepthMap
@@ -91,7 +91,7 @@ def build_map(
     progress: Callable[[int], None] | None = None,
     max_disparity_px: int | None = None,
 ) -> ElevationMap:
-    """Builds the elevation map, its uncertainty and the photo mosaic.
+    """Builds the elevation map, its standard deviation and the orthomosaic.
 
     Args:
         keyframes: stereo pairs along the path, read one at a time.
@@ -99,7 +99,7 @@ def build_map(
         rig: calibration.
         grid: grid of the map.
         progress: called with the number of keyframes that are done.
-        max_disparity_px: largest disparity searched; adapted to the images if None.
+        max_disparity_px: largest disparity searched; if None, it is adapted to the previous pair.
     """
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     search_range = disparity.SearchRange(rig, max_disparity_px)
@@ -126,7 +126,7 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items, while a second thread computes the next item."""
+    """Yields the items in order, while a second thread computes the next one."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -149,7 +149,7 @@ def _advance(
     """Advances the filter to the next keyframe: propagation, fusion with stereo depth, fusion with depth from motion.
 
     Returns:
-        The depth map, and the pixels (H, W) bool that contain information of the old depth map.
+        The filtered depth map, and a mask (H, W) of the pixels that contain information from the old depth map.
     """
     old_from_new = geometry.inverse(old.pose) @ pose
     propagated = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)
@@ -158,7 +158,10 @@ def _advance(
 
 
 class MeanIllumination:
-    """Mean image of the survey, an estimate of the illumination: lamps are fixed to the camera, the floor is not."""
+    """Illumination pattern, estimated as the mean of all images added so far.
+
+    The lamps are fixed to the camera, so their pattern remains in the mean, and the texture of the floor averages out.
+    """
 
     def __init__(self, rig: StereoRig) -> None:
         self._size = (rig.width_px, rig.height_px)
@@ -166,12 +169,12 @@ class MeanIllumination:
         self._count = 0
 
     def add(self, rgb: Image) -> None:
-        """Adds an image (H, W, 3) to the mean, at a quarter of its size and blurred."""
+        """Adds an image (H, W, 3), reduced to a quarter of its width and height and blurred, to the mean."""
         small = cv2.resize(rgb, self._sum.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
         self._sum += cv2.blur(small, (9, 9))
         self._count += 1
 
     def gain(self) -> Map:
-        """Returns the factor (H, W, 3) that makes the illumination uniform."""
+        """Returns the factor (H, W, 3) by which to multiply an image to make its illumination uniform."""
         mean = self._sum / self._count + 1
         return np.asarray(cv2.resize(mean.mean(axis=(0, 1)) / mean, self._size), np.float32)

@@ -1,4 +1,4 @@
-"""Rasterisation of a depth map at the cell centres of a grid, with the variance of height."""
+"""Conversion of a depth map to heights at the cell centres of a grid, with their variances."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-#: Smallest cosine between the normal of a triangle and the ray to it; below this, the triangle may connect two
-#: separate surfaces.
+#: Smallest cosine of the angle between the normal of a triangle and the ray from the triangle to the camera; with a
+#: smaller cosine, the triangle may connect two separate surfaces.
 MIN_COSINE = 0.05
-#: Lateral error of the surface that fusion does not reduce [px on the floor]: the matching window smooths relief and
-#: displaces edges in similar ways in all views. On a slope s it causes a height error of s times this value.
+#: Standard deviation of the lateral error of the surface [px]; on the floor it is this value times depth / focal
+#: length. Fusion does not reduce it, because the matching window smooths relief and displaces edges in similar ways in
+#: all views. On a surface of slope s it causes a height error of s times the lateral error.
 LATERAL_SIGMA_PX = 0.35
 
 
@@ -28,10 +29,11 @@ class HeightPatch(NamedTuple):
     Args:
         row, col: grid position of the first (north-west) cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
-        variance_m2: (rows, cols) variance due to depth, independent between the depth maps that leave the filter.
-        systematic_m2: (rows, cols) variance of errors common to the views, due to the pose and smoothed slopes.
-        pixel: (rows, cols, 2) position (u, v) of the cell in the image [px].
-        lateral_m: lateral error at the mean depth of the depth map [m].
+        variance_m2: (rows, cols) variance due to the error of depth, which is independent between the parts of the
+            depth maps that leave the filter.
+        systematic_m2: (rows, cols) variance due to the pose and to the smoothing of slopes, errors common to all views.
+        pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
+        lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
     """
 
     row: int
@@ -46,12 +48,12 @@ class HeightPatch(NamedTuple):
 def rasterise(
     depth_map: DepthMap, world_from_camera: Array, pose_cov: Array, rig: StereoRig, grid: MapGrid
 ) -> HeightPatch | None:
-    """Computes the heights of a depth map at the cell centres of a grid, linear in triangles between pixels.
+    """Computes heights at the cell centres of a grid from a depth map, by linear interpolation in triangles of pixels.
 
-    Each square of four pixels makes two triangles. Triangles across a depth discontinuity and those seen from below or
-    at a grazing angle are omitted, so that no surface appears between the edge of a reef and the floor behind it. The
-    variance of depth is projected along the ray to the height of the surface. The covariance of the pose is projected
-    likewise, with the effect of a horizontal error on a slope.
+    Each square of four pixels is divided into two triangles. Triangles across a depth discontinuity and triangles seen
+    from below or at a grazing angle are omitted, so that no surface appears between the edge of a reef and the floor
+    behind it. The variance of depth along the ray and the covariance of the pose are propagated to the height at the
+    cell centre; on a slope, this includes the effect of horizontal errors.
 
     Args:
         depth_map: depth in the left camera.
@@ -99,7 +101,7 @@ class _ViewGeometry(NamedTuple):
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
         cell_m: cell size [m].
         focal_px: focal length [px].
-        max_jump: largest difference of inverse depth within a surface [1/m].
+        max_jump: largest difference of inverse depth between the corners of a triangle on one surface [1/m].
     """
 
     position: Array
@@ -111,13 +113,13 @@ class _ViewGeometry(NamedTuple):
 
 
 def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
-    """Returns height, two variances (rows, cols), all NaN, and pixel positions (rows, cols, 2)."""
+    """Returns arrays for height and two variances (rows, cols), all NaN, and for pixels (rows, cols, 2), all zero."""
     unknown = np.full((rows, cols), np.nan, np.float32)
     return unknown, unknown.copy(), unknown.copy(), np.zeros((rows, cols, 2), np.float32)
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row, first column, number of rows and number of columns of the cells in bounds, None if empty."""
+    """Returns first row, first column, number of rows and of columns of the cells within `bounds` (4,), if any."""
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -131,8 +133,8 @@ def _grid_points(depth, pose, camera, west, north, cell):
     """Converts a depth map to grid coordinates.
 
     Returns:
-        Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; their bounds (4,):
-        lowest row and column, highest row and column.
+        Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; bounds (4,) of the
+        points: lowest row and column, highest row and column.
     """
     (focal, cx, cy), (height, width) = camera, depth.shape
     points = np.empty((height, width, 3))
@@ -180,7 +182,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside one triangle of pixels a, b, c; the highest surface over a cell is kept."""
+    """Writes the cells inside the triangle of pixels a, b, c; where triangles overlap, the highest is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
@@ -220,11 +222,11 @@ def _triangle(
 
 @njit(cache=True, nogil=True, inline="always")
 def pose_variance(px, py, pz, sx, sy, cov):
-    """Returns the part of the variance of a surface's height at a point that the pose causes [m^2].
+    """Returns the variance of a surface's height at a point due to the error of the camera pose [m^2].
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].
-        sx, sy: slope of the surface.
+        sx, sy: slopes dz/dx and dz/dy of the surface at the point.
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
     """
     row = (-sx, -sy, 1.0)

@@ -1,1 +1,1 @@
-"""Online pose filter, and the navigation sensors that aid it and the global alignment."""
+"""Online pose filter, and models of the navigation sensors that aid the filter and the global alignment."""

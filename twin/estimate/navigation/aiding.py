@@ -1,9 +1,9 @@
 """Factors of the navigation sensors in the graph of the global alignment.
 
-Pressure, acoustic position fixes and attitude each constrain one node. Beacons have surveyed positions, so their image
-coordinates constrain the camera pose of a node. The DVL constrains the displacement between two nodes. Its scale error
-is one parameter shared by all displacements: as independent noise it would average out along a path, but the real error
-accumulates.
+A reading of pressure, position (USBL) or attitude constrains the pose of one node. Beacons have surveyed positions, so
+their image coordinates also constrain the pose of one node. The DVL constrains the displacement between two nodes. Its
+scale error is estimated as one parameter shared by all displacements: modelled as independent noise, it would average
+out along the path, but the real error accumulates.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
     Args:
         nodes: keyframes, in the order of the poses in the graph.
-        rig, noise: nominal calibration and sensor noise.
+        rig: nominal calibration.
+        noise: nominal noise of the navigation sensors.
     """
     return [
         _height_factors(nodes, noise),
@@ -76,7 +77,7 @@ def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
 
 @njit(cache=True, nogil=True)
 def _camera_poses_at_origin(angles, body_from_camera):
-    """Returns world_from_camera (m, 4, 4) with zero translation for attitudes (m, 3) of the body [rad]."""
+    """Returns world_from_camera (m, 4, 4), with zero translation, for roll, pitch and yaw (m, 3) of the body [rad]."""
     poses, mount_rotation = np.empty((len(angles), 4, 4)), body_from_camera.copy()
     mount_rotation[:3, 3] = 0.0
     for k in range(len(angles)):
@@ -100,7 +101,7 @@ def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFac
 
 
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the reprojection errors of beacons in the left image."""
+    """Returns the factors of the beacons seen in the left image; their residuals are reprojection errors [px]."""
     sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
     beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
     pixels = np.array([sighting.pixel for _, sighting in sightings]).reshape(-1, 2)
@@ -121,7 +122,8 @@ def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNois
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:
     """Returns the factors of the displacements between nodes measured by the DVL, (1 + s) d = measured.
 
-    d is the displacement of the body's origin in the axes of the earlier body, s the scale error (shared parameter).
+    d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
+    one parameter shared by all factors.
 
     Args:
         nodes: keyframes, in the order of the poses in the graph.
@@ -146,7 +148,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
 @njit(cache=True, nogil=True)
 def _body_displacements(motions, body_from_camera):
-    """Computes `body_displacement` for motions (m, 4, 4): displacements (m, 3) and Jacobians (m, 3, 6)."""
+    """Returns displacements (m, 3) [m] and Jacobians (m, 3, 6) of `body_displacement` for camera motions (m, 4, 4)."""
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
         displacement, jacobian = body_displacement(motions[k], body_from_camera)

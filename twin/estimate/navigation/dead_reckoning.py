@@ -15,12 +15,12 @@ from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressur
 
 
 class DeadReckoningState(NamedTuple):
-    """State of dead reckoning after a frame: poses (4, 4) and covariances (6, 6). Not modified in place.
+    """State of dead reckoning after a frame: poses (4, 4) and covariances (6, 6), which are not modified in place.
 
     Args:
         f2f: world_from_camera from frame-to-frame motion alone.
-        online, cov: estimated world_from_camera and its covariance.
-        since_node, since_node_cov: estimated motion since the last node and its covariance.
+        online, cov: online estimate of world_from_camera and its covariance.
+        since_node, since_node_cov: motion since the last node from vision and DVL, and its covariance.
     """
 
     f2f: Array
@@ -65,13 +65,14 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Computes the state after one frame.
+    """Advances dead reckoning by one frame.
 
     Args:
         last: `DeadReckoningState` of the previous frame.
         aiding: `FrameAiding`.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m, rpy_rad, velocity_mps: readings of this frame; NaN where there is none.
+        height_m, rpy_rad, velocity_mps: height (pressure), roll, pitch and yaw (3,) (AHRS) and velocity (3,) (DVL) of
+            this frame; NaN where there is no reading.
 
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.

@@ -1,4 +1,4 @@
-"""Integration of DVL velocities to displacements: per frame for the online pose, per node for the global alignment."""
+"""Integration of DVL velocities: displacements per frame for the online pose, and per node for the global alignment."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class DvlModel(NamedTuple):
 
     Args:
         body_from_camera: (4, 4) pose of the left camera in the body.
-        step_s: time between readings.
+        step_s: time between readings [s].
         white_m2: variance of each component of a frame's displacement due to white noise [m^2].
-        scale_variance: variance of the scale error.
+        scale_variance: variance of the scale error (a relative error of the velocity).
     """
 
     body_from_camera: Array
@@ -34,12 +34,12 @@ class DvlState(NamedTuple):
     """Integration of DVL velocities since the last node. All arrays are modified in place.
 
     Args:
-        velocity: (3,) last reading [m/s]; NaN if there was none.
+        velocity: (3,) last reading, in body axes [m/s]; NaN if the last frame had none.
         node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance [rad^2].
         displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
             white noise [m^2].
-        path_m: (1,) path length since the node.
-        complete: (1,) true if no reading since the node was missing.
+        path_m: (1,) path length since the node [m].
+        complete: (1,) true unless a reading has been missing since the node.
     """
 
     velocity: Array
@@ -54,8 +54,9 @@ class DvlState(NamedTuple):
 class DvlIntegrator:
     """Integrates DVL velocities, rotated into the body axes at the last node, by the trapezoidal rule.
 
-    Each reading contributes half its noise to two consecutive frames. Frames are treated as independent with the
-    variance (sigma dt)^2, which gives the correct variance of the sum.
+    Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
+    correlated. Treating the displacements as independent, each with the variance (sigma dt)^2, gives the correct
+    variance of their sum; sigma is the noise of a reading, dt the interval between frames.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
@@ -72,12 +73,12 @@ class DvlIntegrator:
         self._node = 0
 
     def model(self, interval_s: float) -> DvlModel:
-        """Returns the error model for an interval between frames [s]."""
+        """Returns the error model for a given interval between frames [s]."""
         white_m2 = (self._noise.dvl_mps * interval_s) ** 2
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
     def displacement_at_node(self, number: int) -> Displacement | None:
-        """Returns the displacement from the last node to the current one and restarts the integration at the latter.
+        """Returns the displacement from the last node to the current node, and restarts the integration.
 
         Args:
             number: number of the current node.
@@ -97,12 +98,12 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
     """Computes the displacement of the body's origin for a motion of the camera.
 
     Args:
-        a_from_b: (4, 4) motion of the camera.
+        a_from_b: (4, 4) motion of the camera: the pose of the later camera in the earlier camera.
         body_from_camera: (4, 4) pose of the camera in the body.
 
     Returns:
-        Displacement (3,) [m] in the axes of the earlier body, and its Jacobian (3, 6) with respect to an increment of
-        the motion.
+        Displacement (3,) [m] in the body axes before the motion, and its Jacobian (3, 6) with respect to an increment
+        [rotation, translation] of the motion, in the axes of the later camera.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -117,17 +118,17 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 @njit(cache=True, nogil=True)
 def fuse_dvl(state, model, a_from_b, cov, velocity):
-    """Fuses a frame's visual motion with the DVL and adds the frame to the integration.
+    """Fuses the visual motion since the previous frame with the DVL, and continues the integration.
 
     Args:
         state: `DvlState`, modified in place.
         model: `DvlModel`.
         a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
-        velocity: (3,) reading at the end of the frame, in body axes [m/s]; NaN if there is none.
+        velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
 
     Returns:
-        The fused motion (4, 4) and its covariance (6, 6). Equal to the arguments if the reading at either end of the
-        frame interval is missing.
+        The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
+        missing, these are `a_from_b` and `cov` unchanged.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -145,7 +146,7 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
 
 @njit(cache=True, nogil=True)
 def _body_motion(a_from_b, body_from_camera):
-    """Returns the motion (4, 4) of the body for a motion of the camera."""
+    """Returns the motion (4, 4) of the body that corresponds to a motion of the camera."""
     return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
 
 
@@ -157,10 +158,11 @@ def _length(step):
 
 @njit(cache=True, nogil=True)
 def _step_cov(state, model, step):
-    """Computes the covariance (3, 3) of a frame's displacement of length l.
+    """Returns the covariance (3, 3) of a frame's displacement, of length l [m^2].
 
-    The scale error, of standard deviation s, accumulates along the path of length L since the node: the contributions
-    of the frames, s^2 ((L + l)^2 - L^2), sum to s^2 L^2 over the path.
+    The scale error, of standard deviation s, accumulates along the path. After a path of length L since the node, a
+    frame therefore contributes the variance s^2 ((L + l)^2 - L^2); these contributions sum to s^2 times the squared
+    length of the whole path.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
@@ -175,8 +177,8 @@ def _accumulate(state, model, step, a_from_b, cov):
     """Adds a frame to the integration since the node.
 
     Args:
-        step: (3,) displacement in the axes of the body before the frame [m].
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
+        step: (3,) displacement since the previous frame, in the body axes at the previous frame [m].
+        a_from_b, cov: (4, 4), (6, 6) motion of the camera since the previous frame, and its covariance.
     """
     state.path_m[0] += _length(step)
     node_from_body = state.node_from_body
@@ -195,7 +197,7 @@ def _accumulate(state, model, step, a_from_b, cov):
 @njit(cache=True, nogil=True)
 def _displacement_cov(state):
     """Returns the covariance (3, 3) of the displacement since the node due to white noise and attitude error."""
-    lever = geometry.skew(state.displacement_m)  # conservative: the attitude error at the end applies to the whole path
+    lever = geometry.skew(state.displacement_m)  # conservative: applies the final attitude error to the whole path
     return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
 
 

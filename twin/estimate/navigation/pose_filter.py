@@ -1,6 +1,6 @@
 """Extended Kalman filter of the online pose.
 
-The prediction uses frame-to-frame motion, the correction registration with the mosaic (F2M) and navigation sensors.
+Frame-to-frame motion predicts the pose; registrations with the mosaic (F2M) and navigation sensors correct it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings, SensorNoise, StereoRig
 
-_GATE = 30.0  # chi2 of a 6-DOF correction above which it is rejected as an outlier
+_GATE = 30.0  # largest chi2 (6 degrees of freedom) of a correction; above it, the correction is rejected
 
 
 class PoseFilter:
@@ -31,18 +31,18 @@ class PoseFilter:
         self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
 
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
-        """Fuses a pose measured relative to an earlier one, such as a registration with the mosaic.
+        """Fuses a pose measured relative to an earlier pose, such as a registration with the mosaic.
 
-        The mosaic contains the pose error at the time when it was recorded, so the measurement constrains only the
-        motion since then. With S the covariance of that motion, the gain is S (S + R)^-1 and the covariance decreases
-        by the gain times S, which is less than for an absolute pose (Schmidt's consider filter, where the earlier pose
-        is a consider parameter).
+        The mosaic contains the error of the pose at which it was recorded, so the measurement constrains only the
+        motion since that pose. With S the covariance of this motion and R that of the measurement, the gain is
+        S (S + R)^-1, and the covariance of the pose decreases by the gain times S, less than for a measurement of an
+        absolute pose (Schmidt's consider filter, with the earlier pose as consider parameter).
 
         Args:
             measured: (4, 4) measured world_from_camera.
-            cov: R, (6, 6) covariance of the measurement.
-            motion_cov: (6, 6) covariance of the motion since the reference was recorded. S is this matrix, limited to
-                the covariance of the pose.
+            cov: (6, 6) covariance R of the measurement.
+            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to the
+                covariance of the pose.
 
         Returns:
             (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.
@@ -77,7 +77,8 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     """Projects a beacon (3,) into the left image.
 
     Returns:
-        Pixel (2,), NaN behind the camera, and its Jacobian (2, 6) with respect to an increment of the pose.
+        Pixel (2,), NaN if the beacon is behind the camera, and its Jacobian (2, 6) with respect to an increment
+        [rotation, translation] of the pose in camera axes.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -90,8 +91,8 @@ class PressureAhrsModel(NamedTuple):
 
     Args:
         camera_from_body: (4, 4) pose of the body in the camera.
-        pressure_m2: variance of the height [m^2].
-        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw.
+        pressure_m2: variance of the height measured by the pressure sensor [m^2].
+        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw measured by the AHRS.
     """
 
     camera_from_body: Array
@@ -106,10 +107,10 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
         model: `PressureAhrsModel`.
-        height_m, rpy_rad: readings of the height and of roll, pitch and yaw (3,); NaN where there is none.
+        height_m, rpy_rad: readings of the height, and of roll, pitch and yaw (3,); NaN where there is no reading.
 
     Returns:
-        Updated pose and covariance.
+        Pose and covariance after the update.
     """
     pose = world_from_camera
     if not np.isnan(height_m):
@@ -126,7 +127,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
 
 @njit(cache=True, nogil=True)
 def predict(world_from_camera, cov, a_from_b, motion_cov):
-    """Returns the pose and its covariance after a motion with covariance `motion_cov`.
+    """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
 
     Equations (3) to (5) of Negahdaripour & Madjidi (2003).
     """
@@ -137,7 +138,7 @@ def predict(world_from_camera, cov, a_from_b, motion_cov):
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
-    The limits apply to the generalised eigenvalues of the two matrices.
+    The limits apply to the generalised eigenvalues of `cov` with respect to `reference`.
     """
     root = np.linalg.cholesky(reference)
     inverse_root = np.linalg.inv(root)
@@ -148,7 +149,7 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
 
 @njit(cache=True, nogil=True)
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of b from that of the pose of a, to which b is rigidly attached."""
+    """Returns the covariance (6, 6) of the pose of b, rigidly attached to a, from the covariance of the pose of a."""
     return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
@@ -158,8 +159,8 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
     Args:
         world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) residual of the observation, its Jacobian, and its covariance;
-            k <= 3.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) residual of the observation, Jacobian of the predicted
+            observation, and covariance of the observation; k <= 3.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -209,7 +210,7 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
     """Computes the update of `PoseFilter.correct_pose`.
 
     Returns:
-        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the covariance of the pose.
+        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the pose covariance.
     """
     motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)

@@ -14,22 +14,25 @@ from twin.estimate.vision import epipolar
 Gray = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
-#: Block of semi-global matching [px]: 5 matches more pixels than 3 in turbid water; refinement restores sharp edges.
+#: Block size of semi-global matching [px]. In turbid water, 5 px matches more pixels than 3 px; the refinement restores
+#: the sharpness of edges.
 BLOCK_PX = 5
 #: Connected regions with fewer pixels than this are removed as mismatches.
 SPECKLE_PX = 60
-#: Window of the contrast normalisation before matching, as a fraction of the image width. Illumination and backscatter
-#: vary slowly. A small window (25 px) is affected by the brightness of near objects next to a pixel, and differently in
-#: the two cameras.
+#: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
+#: because illumination and backscatter vary slowly over the image. In a small window (25 px), a near object beside a
+#: pixel changes the local mean, and differently in the two images.
 NORMALISATION_WINDOW = 1 / 7
-#: Largest difference between the left-to-right and the right-to-left disparity [px]; beyond it, the pixel is occluded.
+#: Largest difference between the left-to-right and the right-to-left disparity of a valid pixel [px]; a larger
+#: difference indicates an occlusion or a mismatch.
 CONSISTENCY_PX = 1.0
-#: Error that refinement does not model (interpolation, relief inside the window): a lower bound of sigma [px].
+#: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px]; it is
+#: added in quadrature.
 MIN_SIGMA_PX = 0.03
 #: Largest disparity that is searched, as a fraction of the image width.
 MAX_DISPARITY_FRACTION = 0.4
-#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px]; pixels beyond it
-#: are mismatches.
+#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px]; pixels above it
+#: are treated as mismatches.
 MAX_SIGMA_PX = 1.0
 
 
@@ -45,7 +48,7 @@ class Disparity(NamedTuple):
     sigma_px: Map
 
     def with_sigma_below(self, sigma_px: float) -> Disparity:
-        """Returns the disparity with pixels of a larger standard deviation set to NaN."""
+        """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN."""
         accepted = self.sigma_px < sigma_px
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
@@ -54,11 +57,11 @@ class Disparity(NamedTuple):
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
     """Computes the disparity of every pixel of the left image that is visible in both images.
 
-    Semi-global matching (Hirschmueller 2008, three-way), on locally normalised contrast, finds the disparity to the
-    nearest pixel, with a left-right consistency check against occlusions and mismatches. The sub-pixel interpolation of
+    Semi-global matching (Hirschmueller 2008, three-way) of images with locally normalised contrast gives an initial
+    disparity; a left-right consistency check removes occlusions and mismatches. The sub-pixel interpolation of
     semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef),
-    so `epipolar.refine` replaces it (bias 0.002 px, standard deviation 0.06 px). The standard deviation is that of the
-    refinement without its prior, so it increases where texture is weak compared with noise.
+    so `epipolar.refine` improves it (bias 0.002 px, standard deviation 0.06 px). The returned standard deviation is
+    that of the refinement without its prior, so it increases where texture is weak compared with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
@@ -71,14 +74,14 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
 
 
 class SearchRange:
-    """Range of the disparity search, adapted to the largest disparity of the last pair.
+    """Range of the disparity search, adapted to the largest disparities of the last stereo pair.
 
     Args:
         rig: calibration at the scale of the images.
-        fixed_px: fixed largest disparity; None to adapt it, starting from a wide range.
+        fixed_px: fixed largest disparity [px]; None to adapt the range, starting from the widest one.
 
     Attributes:
-        max_disparity_px: largest disparity to search.
+        max_disparity_px: largest disparity to search [px].
     """
 
     def __init__(self, rig: StereoRig, fixed_px: int | None = None):
@@ -87,7 +90,7 @@ class SearchRange:
         self.max_disparity_px = self._widest_px
 
     def update(self, disparity_px: Map) -> None:
-        """Adapts the range to the disparities (H, W) of the last pair; uses the widest range if there are too few."""
+        """Adapts the range to the disparities (H, W) of the last pair, or widens it fully if too few are known."""
         known = disparity_px[np.isfinite(disparity_px)]
         if not self._fixed:
             wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px
@@ -95,9 +98,9 @@ class SearchRange:
 
 
 def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Computes the disparity (H, W) [px] by semi-global matching, to about 0.2 px; NaN where unknown.
+    """Computes the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
 
-    Images are padded on the left, so that the margin without disparity is not wider than a pixel's own disparity.
+    The images are padded on the left; otherwise the left margin, as wide as the search range, would have no disparity.
 
     Args:
         left, right: (H, W) uint8 rectified images with normalised contrast.
@@ -124,7 +127,7 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
 
 def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Computes the disparity as `search` does, and keeps only pixels that pass the left-right consistency check."""
+    """Computes the disparity as `search` does; pixels that fail the left-right consistency check are set to NaN."""
     disparity = search(left, right, max_disparity_px)
     mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
     v, u = np.nonzero(np.isfinite(disparity))
@@ -139,7 +142,7 @@ def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 def _normalise_contrast(image: Gray) -> Gray:
     """Normalises local mean and contrast of an image, so that illumination and backscatter do not affect matching.
 
-    Areas with little contrast are amplified less, because they are mostly noise.
+    Areas of low contrast are amplified less, because their contrast is mostly noise.
     """
     window = (2 * int(image.shape[1] * NORMALISATION_WINDOW / 2) + 1,) * 2
     centred = image.astype(np.float32)

@@ -1,7 +1,8 @@
 """Sub-pixel disparity from two views: dense Lucas-Kanade along the epipolar lines, for stereo and for motion.
 
-Depth is expressed as disparity of the stereo pair, d = f b / Z [px]. The two-view equations are linear in it, and a
-plane in space is a plane in disparity, d = c + a u + b v.
+Depth Z is expressed as disparity of the stereo pair, d = f b / Z [px], with focal length f and baseline b. In
+homogeneous coordinates, the projection into the other image is linear in d, and a plane in space is a plane in
+disparity, linear in the pixel coordinates u and v.
 """
 
 from __future__ import annotations
@@ -19,29 +20,32 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Marks unknown disparity inside the kernels; so far from any real value that the pixel never supports others.
+#: Marks unknown disparity inside the kernels; so far from any real disparity that such a pixel never supports others.
 UNKNOWN_PX = np.float32(-1e4)
-#: Neighbours support a pixel if their disparities differ by less than this [px]; otherwise they are on another surface.
+#: A neighbour supports the fit at a pixel if their disparities differ by less than this [px]; otherwise it is on
+#: another surface.
 SUPPORT_PX = 1.2
-#: Standard deviation of the prior of the correction and of the plane's slope [px, px/px]; effective without texture
-#: only.
+#: Standard deviations of the priors of the disparity correction [px] and of the slopes of the disparity plane [px/px];
+#: the priors only matter where there is no texture.
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
-#: Taper of the window (standard deviation) at low noise and at most [px]; median sigma that counts as low noise [px].
+#: Taper of the Gaussian window (its standard deviation) at low noise, largest taper, and largest median standard
+#: deviation of disparity that counts as low noise [px].
 TAPER_PX, MAX_TAPER_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
-#: Window in which brightness and contrast of the two images are equalised [px of images at half size].
+#: Side of the window in which brightness and contrast of the two images are equalised [px of images at half size].
 BALANCE_PX = 13
-#: Windows with a smaller correlation are mismatches.
+#: Windows with a smaller correlation of the two images are treated as mismatches.
 MIN_CORRELATION = 0.4
-#: Variance of the difference of two images due to rounding to grey levels alone.
+#: Variance of the difference of two images due to rounding to grey levels alone [grey levels squared].
 MIN_NOISE_VARIANCE = 1 / 6
-#: Per unit of noise variance: weights of the two priors, and the contribution of noise to a squared slope.
+#: Per unit of noise variance: weights of the two priors, and expected square of an image gradient due to noise alone.
 _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 
 
 class TwoView(NamedTuple):
     """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
 
-    The relative pose has rotation R and translation t; f is the focal length, b the baseline of the stereo pair.
+    K is the camera matrix, f the focal length, b the baseline of the stereo pair; the relative pose has rotation R and
+    translation t.
 
     Args:
         matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
@@ -56,12 +60,13 @@ class Refinement(NamedTuple):
     """Result of `refine`.
 
     Args:
-        disparity_px: (H, W) refined disparity [px]; NaN where it failed.
-        sigma_px: (H, W) standard deviation if the error of the initial disparity is `PRIOR_PX` [px].
-        gain: (H, W) fraction of an error of the initial disparity that the images correct: 1 on texture, 0 without.
+        disparity_px: (H, W) refined disparity [px]; NaN where the refinement failed.
+        sigma_px: (H, W) standard deviation of the refined disparity if that of the initial one is `PRIOR_PX` [px].
+        gain: (H, W) fraction of an error of the initial disparity that the refinement removes: 1 on texture, 0 without
+            texture.
         noise: standard deviation of the image noise in the difference of both images [grey levels].
-        variance_inflation: factor on the variance due to noise that neighbouring pixels share; not included in
-            `sigma_px`.
+        variance_inflation: factor by which correlated noise of neighbouring pixels increases the variance; not included
+            in `sigma_px`.
     """
 
     disparity_px: Map
@@ -72,7 +77,7 @@ class Refinement(NamedTuple):
 
     @property
     def measurement_sigma_px(self) -> Map:
-        """Standard deviation (H, W) of the disparity if the prior is not used; infinite without texture [px]."""
+        """Standard deviation (H, W) of the disparity without the prior, including `variance_inflation` [px]."""
         return _measurement_sigma(self.sigma_px, self.gain) * np.float32(self.variance_inflation**0.5)
 
 
@@ -83,9 +88,9 @@ def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> T
     """Returns the two-view geometry of a relative pose.
 
     Args:
-        other_from_reference: (4, 4) pose of the reference camera in the other one.
+        other_from_reference: (4, 4) pose of the reference camera in the other camera.
         matrix: (3, 3) camera matrix K of both cameras [px].
-        baseline_m: baseline of the stereo pair, which defines disparity.
+        baseline_m: baseline of the stereo pair, which defines disparity [m].
     """
     focal_baseline = matrix[0, 0] * baseline_m
     rotation, translation = other_from_reference[:3, :3], other_from_reference[:3, 3]
@@ -96,22 +101,22 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
     With the other image O warped by the current disparities d, each pixel measures e = d_true - d = (I - O) / (dO/dd).
-    A plane is fitted to the d + e of a window, weighted by (dO/dd)^2 and the taper of the window; its value at the
-    centre is the refined disparity. This value is unbiased on slopes and not biased towards whole pixels; neighbours on
-    another surface are excluded. Brightness and contrast of O are first equalised locally, because backscatter and
-    illumination change with the viewpoint.
+    A plane is fitted to the values d + e in a window, weighted by (dO/dd)^2 and the taper of the window; its value at
+    the centre is the refined disparity. This value is unbiased on inclined surfaces and not biased towards whole
+    pixels; neighbours on another surface are excluded. Brightness and contrast of O are first equalised locally,
+    because backscatter and illumination change with the viewpoint.
 
-    The variance is that of least squares with the noise of nearby residuals (smaller in dark and uniform areas), or of
-    the window's own residuals if they are larger. With strong noise, the window of the last iteration is larger. Slopes
-    that noise alone can cause do not count as texture. `measurement_sigma_px` agrees with the error to 15 % in clear
-    water; where noise is a fifth of the contrast, the error (mismatches included) is 1.3 times this value; where noise
-    is half of the contrast, 1.7 times.
+    The variance is the least-squares variance for a noise variance estimated from nearby residuals, or from the
+    residuals of the window itself if that estimate is larger. With strong noise, the window of the last iteration is
+    larger. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
+    agrees with the standard deviation of the error to 15 % in clear water; the error (mismatches included) is 1.3
+    times this value if the noise is one fifth of the image contrast, and 1.7 times if it is half of the contrast.
 
     Args:
         reference, other: (H, W) float32 grey images.
         disparity_px: (H, W) float32 initial disparity, NaN where unknown.
         view: two-view geometry of the images.
-        iterations: number of iterations.
+        iterations: number of Gauss-Newton iterations.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
     sigma, gain, mean_square, noise_variance, inflation, taper_px = fitted, fitted, fitted, 1.0, 1.0, TAPER_PX
@@ -137,12 +142,12 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) without the contribution of the prior."""
+    """Returns the standard deviation (H, W) of the disparity without the prior, from that with the prior."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
 def _choose_taper(sigma: Map, fitted: Map, taper_px: float) -> float:
-    """Returns the taper of the next window: larger if the median sigma is above `LOW_NOISE_SIGMA_PX`."""
+    """Returns the taper of the next window [px], larger if the median of `sigma` is above `LOW_NOISE_SIGMA_PX`."""
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
         return taper_px
@@ -150,7 +155,7 @@ def _choose_taper(sigma: Map, fitted: Map, taper_px: float) -> float:
 
 
 def _contrast(image: Map) -> Map:
-    """Returns the local variance (H, W) of an image, over a window similar to that of the fit."""
+    """Returns the local variance (H, W) of an image, in a window about as large as that of the plane fit."""
     mean = cv2.boxFilter(image, -1, (7, 7))
     return np.maximum(cv2.boxFilter(image * image, -1, (7, 7)) - mean * mean, 0)
 
@@ -159,7 +164,7 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
     """Warps the other image O to the reference I and equalises its local mean and standard deviation.
 
     Returns:
-        Residual I - O, slope dO/dd, and a mask of the pixels that are visible in O, each (H, W).
+        Residual I - O, image gradient dO/dd, and a mask of the pixels that are visible in O, each (H, W).
     """
     warped, slope = np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope)
@@ -176,7 +181,7 @@ def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
     count = _mean(weight) + 1e-3
     mean_i, mean_o = _mean(image * weight) / count, _mean(other * weight) / count
     power_i, power_o = _mean(image * image * weight) / count, _mean(other * other * weight) / count
-    floor = 4.0  # grey levels squared: keeps the gain near 1 without texture
+    floor = 4.0  # [grey levels squared]; keeps the gain near 1 where there is no texture
     gain = np.sqrt((np.maximum(power_i - mean_i**2, 0) + floor) / (np.maximum(power_o - mean_o**2, 0) + floor))
     return gain.astype(np.float32), (mean_i - gain * mean_o).astype(np.float32)
 
@@ -187,13 +192,13 @@ def _mean(image: Map) -> Map:
 
 
 def _taper(taper_px: float) -> Map:
-    """Returns the weights of a Gaussian window along one axis; `taper_px` is its standard deviation."""
+    """Returns the weights (n,) of a Gaussian window along one axis; `taper_px` is its standard deviation."""
     half = int(np.ceil(2 * taper_px))
     return np.exp(-0.5 * (np.arange(-half, half + 1) / taper_px) ** 2).astype(np.float32)
 
 
 def _noise_variance(residual: Map, visible: Mask) -> float:
-    """Returns a robust variance of the residuals (MAD), never below that of rounding to grey levels."""
+    """Returns a robust variance of the residuals, from their median absolute value; at least `MIN_NOISE_VARIANCE`."""
     sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
         return 1.0
@@ -201,10 +206,11 @@ def _noise_variance(residual: Map, visible: Mask) -> float:
 
 
 def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor on the variance of a window due to noise that neighbouring pixels share.
+    """Returns the factor by which correlated noise of neighbouring pixels increases the variance of a window's fit.
 
-    It is computed from the autocorrelation of the residuals that remain after the fit. Images behind a Bayer mosaic
-    have interpolated colours: with pixels taken as independent, the standard deviation was 1.6 times too small.
+    It is computed from the autocorrelation of the residuals that remain after the fit. The interpolated colours of a
+    Bayer sensor, for example, have correlated noise: with pixels treated as independent, the standard deviation of the
+    disparity was 1.6 times too small.
     """
     noise = np.where(visible, np.clip(remaining, -3 * variance**0.5, 3 * variance**0.5), 0)
     power = float(np.mean(noise * noise)) + 1e-6
@@ -213,16 +219,17 @@ def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float
 
 
 def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
-    """Returns the variance (H, W) of the residuals around each pixel, at most that of the whole image."""
+    """Returns the local mean square (H, W) of the residuals, from `MIN_NOISE_VARIANCE` to `max_variance`."""
     count = _mean(visible.astype(np.float32)) + 1e-3
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
 def _warp(reference, other, disparity, matrix, epipole, warped, slope):
-    """Writes the other image O, warped to the reference, and its slope dO/dd; returns which pixels are visible in O.
+    """Warps the other image O to the reference image, and returns which pixels are visible in O (H, W).
 
-    The gradient is the mean of both images; the gradient of a single image is biased by its noise and by interpolation.
+    Writes the warped image to `warped` and its gradient dO/dd to `slope`, both (H, W). The gradient is the mean of the
+    gradients of both images, because that of a single image is biased by its noise and by interpolation.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)
@@ -252,7 +259,10 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support):
-    """Adds a row of neighbours at offset (i, j) to the normal equations; written to be vectorised."""
+    """Adds the neighbours at offset (i, j) of a row of pixels to their normal equations `sums` (12, n), in place.
+
+    The loop is written so that the compiler can vectorise it.
+    """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
     for u in range(centre.size):
@@ -281,8 +291,8 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
     """Fits a plane to the disparities around each pixel.
 
     Returns:
-        Disparity at the centre, its variance at unit noise, gain (see `Refinement`) and mean squared residual, each
-        (H, W).
+        Disparity at the centre, its variance for a noise variance of 1, gain (see `Refinement`) and mean squared
+        residual, each (H, W).
     """
     height, width = disparity.shape
     half = taper.size // 2
@@ -319,9 +329,9 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
             step = (c00 * sums[6, u] + c01 * sums[7, u] + c02 * sums[8, u]) / det
             if abs(step) < 1:
                 fitted[v, u] = disparity[v, u] + step
-                # tapering increases the variance by sum w^2 / sum w
+                # the last factor accounts for the taper w in the variance: sum(w^2 g^2) / sum(w g^2)
                 unit_variance[v, u] = c00 / det * (sums[11, u] + p0) / a00
-                # squared slopes up to the mean plus three standard deviations of noise alone do not count as texture
+                # squared gradients up to mean + 3 sigma of those due to noise alone do not count as texture
                 noise_slopes = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))
                 gain[v, u] = max(sums[0, u] - noise_slopes, 0.03 * sums[0, u]) / a00
                 mean_square[v, u] = sums[9, u] / sums[10, u]

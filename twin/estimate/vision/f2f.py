@@ -13,19 +13,19 @@ from twin.estimate.vision import matching, observation_equations, two_view_motio
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.stereo import StereoPoints
 
-MAX_POINTS = 150  # only the strongest points; keyframes correct the drift of the frames between them
-_MIN_TRACKED = 0.7  # fraction of the reference points; below it, patches may have changed their appearance too
-_UNKNOWN_VARIANCE = 1.0  # normalised variance of the disparity, which a single image does not measure
+MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
+_MIN_TRACKED = 0.7  # smallest tracked fraction of the reference points; below it, the frame becomes the reference
+_UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
 
 class _Reference(NamedTuple):
-    """Reference image that frames are matched with, and its stereo points.
+    """Reference image with which frames are matched, and its points.
 
     Args:
         image: (height, width) normalised image.
         pixels: (n, 2) positions of the points in the image [px].
         measured: (n, 3) normalised (x, y, disparity).
-        cov: (n, 3, 3) covariance of each point in `measured`.
+        cov: (n, 3, 3) covariance of each row of `measured`.
     """
 
     image: matching.Image
@@ -43,21 +43,21 @@ class FrameToFrame:
     """Frame-to-frame motion by tracking the points of the last keyframe.
 
     Every frame is matched with the last keyframe, and structure is estimated together with motion
-    (`two_view_motion.pair_motion`); the motion between two frames is the difference of their poses in the keyframe.
-    Matching each frame with the previous one and taking depth as exact, as eq. (2) of Negahdaripour & Madjidi (2003)
-    does, biases the motion over the 15 frames between two keyframes, because matching errors add up: 1.25 mrad of pitch
-    over fine texture (0.1 +- 0.1 here) and 4 mrad over coarse texture, where depth is noisy (0.5 +- 0.7 here). The
-    standard deviation of the rotation falls from 0.6 to 0.35 mrad.
+    (`two_view_motion.pair_motion`); the motion between two frames follows from their poses relative to the keyframe.
+    The alternative is to match each frame with the previous one and to take depth as exact, as in eq. (2) of
+    Negahdaripour & Madjidi (2003). Its matching errors accumulate over the 15 frames between two keyframes: the bias of
+    pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is noisy
+    (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
 
-    If a step fails, the last motion is repeated, with a status and a large covariance.
+    If a step fails, the last motion is returned again, with a large covariance and the reason for the failure.
 
     Args:
         rig: calibration at the scale of the images.
-        patch_px: side of the tracking window.
+        patch_px: side of the tracking window [px].
 
     Attributes:
-        reference: image that frames are matched with, and its points; None before the first keyframe.
-        started: false until the first frame.
+        reference: image with which frames are matched, and its points; None before the first keyframe.
+        started: whether a frame has been processed.
         reference_from_current: (4, 4) pose of the last frame in the reference camera.
         last_motion: (4, 4) motion of the last step.
     """
@@ -70,7 +70,7 @@ class FrameToFrame:
         self.last_motion = np.eye(4)
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Makes a new keyframe the reference, with its strongest points (they are sorted by strength)."""
+        """Makes a new keyframe the reference, with the strongest of its points, which are sorted by strength."""
         strongest = slice(MAX_POINTS)
         self._set_reference(
             _Reference(image, points.pixels[strongest], points.measured[strongest], points.cov[strongest])
@@ -84,9 +84,9 @@ class FrameToFrame:
             interval_ratio: time since the last frame divided by the time between the two frames before.
 
         Returns:
-            The motion, and "ok" or the reason for a failure. The covariance is that of the pose of this frame in the
-            reference camera. Because the errors of successive motions partly cancel, the sum of their covariances is an
-            upper bound.
+            The motion, and "ok" or the reason for a failure. The covariance of the motion is that of the pose of this
+            frame in the reference camera. The errors of successive motions partly cancel, so the sum of their
+            covariances is an upper bound.
         """
         if not self.started:
             self.started = True
@@ -107,10 +107,10 @@ class FrameToFrame:
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> two_view_motion.Motion | None:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
-        If many points are lost, the image becomes the new reference, with the points tracked in it.
+        If many points are lost, the image becomes the new reference, with the points that were tracked to it.
 
         Returns:
-            The motion from the reference, or None if there are too few inliers.
+            The motion from the reference to the image, or None if there are too few inliers.
         """
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))

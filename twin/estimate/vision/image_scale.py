@@ -1,10 +1,10 @@
-"""Choice of the image scale: pixels are binned if the texture of the floor is coarser than the image noise.
+"""Choice of the image scale: pixels are binned if the texture is so coarse that many detected corners are noise.
 
 Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
-corners of the full image are matched in the right image: the other corners are noise, and F2F tracking fails within 18
-s. With pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors whose texture the full
-image resolves, 95 to 99 % are matched without binning. Larger patches alone do not help, because they keep the corners
-that are noise.
+corners of the full left image are matched in the right image: the other corners are noise, and F2F tracking fails
+within 18 s. With pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors with fine
+texture, 95 to 99 % are matched without binning. Larger patches alone do not help, because the same noise corners are
+detected.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning that matches enough corners, or else the one that matches most.
+    """Returns the smallest binning at which enough corners are matched, otherwise the one at which most are matched.
 
     Args:
         left, right: (height, width, 3) images of the first keyframe.
-        rig: calibration of the full images.
+        rig: calibration at full image size.
         settings: settings of the estimators.
 
     Returns:
@@ -43,7 +43,7 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
 def _matched_fraction(
     left_rgb: Image, right_rgb: Image, binning: int, rig: StereoRig, settings: EstimatorSettings
 ) -> float:
-    """Returns the fraction of the corners with a coarse disparity that are matched to sub-pixel accuracy."""
+    """Returns the fraction of the corners with a dense disparity that are also matched to sub-pixel accuracy."""
     left, right = matching.gray(left_rgb, binning), matching.gray(right_rgb, binning)
     max_disparity_px = disparity.SearchRange(rig).max_disparity_px
     dense_px = disparity.search(matching.normalise(left), matching.normalise(right), max_disparity_px)

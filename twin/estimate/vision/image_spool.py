@@ -18,13 +18,14 @@ _CACHE_BYTES = 384 * 2**20
 
 
 class ImageSpool:
-    """Stereo pairs on disk as lossless PNG, with a cache of the most recently used grey levels in memory.
+    """Stores stereo pairs on disk as lossless PNG, with a cache of the most recently used grey levels in memory.
 
-    Memory does not grow with the length of the survey. Reading is thread-safe.
+    The cache has a fixed size, so memory does not grow with the length of the survey. `gray` may be called from several
+    threads.
 
     Args:
         folder: folder of the images; created if missing.
-        binning: binning of the grey levels.
+        binning: binning of the grey levels (the images on disk have full size).
     """
 
     def __init__(self, folder: Path, binning: int = 1):
@@ -52,7 +53,11 @@ class ImageSpool:
             self._cache(row, gray)
 
     def flush(self) -> None:
-        """Waits until all pairs are written. Raises OSError if writing failed."""
+        """Waits until the last pair is written.
+
+        Raises:
+            OSError: the pair could not be written.
+        """
         if self._writing is not None:
             writing, self._writing = self._writing, None
             writing.result()
@@ -62,12 +67,12 @@ class ImageSpool:
         self._writer.shutdown()
 
     def pair(self, row: int) -> tuple[Image, Image]:
-        """Returns the left and right image (height, width, 3) of a keyframe."""
+        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`."""
         self.flush()
         return self._read(row, "left"), self._read(row, "right")
 
     def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
-        """Returns the binned grey levels of the left and right image (`matching.gray`)."""
+        """Returns the binned grey levels of the left and the right image of a keyframe (`matching.gray`)."""
         with self._lock:
             if row not in self._gray:
                 left, right = self.pair(row)
@@ -77,7 +82,7 @@ class ImageSpool:
         return left.astype(np.float32), right.astype(np.float32)
 
     def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
-        """Adds grey levels to the cache, and drops the least recently used ones beyond its size."""
+        """Adds the grey levels of a pair to the cache; removes the least recently used pairs beyond `_CACHE_BYTES`."""
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
         while len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
@@ -89,10 +94,10 @@ class ImageSpool:
             self._path(row, side).write_bytes(data.tobytes())
 
     def _path(self, row: int, side: str) -> Path:
-        """Returns the file of an image; `side` is "left" or "right"."""
+        """Returns the path of an image file; `side` is "left" or "right"."""
         return self.folder / f"{row:06d}_{side}.png"
 
     def _read(self, row: int, side: str) -> NDArray[np.uint8]:
-        """Reads an image (height, width, 3)."""
+        """Returns an image (height, width, 3) RGB from disk."""
         data = np.fromfile(self._path(row, side), np.uint8)
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)

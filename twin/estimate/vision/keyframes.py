@@ -13,7 +13,7 @@ from twin.estimate.vision.stereo import StereoPoints
 
 @dataclass
 class Keyframe:
-    """Stereo pair on the path ("key point" in Negahdaripour & Madjidi 2003).
+    """Frame with a stereo pair whose pose the network estimates ("key point" in Negahdaripour & Madjidi 2003).
 
     Its fields are updated in place during the survey.
 
@@ -22,10 +22,10 @@ class Keyframe:
         row: index of its frame in the trajectories.
         track: number of its track, from 1.
         world_from_camera: (4, 4) best pose estimate so far.
-        points: matched stereo points; only kept while this is the newest keyframe.
+        points: matched stereo points; None once a newer keyframe has been added.
         readings: readings of the navigation sensors.
-        dvl_displacement: displacement since the previous node, measured by the DVL; None without DVL, or if the link
-            to the previous node is the F2F motion, which already includes it.
+        dvl_displacement: displacement since the previous node, measured by the DVL; None if it was not measured, or if
+            the link to the previous node is the F2F motion, which already includes the DVL.
         accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the part that registrations
             with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference between two
             keyframes is the covariance of the motion between them.

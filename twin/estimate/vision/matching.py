@@ -1,6 +1,6 @@
 """Image normalisation, corner detection, and Lucas-Kanade tracking from frame to frame.
 
-Stereo and the links between keyframes need higher accuracy than Lucas-Kanade: see `patches.match_templates`.
+Stereo and the links between keyframes need a higher accuracy than Lucas-Kanade gives: see `patches.match_templates`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _FORWARD_BACKWARD_PX = 0.5
 
 
 def gray(rgb: Image, binning: int = 1) -> Gray:
-    """Returns slightly smoothed grey levels (height / binning, width / binning), on which patches are matched.
+    """Returns the slightly smoothed grey levels (height / binning, width / binning) in which patches are matched.
 
-    Binned images are limited by noise, so they use the mean of the colour bands: over the coarse floor of the scenario
-    `paper_coarse` its signal-to-noise ratio is 1.14 times that of luma, and the final position error is a fifth
-    smaller.
+    Noise limits the matching of binned images, so their grey levels are the mean of the colour bands. Over the coarse
+    floor of the scenario `paper_coarse`, the signal-to-noise ratio of this mean is 1.14 times that of luma, and the
+    final position error is a fifth smaller.
 
     Args:
         rgb: (height, width, 3) image.
@@ -49,7 +49,8 @@ def normalise(levels: Gray) -> Image:
 
     Returns:
         (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
-        surroundings, which are cut off at the border, so they do not permit matching to a hundredth of a pixel.
+        surroundings of a pixel, which are cut off at the image border, so they do not permit matching to a hundredth
+        of a pixel.
     """
     mean, square = _local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
@@ -60,7 +61,7 @@ def normalise(levels: Gray) -> Image:
 def contrast(levels: Gray) -> float:
     """Returns the local RMS contrast of an image: standard deviation / mean, median over the image.
 
-    The image must not be normalised. Noise contributes to contrast, and dominates it in dark or turbid images.
+    The image must not be normalised. The contrast includes image noise, which dominates it in dark or turbid images.
     """
     mean, square = (moment[::4, ::4] for moment in _local_moments(levels))
     sigma = np.sqrt(np.maximum(square - mean**2, 0))
@@ -68,7 +69,7 @@ def contrast(levels: Gray) -> float:
 
 
 def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
-    """Returns the mean and mean square around each pixel, in a window as wide as an eighth of the image."""
+    """Returns the mean and the mean square (H, W) around each pixel, in a square window 1/8 as wide as the image."""
     size = (levels.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
     square = cv2.sqrBoxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
@@ -103,17 +104,17 @@ def _normalise(gray, mean, square, normalised):
 def corners(image: Image, count: int, patch_px: int) -> Points:
     """Returns well-textured points, spread over the image, whose patches lie inside it.
 
-    Coarse texture has few corners, and most of its information lies between them. If there are fewer than half as many
-    corners as requested, the points form a grid: over texels of 12 px the rotation error over three keyframes is then
-    4.5 mrad instead of 7.6 mrad.
+    Coarse texture has few corners, and most of its information lies between them. If fewer than half of the requested
+    number of corners are found, the points are taken from a grid instead: with texels of 12 px, this reduces the
+    rotation error over three keyframes from 7.6 to 4.5 mrad.
 
     Args:
         image: (height, width) normalised image.
         count: largest number of points.
-        patch_px: side of the patches.
+        patch_px: side of the patches [px].
 
     Returns:
-        (n, 2) float32 [px], strongest first.
+        (n, 2) float32 positions [px], strongest first.
     """
     height, width = image.shape
     margin, block = patch_px // 2 + 2, 7
@@ -141,12 +142,12 @@ def track(
         source, target: normalised images of the same shape.
         points: (n, 2) positions in the source [px].
         guess: (n, 2) expected positions in the target [px].
-        patch_px: side of the window.
-        levels: pyramid levels above the full image.
+        patch_px: side of the window [px].
+        levels: number of pyramid levels above the full image.
 
     Returns:
-        (n, 2) positions in the target [px], and (n,) bool, true if the point is tracked back to within half a pixel
-        and its window is inside the image.
+        (n, 2) positions in the target [px], and (n,) bool, true where tracking back to the source returns to within
+        half a pixel of the point and the window is inside the target.
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
@@ -160,7 +161,7 @@ def track(
 def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
-    """Returns positions (n, 2) in the target, and which points were tracked (n,)."""
+    """Returns the positions (n, 2) in the target [px], and which points were tracked (n,)."""
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,
@@ -181,10 +182,10 @@ def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: floa
 
 
 def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
-    """Returns the factor on a covariance that was computed for independent points (n, 2).
+    """Returns the factor by which to multiply a covariance that was computed for independent points (n, 2).
 
-    Overlapping patches share pixels, so their errors are correlated. The variance of a mean is inflated by the
-    summed overlap of a patch with all patches, averaged over the patches (design effect, Kish 1965).
+    Overlapping patches share pixels, so their errors are correlated. For a mean over the points, the factor is the
+    summed overlap of a patch with all patches, itself included, averaged over the patches (design effect, Kish 1965).
     """
     if len(points) == 0:
         return 1.0

@@ -1,14 +1,14 @@
-"""Local 2.5-D mosaic, and the registration of frames with it (F2M): six degrees of freedom over any relief.
+"""Local 2.5-D mosaic, and the registration of frames with it (F2M) in six degrees of freedom over any relief.
 
-The mosaic is a raster in world coordinates: normalised brightness and elevation per cell, and the keyframe that each
-cell was taken from. Cells are never overwritten, because the pose of the oldest keyframe has drifted least. A frame is
-registered by direct image alignment: textured cells are projected into the frame, and the pose is optimised until the
-brightness agrees (Gauss-Newton with Huber weights).
+The mosaic is a raster in world coordinates. Each cell has a normalised brightness, an elevation and the number of the
+keyframe that they come from. Cells are never overwritten, because the pose of the oldest keyframe has drifted least. A
+frame is registered by direct image alignment: textured cells are projected into the frame, and the pose is adjusted to
+minimise the differences of brightness (Gauss-Newton with Huber weights).
 
-The residuals are dominated by errors of height and by uneven illumination rather than by pixel noise, and neighbouring
-cells share them. Over a floor of coarse texture, with cells taken as independent, the computed standard deviation of
-the rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore that of clustered data (Liang &
-Zeger 1986), with blocks of the image as clusters.
+The residuals are dominated not by pixel noise but by errors of height and by uneven illumination, which neighbouring
+cells share. Over a floor of coarse texture, with cells treated as independent, the computed standard deviation of the
+rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore computed as for clustered data
+(Liang & Zeger 1986), with blocks of the image as clusters.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from twin.estimate.vision.tiles import TiledRaster
 _MAX_CELLS = 4000
 _MIN_CELLS = 300
 _MIN_GRADIENT = 4.0  # grey levels per cell
-_MAX_RESIDUAL = 40.0  # grey levels; inliers are far below this, the standard deviation of an image is 36
+_MAX_RESIDUAL = 40.0  # grey levels; residuals of inliers are far smaller (standard deviation of a normalised image: 36)
 _ITERATIONS = 8
-_BLOCKS = (6, 8)  # rows and columns of blocks of the image, each about as wide as the normalisation window
+_BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide as the normalisation window
 
 
 class Registration(NamedTuple):
     """Result of a registration with the mosaic.
 
     Args:
-        correction: estimated pose of the frame relative to its predicted pose (predicted_from_true).
-        reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells are from this
-            keyframe or older keyframes.
+        correction: estimated pose of the frame in the camera at its predicted pose (predicted_from_estimated).
+        reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells come from this
+            keyframe or older ones.
     """
 
     correction: two_view_motion.Motion
@@ -49,25 +49,25 @@ class Registration(NamedTuple):
 
 
 class Mosaic:
-    """Raster of brightness, elevation and keyframe number, in tiles: memory does not grow with the area.
+    """Raster of brightness, elevation and keyframe number, stored in tiles so that memory does not grow with the area.
 
     Args:
         cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
             the world, and row numbers increase to the north.
-        folder: folder of the tiles on disk.
+        folder: folder for the tiles on disk.
     """
 
     def __init__(self, cell_m: float, folder: Path):
         self.cell_m, self.cells = cell_m, TiledRaster(3, folder)
 
     def clear(self) -> None:
-        """Removes all cells; used before the mosaic is rebuilt after a global alignment."""
+        """Empties all cells, before the mosaic is rebuilt after a global alignment."""
         self.cells.clear()
 
     def add(
         self, number: int, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
     ) -> None:
-        """Adds a keyframe to the empty cells of the mosaic.
+        """Fills empty cells of the mosaic from a keyframe.
 
         Args:
             number: number of the keyframe.
@@ -107,7 +107,7 @@ class Mosaic:
             rig: calibration at the scale of the image.
 
         Returns:
-            The pose correction with its covariance, or None if too few cells are textured or agree.
+            The pose correction with its covariance, or None if too few cells are textured or have small residuals.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], footprint_m)
         if cells is None:
@@ -130,18 +130,21 @@ class Mosaic:
         inverse = np.linalg.inv(normal)
         cov = np.asarray(inverse @ scatter @ inverse.T, np.float64)
         correction = geometry.inverse(world_from_camera) @ current
-        median = np.partition(keyframe[used], n_used // 2)[n_used // 2]  # unlike np.median, always one of the numbers
+        median = np.partition(keyframe[used], n_used // 2)[n_used // 2]  # unlike np.median, an existing number
         return Registration(two_view_motion.Motion(correction, cov, n_used, sigma), int(median))
 
     def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
-        """Returns first row, first column and side of the square of cells around a position."""
+        """Returns the first row, the first column and the side, in cells, of the square around a position."""
         half = int(np.ceil(half_m / self.cell_m))
         return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
     def _textured_cells(
         self, centre: Array, half_m: float
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
-        """Returns world points (n, 3), brightness (n,) and keyframe number (n,) of the textured cells in a square."""
+        """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
+
+        If more than about `_MAX_CELLS` cells are textured, every n-th of them is returned; None if there are too few.
+        """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
         if side < 8:
@@ -169,10 +172,9 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 
 @njit(cache=True, nogil=True)
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
-    """Fills empty cells with the mean height of the pixels in the cell and the brightness at the projected cell centre.
+    """Fills empty cells with the mean height of their pixels and the image brightness at the projected cell centre.
 
-    Taking the brightness of the pixels in the cell instead would bias the position by 5 mm, because they are not at the
-    cell's centre.
+    The brightness of the pixels in the cell would bias the position by 5 mm, because they are not at the cell's centre.
     """
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)
@@ -209,17 +211,17 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
     Args:
         points: (n, 3) positions of the cells in the world [m].
-        brightness: (n,) brightness of the cells [grey levels].
-        frame: (height, width) brightness of the frame [grey levels].
+        brightness: (n,) brightness of the cells [normalised grey levels].
+        frame: (height, width) brightness of the frame [normalised grey levels].
         depth: (height, width) depth of the frame [m].
         camera_from_world: (4, 4) pose of the world in the camera.
         camera: focal length, column and row of the principal point [px].
         max_residual: largest brightness residual of an inlier [grey levels].
 
     Returns:
-        Jacobian (m, 6) of the projected brightness with respect to the motion, with the depth of the mosaic; the same
-        Jacobian with the depth of the frame; residuals (m,); index of the image block of each (m,); and a mask of the
-        cells that are used (n,).
+        Jacobian (m, 6) of the frame's brightness at the projected cells with respect to the motion, with depth from the
+        mosaic; the same Jacobian with depth from the frame; residuals (m,); index of the image block of each residual
+        (m,); and a mask of the cells that are used (n,).
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
@@ -258,10 +260,10 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
 @njit(cache=True, nogil=True)
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
-    """Returns the weighted normal equations of the motion.
+    """Computes the weighted normal equations of the motion.
 
-    The Jacobian with the frame's depth serves as instrumental variables: its errors are independent of those of the
-    mosaic's depth, which would otherwise bias the solution.
+    The Jacobian with the depth from the frame provides instrumental variables: its errors are independent of the errors
+    of the depth from the mosaic, which would otherwise bias the solution.
 
     Returns:
         Normal matrix (6, 6), right-hand side (6,), scatter matrix (6, 6) of the right-hand side over the blocks of the
