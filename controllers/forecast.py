@@ -97,7 +97,7 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """Computes the clearance of the planned path above the floor in the footprints along the path and between them.
+    """Returns the least height of the planned path above the floor, within the image footprints and between the swaths.
 
     Args:
         plan: the survey plan.

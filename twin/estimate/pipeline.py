@@ -287,8 +287,9 @@ class Navigator:
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
         """Corrects the online pose by registration with the mosaic (F2M).
 
-        The compared part of the mosaic has the pose error of the keyframe that it was taken from, so the correction is
-        weighted by the covariance of the motion since that keyframe only.
+        The part of the mosaic that the image is registered with has the pose error of the keyframe that it was taken
+        from. The correction is therefore weighted by the covariance of the motion since that keyframe, not by that of
+        the pose.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov

@@ -110,7 +110,7 @@ def improvement(gain: float | None) -> str:
 
 
 def milliseconds(value_ms: float | None) -> str:
-    """Returns a duration as text, in ms below one second and in s from one second; a dash for None."""
+    """Returns a duration as text, in ms if shorter than one second, otherwise in s; a dash for None."""
     return DASH if value_ms is None else f"{value_ms:.3g} ms" if value_ms < 1e3 else f"{value_ms / 1e3:.2f} s"
 
 

@@ -1,4 +1,4 @@
-"""Rendered surveys that collect comparison statistics, and the fit of the surrogate's error model to them."""
+"""Flies rendered surveys, compares their image measurements with the surrogate's, and fits the error model to them."""
 
 from __future__ import annotations
 

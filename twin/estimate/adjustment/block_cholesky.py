@@ -131,7 +131,7 @@ def _set_diagonal(s, diagonal, panels):
 
 @njit(cache=True, nogil=True)
 def _add(s, start, blocks, panels):
-    """Adds blocks (k, 6, 6) to the off-diagonal blocks from number `start` on."""
+    """Adds `blocks` (k, 6, 6) element by element to the k off-diagonal blocks that start at index `start`."""
     for k in range(len(blocks)):
         row, column = s.off_diagonal[start + k]
         p = s.panel_of[column]
