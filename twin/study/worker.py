@@ -81,7 +81,7 @@ class Worker:
         return Reply("timeout", reason=f"did not finish within {timeout_s:g} s")
 
     def kill(self) -> None:
-        """Kills the process if it is still running. Thread-safe; a concurrent `run` returns a reply of kind "killed"."""
+        """Kills the process if it still exists. Thread-safe; a concurrent `run` returns a reply of kind "killed"."""
         self._process.kill()
         self._process.wait()
 

@@ -156,7 +156,7 @@ class SurrogateVision:
 
     @property
     def bounds_px(self) -> tuple[float, float]:
-        """Returns the smallest and the largest Cramer-Rao bound of image matching over the range of floor depths [px]."""
+        """Returns the smallest and the largest Cramer-Rao bound of matching over the range of floor depths [px]."""
         bounds_px = self.scene.matchability.bounds_px
         return float(bounds_px.min()), float(bounds_px.max())
 
