@@ -1,4 +1,4 @@
-"""One survey of a study: flies it, keeps the requested output files, and returns its row of results."""
+"""Flies one survey of a study, keeps the requested output files, and returns its row of results."""
 
 from __future__ import annotations
 

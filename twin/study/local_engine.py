@@ -1,4 +1,4 @@
-"""Engine on worker processes of this machine."""
+"""Execution engine that runs tasks in worker processes on this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flies rendered surveys, compares their image measurements with the surrogate's, and fits the error model to them."""
+"""Flies rendered surveys, compares their image measurements with the surrogate's, and fits the error model."""
 
 from __future__ import annotations
 
