@@ -139,7 +139,7 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe (`new_*`)."""
+    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
