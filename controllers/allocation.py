@@ -17,7 +17,7 @@ class ThrustAllocation(NamedTuple):
 
     Args:
         thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrust configuration matrix.
-        command_table: (k,) increasing commands within the range in which thrust increases with the command.
+        command_table: (k,) increasing commands, over the range in which thrust increases with the command.
         thrust_table_n: (k,) steady thrust at the commands of `command_table` [N].
     """
 

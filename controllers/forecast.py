@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,6 +13,9 @@ from controllers.survey_plan import SurveyPlan
 
 Array = NDArray[np.float64]
 
+#: Largest number of floor heights that `least_clearance` samples.
+MAX_CLEARANCE_SAMPLES = 20_000_000
+
 
 class Forecast(NamedTuple):
     """Predicted properties of a survey, for a floor at the reference plane z = 0.
@@ -19,7 +23,7 @@ class Forecast(NamedTuple):
     Args:
         n_frames_per_keyframe: N, frames from one keyframe to the next.
         keyframes_per_swath: M, number of keyframes on a leg or loop.
-        n_tracks: L, number of tracks.
+        n_tracks: L, number of planned tracks.
         n_keyframes, n_frames: totals of the survey, without station keeping.
         duration_s, path_m: totals of the survey, without station keeping.
         speed_mps: cruise speed along the swaths.
@@ -85,8 +89,9 @@ class Clearance(NamedTuple):
     """Clearance of a planned path above the floor.
 
     Args:
-        least_m: least height of the camera above the checked floor; infinite if no floor was found.
-        x_m, y_m: position of the highest point of the checked floor.
+        least_m: least height of the camera above the highest floor near it; infinite if no floor was found.
+        x_m, y_m: where the clearance is least: the floor point for a level path, the camera for a path that follows the
+            floor.
         inside: whether the whole path lies above the terrain.
     """
 
@@ -97,24 +102,29 @@ class Clearance(NamedTuple):
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
-    """Returns the least height of the planned path above the floor, within the image footprints and between the swaths.
+    """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
 
     Args:
         plan: the survey plan.
         height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain. The terrain must
             be a rectangle: the path is taken to lie inside if all its waypoints do.
-        sample_m: sampling distance of the heights.
+        sample_m: sampling distance of the heights. It is increased if there would be more than
+            `MAX_CLEARANCE_SAMPLES` samples: at 2 cm, for areas above 8000 m2.
     """
-    path = plan.outline()[:, :2]
-    along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along x
+    outline = plan.outline()[:, :2]
+    path = np.column_stack(plan.area.to_legs(*outline.T))
+    along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along the legs
     south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
+    area_m2 = (north - south) * (np.ptp(path[:, 0]) + 2 * along_m)
+    sample_m = max(sample_m, math.sqrt(area_m2 / MAX_CLEARANCE_SAMPLES))
     # Processed row by row to limit memory on a large floor.
     tops = []
     for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
         near = path[np.abs(path[:, 1] - y) <= across_m + 1e-9, 0]
         west, east = near.min() - along_m, near.max() + along_m
         x = np.linspace(west, east, round((east - west) / sample_m) + 2)
-        row = np.nan_to_num(height_at(x, np.full_like(x, y)), nan=-np.inf)
+        row = np.nan_to_num(height_at(*plan.area.to_scene(x, np.full_like(x, y))), nan=-np.inf)
         tops.append((float(row.max()), float(x[row.argmax()]), float(y)))
-    height, x, y = max(tops)
-    return Clearance(plan.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*path.T)).all()))
+    height, u, v = max(tops)
+    x, y = (float(c) for c in plan.area.to_scene(u, v))
+    return Clearance(plan.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*outline.T)).all()))

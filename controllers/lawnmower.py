@@ -1,7 +1,9 @@
 """Lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
 
-The bow always points east, and every second leg is flown backwards. The top of the image therefore always points east:
-consecutive keyframes are displaced along the image height, neighbouring swaths along the image width.
+By default the bow always points along the first leg (east if the heading is 0), and every second leg is flown
+backwards, so the images of all legs have the same orientation. With `turns` = "bow_first" the vehicle turns by 180
+degrees at the end of each leg, alternately counter-clockwise and clockwise so that a tether is not twisted. In both
+cases consecutive keyframes are displaced along the image height, neighbouring swaths along the image width.
 """
 
 from __future__ import annotations
@@ -9,15 +11,31 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-from controllers.segments import Point, Segment, line
-from controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, frames_per_keyframe, n_tracks_to_fly
+import numpy as np
+
+from controllers.profile import SpeedProfile
+from controllers.segments import Point, Segment, Turn, line
+from controllers.survey_area import SurveyArea
+from controllers.survey_plan import (
+    TURN_ACCELERATION,
+    TURN_RATE,
+    SurveyPlan,
+    SurveyRequest,
+    check_request,
+    frames_per_keyframe,
+    n_tracks_to_fly,
+)
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
     """Plans a lawnmower survey of an area (Negahdaripour & Madjidi 2003, section III-A).
 
-    The legs run along x, at most (1 - overlap_across) ImgSize Altitude / FocalLength apart (ImgSize is the image
-    width). They are the centre lines of an even number of equal strips of the area; the first leg is the southernmost.
+    The legs run along the heading of the area. Their distance is at most (1 - overlap_across) ImgSize Altitude /
+    FocalLength (ImgSize is the image width), times `across_scale` of the request. The extent of the area is divided
+    into an even number of strips of equal width, with a leg along the centre line of each; the first leg is the
+    rightmost as seen along the heading. In a polygon, a leg spans the extent of the polygon within its strip. Of two
+    neighbouring legs, the shorter is extended at the end where they are joined, so that the segment between them is
+    perpendicular to both.
 
     Args:
         request: requirements of the survey.
@@ -25,35 +43,68 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         TwinError: a requirement is invalid or cannot be met.
     """
     check_request(request)
-    length_m, width_m = request.area_m
-    max_spacing_m = (1 - request.overlap_across) * request.footprint_m[0]
+    area = request.area or SurveyArea("rectangle", request.area_m)
+    width_m = area.size_m[1]
+    max_spacing_m = (1 - request.overlap_across) * request.footprint_m[0] * request.across_scale
     # Tolerance: a strip that exceeds the limit only by rounding must not add a track.
     n_filling = math.ceil(width_m / max_spacing_m / 2 - 1e-9)
     n_tracks = n_tracks_to_fly(request, n_filling)
     spacing_m = width_m / (2 * n_filling)
+    legs = _leg_extents(area, spacing_m, 2 * n_filling)
+    corners = [_corners(area, legs, spacing_m, track, last=track == n_tracks) for track in range(1, n_tracks + 1)]
     return SurveyPlan(
-        paths=tuple(_track(request, spacing_m, track, last=track == n_tracks) for track in range(1, n_tracks + 1)),
-        area_m=request.area_m,
+        paths=tuple(_track(request, area, track) for track in corners),
+        area=area,
         altitude_m=request.altitude_m,
         speed_mps=request.speed_mps,
         frame_rate_hz=request.frame_rate_hz,
         n_frames_per_keyframe=frames_per_keyframe(request, request.speed_mps),
-        swath_length_m=length_m,
+        swath_length_m=float(np.mean([end - start for start, end in legs])),
         swath_spacing_m=spacing_m,
+        n_tracks_to_fill=n_filling,
         footprint_m=request.footprint_m,
         side_along_m=request.footprint_m[1],
         side_across_m=request.footprint_m[0],
         focal_px=float(request.focal_px),
         acceleration_mps2=request.acceleration_mps2,
+        surface=request.surface,
     )
 
 
-def _track(request: SurveyRequest, spacing_m: float, track: int, last: bool) -> tuple[Segment, ...]:
-    """Returns the segments of a track (from 1): leg, cross segment, return leg, segment to the next track if any."""
-    half_x, half_y = request.area_m[0] / 2, request.area_m[1] / 2
-    south = (2 * track - 1.5) * spacing_m - half_y
-    out = [(-half_x, south), (half_x, south)]
-    back = [(half_x, south + spacing_m), (-half_x, south + spacing_m)]
-    onward = [] if last else [(-half_x, south + 2 * spacing_m)]
-    corners: list[Point] = [(x, y, request.altitude_m) for x, y in out + back + onward]
-    return tuple(line(a, b, request.speed_mps, request.acceleration_mps2) for a, b in pairwise(corners))
+def _leg_extents(area: SurveyArea, spacing_m: float, n_legs: int) -> list[tuple[float, float]]:
+    """Returns for each leg the least and the greatest u [m] of the area within the leg's strip."""
+    south_m = -area.size_m[1] / 2
+    return [area.extent_between(south_m + k * spacing_m, south_m + (k + 1) * spacing_m) for k in range(n_legs)]
+
+
+def _corners(
+    area: SurveyArea, legs: list[tuple[float, float]], spacing_m: float, track: int, last: bool
+) -> list[tuple[float, float]]:
+    """Returns the corners (u, v) of a track (from 1) in the axes of the legs [m].
+
+    They are the two ends of the first leg, the two ends of the return leg and, except for the last track, the start of
+    the next track.
+    """
+    first = 2 * (track - 1)  # index of the track's first leg
+    south = (2 * track - 1.5) * spacing_m - area.size_m[1] / 2
+    start = min(u for u, _ in legs[max(first - 1, 0) : first + 1])
+    turn = max(u for _, u in legs[first : first + 2])
+    end = legs[first + 1][0] if last else min(u for u, _ in legs[first + 1 : first + 3])
+    out, back = [(start, south), (turn, south)], [(turn, south + spacing_m), (end, south + spacing_m)]
+    return [*out, *back, *([] if last else [(end, south + 2 * spacing_m)])]
+
+
+def _track(request: SurveyRequest, area: SurveyArea, corners: list[tuple[float, float]]) -> tuple[Segment, ...]:
+    """Returns the segments of a track between its corners (u, v) in the axes of the legs [m], with turns if asked."""
+    scene = [area.to_scene(u, v) for u, v in corners]
+    points: list[Point] = [(float(x), float(y), request.altitude_m) for x, y in scene]
+    turning = request.turns == "bow_first"
+    segments: list[Segment] = []
+    for k, (a, b) in enumerate(pairwise(points)):
+        reversed_bow = turning and k in (1, 2)
+        yaw = area.heading + (math.pi if reversed_bow else 0.0)
+        segments.append(line(a, b, request.speed_mps, request.acceleration_mps2, yaw))
+        if turning and (k == 0 or (k == 2 and len(points) > 4)):  # at the end of a leg, except the last one
+            profile = SpeedProfile(math.pi, TURN_RATE, TURN_ACCELERATION)
+            segments.append(Turn(b, yaw, -1.0 if reversed_bow else 1.0, profile))
+    return tuple(segments)

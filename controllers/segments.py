@@ -1,4 +1,4 @@
-"""Segments of a planned path: straight lines and full circles, each flown from rest to rest."""
+"""Segments of a planned path: straight lines, full circles and turns on the spot, each flown from rest to rest."""
 
 from __future__ import annotations
 
@@ -33,11 +33,17 @@ class Reference(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Straight line from a start point [m] along a unit direction."""
+    """Straight line from a start point [m] along a unit direction, with the bow at a constant yaw [rad]."""
 
     start: Point
     direction: Point
     profile: SpeedProfile
+    yaw: float = 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Returns the path length [m]."""
+        return self.profile.length_m
 
     def points(self) -> Array:
         """Returns the two end points (2, 3) [m]."""
@@ -45,26 +51,35 @@ class Line(NamedTuple):
         return np.stack([start, start + self.profile.length_m * np.array(self.direction)])
 
     def at(self, times_s: Array) -> Reference:
-        """Returns the camera reference at times (n,) since the start, with yaw 0 (bow east)."""
+        """Returns the camera reference at times (n,) since the start [s]."""
         distance, speed, acceleration = _along(self.profile, times_s)
         direction = np.array(self.direction)
         position = np.array(self.start) + distance * direction
-        return Reference(position, speed * direction, np.zeros(len(times_s)), acceleration * direction)
+        return Reference(position, speed * direction, np.full(len(times_s), self.yaw), acceleration * direction)
 
 
 class Circle(NamedTuple):
-    """Full horizontal circle, counter-clockwise from the start point back to it; start and centre in metres."""
+    """Full horizontal circle, counter-clockwise from the start point back to it; start and centre in metres.
+
+    The bow keeps a constant yaw [rad].
+    """
 
     start: Point
     centre: Point
     profile: SpeedProfile
+    yaw: float = 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Returns the path length [m]."""
+        return self.profile.length_m
 
     def points(self) -> Array:
         """Returns points along the circle (n, 3) [m], one every 2 degrees; the first and the last are equal."""
         return self._from_centre(np.linspace(0, 2 * np.pi, _CIRCLE_POINTS)) + np.array(self.centre)
 
     def at(self, times_s: Array) -> Reference:
-        """Returns the camera reference at times (n,) since the start, with yaw 0 (bow east)."""
+        """Returns the camera reference at times (n,) since the start [s]."""
         distance, speed, acceleration = _along(self.profile, times_s)
         radius_m = math.dist(self.start, self.centre)
         radial = self._from_centre(distance[:, 0] / radius_m) / radius_m
@@ -72,7 +87,7 @@ class Circle(NamedTuple):
         return Reference(
             np.array(self.centre) + radius_m * radial,
             speed * tangent,
-            np.zeros(len(times_s)),
+            np.full(len(times_s), self.yaw),
             acceleration * tangent - speed**2 / radius_m * radial,
         )
 
@@ -83,7 +98,38 @@ class Circle(NamedTuple):
         return np.stack([c * x - s * y, s * x + c * y, np.zeros_like(c)], axis=-1)
 
 
-Segment = Line | Circle
+class Turn(NamedTuple):
+    """Turn on the spot: the vehicle rotates about the vertical axis through the camera, whose position does not change.
+
+    Args:
+        position: position of the camera [m].
+        yaw: yaw at the start [rad].
+        sense: +1 counter-clockwise, -1 clockwise.
+        profile: profile of the rotation angle, in rad, rad/s and rad/s2 instead of m, m/s and m/s2.
+    """
+
+    position: Point
+    yaw: float
+    sense: float
+    profile: SpeedProfile
+
+    @property
+    def length_m(self) -> float:
+        """Returns the path length, 0 [m]."""
+        return 0.0
+
+    def points(self) -> Array:
+        """Returns the position (1, 3) [m]."""
+        return np.array([self.position])
+
+    def at(self, times_s: Array) -> Reference:
+        """Returns the camera reference at times (n,) since the start [s]."""
+        angle = _along(self.profile, times_s)[0, :, 0]
+        still = np.zeros((len(times_s), 3))
+        return Reference(still + self.position, still, self.yaw + self.sense * angle, still.copy())
+
+
+Segment = Line | Circle | Turn
 
 
 def _along(profile: SpeedProfile, times_s: Array) -> Array:
@@ -91,15 +137,15 @@ def _along(profile: SpeedProfile, times_s: Array) -> Array:
     return np.array([profile.at(t) for t in times_s.tolist()]).reshape(-1, 3).T[:, :, None]
 
 
-def line(start: Point, end: Point, cruise_mps: float, acceleration_mps2: float) -> Line:
-    """Returns the line between two points [m] with a trapezoidal speed profile."""
+def line(start: Point, end: Point, cruise_mps: float, acceleration_mps2: float, yaw: float = 0.0) -> Line:
+    """Returns the line between two points [m] with a trapezoidal speed profile and a constant yaw [rad]."""
     length_m = math.dist(start, end)
     x, y, z = ((b - a) / length_m for a, b in zip(start, end, strict=True))
-    return Line(start, (x, y, z), SpeedProfile(length_m, cruise_mps, acceleration_mps2))
+    return Line(start, (x, y, z), SpeedProfile(length_m, cruise_mps, acceleration_mps2), yaw)
 
 
-def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: float) -> Circle:
-    """Returns the circle from a start point about a centre [m] whose total acceleration stays within a limit.
+def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: float, yaw: float = 0.0) -> Circle:
+    """Returns the circle from a start point about a centre [m], flown within a limit of the total acceleration.
 
     The cruise speed is limited to `max_circle_speed_mps`. The tangential acceleration is chosen so that the total
     acceleration equals the limit when the cruise speed is reached.
@@ -108,7 +154,7 @@ def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: fl
     cruise_mps = min(cruise_mps, max_circle_speed_mps(radius_m, acceleration_mps2))
     centripetal_mps2 = cruise_mps**2 / radius_m
     tangential_mps2 = math.sqrt(acceleration_mps2**2 - centripetal_mps2**2)
-    return Circle(start, centre, SpeedProfile(2 * math.pi * radius_m, cruise_mps, tangential_mps2))
+    return Circle(start, centre, SpeedProfile(2 * math.pi * radius_m, cruise_mps, tangential_mps2), yaw)
 
 
 def max_circle_speed_mps(radius_m: float, acceleration_mps2: float) -> float:

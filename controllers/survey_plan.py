@@ -1,33 +1,47 @@
-"""Survey requirements, and the plan that meets them: parameters and the path of every track, for any pattern."""
+"""Requirements of a survey, and the plan that meets them: the path of every track and the spacing, for any pattern."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from controllers.segments import Reference, Segment
+from controllers.camera_surface import CameraSurface
+from controllers.segments import Circle, Reference, Segment, Turn
+from controllers.survey_area import SurveyArea
 from twin.errors import TwinError
 
 Array = NDArray[np.float64]
+_EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of rounding
+TURN_RATE = math.radians(15)  # greatest rate of a turn on the spot [rad/s]: 0.5 deg between frames at 30 Hz
+TURN_ACCELERATION = math.radians(15)  # angular acceleration of a turn [rad/s2]
+TURN_PER_KEYFRAME = math.radians(10)  # greatest rotation between keyframes [rad]; beyond it, patch matching degrades
+
+#: Largest number of tracks to fly, and of tracks that fill an area; least altitude, and least side of an area [m].
+MAX_TRACKS, MAX_FILLING, LEAST_M = 10_000, 1_000_000, 1e-3
 
 
 class SurveyRequest(NamedTuple):
     """Requirements of a survey.
 
     Args:
-        area_m: extent along x and y, centred at the origin.
+        area_m: extent along and across the legs.
         altitude_m: height of the left camera above the reference plane z = 0.
         speed_mps: cruise speed.
         overlap_along: required overlap of consecutive keyframes, as a fraction of the image width (see
             `frames_per_keyframe`).
-        overlap_across: required sidelap of neighbouring swaths, as a fraction.
+        overlap_across: required sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`.
         tracks: number of tracks to fly, starting with the first; 0: all tracks that fill the area.
         image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
         acceleration_mps2: greatest acceleration of the camera.
+        area: area to cover, of extent `area_m`; None: a rectangle or disc at the origin, with legs along x.
+        turns: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns at the end of each leg.
+        along_scale, across_scale: factors on the spacing of keyframes and of swaths that follows from the footprint on
+            the reference plane; below 1 if the floor is nearer to the cameras than the plane.
+        surface: planned height z of the camera as a function of x and y; None: `altitude_m` everywhere.
     """
 
     area_m: tuple[float, float]
@@ -41,6 +55,11 @@ class SurveyRequest(NamedTuple):
     focal_px: float
     frame_rate_hz: float
     acceleration_mps2: float = 0.2
+    area: SurveyArea | None = None
+    turns: Literal["reverse", "bow_first"] = "reverse"
+    along_scale: float = 1.0
+    across_scale: float = 1.0
+    surface: CameraSurface | None = None
 
     @property
     def footprint_m(self) -> tuple[float, float]:
@@ -51,37 +70,71 @@ class SurveyRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """Planned path of the left camera, with the bow to the east. The vehicle keeps station after each track.
+    """Planned path and heading of the left camera. The vehicle keeps station after each track.
 
     Args:
         paths: segments of each track; every segment starts and ends at rest.
-        area_m: extent along x and y, centred at the origin.
+        area: area to cover; the legs, and the bow on the first leg, point along its heading.
         altitude_m: height of the camera above the reference plane z = 0.
         speed_mps: cruise speed along the swaths.
         frame_rate_hz: frames per second.
         n_frames_per_keyframe: N, frames from one keyframe to the next.
         swath_length_m: length of a swath (a leg or a loop).
         swath_spacing_m: greatest distance between neighbouring swaths.
+        n_tracks_to_fill: number of tracks that fill the area, of which the first `n_tracks` are planned.
         footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.
         side_along_m: side of the footprint along which consecutive keyframes are displaced.
         side_across_m: side of the footprint along which neighbouring swaths are displaced.
         focal_px: focal length of the cameras.
         acceleration_mps2: greatest acceleration of the camera.
+        surface: planned height z of the camera, which replaces z of the paths; None: `altitude_m` everywhere.
     """
 
     paths: tuple[tuple[Segment, ...], ...]
-    area_m: tuple[float, float]
+    area: SurveyArea
     altitude_m: float
     speed_mps: float
     frame_rate_hz: float
     n_frames_per_keyframe: int
     swath_length_m: float
     swath_spacing_m: float
+    n_tracks_to_fill: int
     footprint_m: tuple[float, float]
     side_along_m: float
     side_across_m: float
     focal_px: float
     acceleration_mps2: float
+    surface: CameraSurface | None = None
+
+    @property
+    def area_m(self) -> tuple[float, float]:
+        """Returns the extent of the area along and across the legs [m]."""
+        return self.area.size_m
+
+    def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
+        """Returns which points of the scene lie in the asked area, the area that the planned tracks have to cover.
+
+        If all tracks are planned, the asked area is the whole area. If only the first tracks are, it is the part up to
+        half a `swath_spacing_m` beyond the last planned leg of a lawnmower, or the points of the disc within half a
+        `swath_spacing_m` of a planned loop.
+
+        Args:
+            x_m, y_m: coordinates of the points, arrays of any shape that broadcast.
+        """
+        x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        inside = self.area.contains(x_m, y_m)
+        if self.n_tracks >= self.n_tracks_to_fill:
+            return inside
+        circles = [segment for path in self.paths for segment in path if isinstance(segment, Circle)]
+        if circles:
+            return inside & self._near_loop(circles, x_m, y_m)
+        _, across = self.area.to_legs(x_m, y_m)
+        return inside & (across <= 2 * self.n_tracks * self.swath_spacing_m - self.area_m[1] / 2 + _EDGE_M)
+
+    @property
+    def turns_on_the_spot(self) -> bool:
+        """Returns whether the vehicle turns by 180 degrees at the ends of the legs."""
+        return any(isinstance(segment, Turn) for path in self.paths for segment in path)
 
     @property
     def n_tracks(self) -> int:
@@ -91,27 +144,51 @@ class SurveyPlan:
     def waypoints(self, track: int) -> Array:
         """Returns the outline of a track (from 1): end points of lines and points along circles, (n, 3) [m]."""
         first, *others = self.paths[track - 1]
-        return np.concatenate([first.points(), *(segment.points()[1:] for segment in others)])
+        points = np.concatenate([first.points(), *(segment.points()[1:] for segment in others)])
+        if self.surface is not None:
+            points[:, 2] = self.surface.height_at(points[:, 0], points[:, 1])
+        return points
 
     def outline(self) -> Array:
         """Returns the waypoints of all tracks (n, 3) [m]."""
         return np.concatenate([self.waypoints(track) for track in range(1, self.n_tracks + 1)])
 
+    def _near_loop(self, circles: list[Circle], x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+        """Returns which points lie within half of `swath_spacing_m` of a circle."""
+        near = np.zeros(x_m.shape, np.bool_)
+        for circle in circles:
+            radius_m, (x, y, _) = math.dist(circle.start, circle.centre), circle.centre
+            near |= np.abs(np.hypot(x_m - x, y_m - y) - radius_m) <= self.swath_spacing_m / 2 + _EDGE_M
+        return near
+
     def track_length_m(self, track: int) -> float:
         """Returns the path length of a track (from 1) [m]."""
-        return sum(segment.profile.length_m for segment in self.paths[track - 1])
+        return sum(segment.length_m for segment in self.paths[track - 1])
 
     def track_duration_s(self, track: int) -> float:
         """Returns the duration of a track (from 1) [s], without the station keeping after it."""
         return sum(segment.profile.duration_s for segment in self.paths[track - 1])
 
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Returns the frames of a track (from 1): times (n,) since its start [s], and which are keyframes (n,) bool.
+        """Returns the times (n,) of the frames of a track (from 1) since its start [s], and whether each is a keyframe.
 
-        Every N-th frame and the last one are keyframes.
+        Every N-th frame and the last one are keyframes. While the vehicle turns, keyframes are closer if it would turn
+        by more than TURN_PER_KEYFRAME in N frames.
         """
         frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
-        return frames / self.frame_rate_hz, (frames % self.n_frames_per_keyframe == 0) | (frames == frames[-1])
+        times_s, n = frames / self.frame_rate_hz, self.n_frames_per_keyframe
+        keyframe = (frames % n == 0) | (frames == frames[-1])
+        if self.turns_on_the_spot:
+            n_turning = max(1, int(TURN_PER_KEYFRAME / TURN_RATE * self.frame_rate_hz))
+            keyframe |= self._turning(track, times_s) & (frames % min(n, n_turning) == 0)
+        return times_s, keyframe
+
+    def _turning(self, track: int, times_s: Array) -> NDArray[np.bool_]:
+        """Returns whether the vehicle turns on the spot at times (n,) since the start of a track [s]."""
+        path = self.paths[track - 1]
+        ends_s = np.cumsum([segment.profile.duration_s for segment in path])
+        current = np.minimum(np.searchsorted(ends_s, times_s), len(path) - 1)
+        return np.array([isinstance(segment, Turn) for segment in path])[current]
 
     def reference(self, track: int, time_s: float) -> Reference:
         """Returns the reference of the left camera at a time since the start of a track (from 1).
@@ -128,19 +205,24 @@ class SurveyPlan:
             n = int(np.searchsorted(remaining_s, segment.profile.duration_s))
             parts.append(segment.at(remaining_s[:n]))
             remaining_s = remaining_s[n:] - segment.profile.duration_s
-        return Reference(*map(np.concatenate, zip(*parts, last.at(remaining_s), strict=True)))
+        level = Reference(*map(np.concatenate, zip(*parts, last.at(remaining_s), strict=True)))
+        return level if self.surface is None else self.surface.follow(level)
+
+    def camera_height_at(self, x_m: Array, y_m: Array) -> Array:
+        """Returns the planned height z of the camera (n,) at points (x, y) of the path [m]."""
+        return np.full(len(x_m), self.altitude_m) if self.surface is None else self.surface.height_at(x_m, y_m)
 
 
 def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
     """Returns the number of frames per keyframe N (Negahdaripour & Madjidi 2003, section III-A).
 
-    N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)); ImgSize is the image width, as in
-    that paper.
+    N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)), with the distance between
+    keyframes multiplied by `along_scale` of the request; ImgSize is the image width, as in the paper.
 
     Raises:
         TwinError: N would be 0 at this speed.
     """
-    advance_m = (1 - request.overlap_along) * request.footprint_m[0]
+    advance_m = (1 - request.overlap_along) * request.footprint_m[0] * request.along_scale
     n = round(advance_m * request.frame_rate_hz / speed_mps)
     if n < 1:
         fastest = 2 * advance_m * request.frame_rate_hz
@@ -159,16 +241,22 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
         request: the requirements; `tracks` = 0 means all tracks.
         n_filling: number of tracks that fill the area.
     Raises:
-        TwinError: more tracks are requested than fill the area.
+        TwinError: more tracks are requested than fill the area, or there are more tracks than `MAX_TRACKS` to fly or
+            `MAX_FILLING` to fill the area.
     """
+    n_flown = request.tracks or n_filling
+    if n_flown > MAX_TRACKS or n_filling > MAX_FILLING:
+        problem = f"{n_flown:.4g} tracks are too many, of {n_filling:.4g} that fill the area"
+        remedy = "less overlap, more altitude, a smaller area, or fewer plan.tracks"
+        raise TwinError("plan.overlap_across", problem, f"up to {MAX_TRACKS}, of {MAX_FILLING}: {remedy}")
     if not 0 <= request.tracks <= n_filling:
         problem = f"{request.tracks} is too many: {n_filling} fill the area at this overlap"
         raise TwinError("plan.tracks", problem, f"0 to {n_filling}")
-    return request.tracks or n_filling
+    return n_flown
 
 
 def check_request(request: SurveyRequest) -> None:
-    """Raises TwinError if a requirement is invalid for every pattern."""
+    """Raises TwinError if a requirement is invalid, whatever the pattern."""
     positive = {
         "plan.altitude_m": request.altitude_m,
         "plan.speed_mps": request.speed_mps,
@@ -180,6 +268,9 @@ def check_request(request: SurveyRequest) -> None:
         if not (value > 0 and math.isfinite(value)):
             problem = "the camera has no footprint" if field in ("plan.altitude_m", "rig.hfov_deg") else f"{value:g}"
             raise TwinError(field, problem, "above 0")
+    for field in ("plan.altitude_m", "plan.area_m"):
+        if positive[field] < LEAST_M:
+            raise TwinError(field, f"{positive[field]:g} is too small", f"at least {LEAST_M:g}")
     overlaps = {"plan.overlap_along": request.overlap_along, "plan.overlap_across": request.overlap_across}
     for field, value in overlaps.items():
         if not 0 < value < 1:

@@ -58,7 +58,7 @@ class Gains(NamedTuple):
 def pole_placement_gains(natural_frequency_radps: float) -> Gains:
     """Returns the gains that give a free mass on each axis the characteristic polynomial (s + w)^2 (s + a).
 
-    w is the natural frequency, ATTITUDE_BANDWIDTH times greater for rotation, and a = INTEGRAL_BANDWIDTH w.
+    w is the natural frequency for translation and ATTITUDE_BANDWIDTH times that for rotation; a = INTEGRAL_BANDWIDTH w.
     """
     w = natural_frequency_radps * np.array([ATTITUDE_BANDWIDTH] * 3 + [1.0] * 3)
     a = INTEGRAL_BANDWIDTH * w
@@ -66,7 +66,7 @@ def pole_placement_gains(natural_frequency_radps: float) -> Gains:
 
 
 def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Converts the reference of the camera to the reference of the level body that carries the camera.
+    """Converts the reference of the camera to that of the level body; velocity and acceleration stay the same.
 
     Args:
         camera: reference of the camera.
@@ -77,7 +77,7 @@ def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
 
 @njit(cache=True, nogil=True)
 def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
-    """Rotates a lever arm (3,) [m] from a level body with this yaw [rad] to the world."""
+    """Rotates a lever arm (3,) [m] from a level body at the given yaw [rad] to the world."""
     c, s = np.cos(yaw), np.sin(yaw)
     forward, left, up = lever_arm_m
     return np.array([c * forward - s * left, s * forward + c * left, up])
@@ -88,7 +88,7 @@ def commanded_velocity(position: Array, reference: Reference, natural_frequency_
 
     Args:
         position: (3,) estimated position [m].
-        reference: reference of the same point.
+        reference: reference of the point whose position is given.
         natural_frequency_radps: natural frequency w of the closed loop.
     """
     return reference.velocity + natural_frequency_radps * (reference.position - position)
@@ -119,7 +119,7 @@ class PoseController:
     Args:
         hull: hull model.
         allocation: thrust allocation.
-        natural_frequency_radps: closed-loop bandwidth of position.
+        natural_frequency_radps: natural frequency of the closed loop in position.
         period_s: time between commands.
     """
 
@@ -174,7 +174,7 @@ def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, int
 
 @njit(cache=True, nogil=True)
 def _integrate(integral, gain, error, saturated):
-    """Updates the integral in place within INTEGRAL_LIMIT; while a thruster saturates, it cannot grow (anti-windup)."""
+    """Updates the integral in place within INTEGRAL_LIMIT; stops its growth while a thruster saturates: anti-windup."""
     for k in range(6):
         updated = min(max(integral[k] + gain[k] * error[k], -INTEGRAL_LIMIT[k]), INTEGRAL_LIMIT[k])
         if not (saturated and abs(updated) > abs(integral[k])):

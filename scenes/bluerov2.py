@@ -1,9 +1,9 @@
 """Physical parameters of the BlueROV2 Heavy.
 
 Source: von Benzon et al. 2022, "An Open-Source Benchmark Simulator: Control of a BlueROV2 Underwater Robot",
-J. Mar. Sci. Eng. 10, 1898, Table A1. That paper's body axes are x forward, y right, z down; here they are x forward,
-y left, z up, about the centre of gravity, so y and z change sign (the horizontal thrusters are 0.085 m below
-the centre of gravity).
+J. Mar. Sci. Eng. 10, 1898, Table A1. The body axes of the paper are x forward, y right, z down; here they are x
+forward, y left, z up, with the origin at the centre of gravity. The signs of y and z are therefore opposite to the
+paper's: z = -0.085 m for the horizontal thrusters, which lie below the centre of gravity.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class VehicleParameters:
             Positive thrust pushes the vehicle along the direction.
         thrust_coefficients: polynomial coefficients of u^9, u^7, u^5, u^3, u for the thrust [N] of a T200 thruster at
             command u in [-1, 1].
-        thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) of the transfer function from steady
-            thrust to thrust.
+        thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) coefficients of the transfer function from
+            steady to actual thrust.
         size_m: (3,) length, width, height of the hull.
     """
 

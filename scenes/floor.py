@@ -1,4 +1,4 @@
-"""Seafloor as textured mesh tiles in a MuJoCo model, so that only the tiles in view have to be rendered.
+"""Seafloor in a MuJoCo model, divided into textured mesh tiles so that only the tiles in view are rendered.
 
 The tiles are meshes instead of MuJoCo height fields: a mesh is rendered twice as fast because triangles share vertices,
 its texture is mapped exactly by explicit texture coordinates, and it has no side walls.
@@ -16,9 +16,9 @@ from scenes.gl import MjSpec, mujoco
 from terrains import Terrain
 from twin.core.grid_triangles import grid_triangles
 
-TILE_CELLS = 48  #: side of a tile; smaller tiles need more OpenGL state changes, larger ones more vertices out of view
+TILE_CELLS = 48  #: cells along a tile's side: a compromise between OpenGL state changes and vertices outside the view
 MAX_TILES = 900  #: MuJoCo supports at most 1000 textures
-MARGIN_TEXELS = 16  #: margin of the neighbouring tiles' texture around each tile: enough for 4 mip-map levels
+MARGIN_TEXELS = 16  #: margin of each tile's texture, copied from its neighbours; enough for 4 mip-map levels
 FLOOR_GROUP = 0
 
 
@@ -31,7 +31,7 @@ class Tile(NamedTuple):
 
 
 def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
-    """Adds the terrain to the model as static, self-lit tiles without contact; returns the tiles."""
+    """Adds the terrain to the model as static, emissive tiles without contacts; returns the tiles."""
     ny, nx = terrain.height_m.shape
     cells = tile_cells(ny - 1, nx - 1)
     tiles = []

@@ -14,7 +14,7 @@ from terrains.textures import generate_texture
 from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
-MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: rise over run that at most one node in 200 of a reef exceeds
+MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: greatest slope (rise over run) of a reef, see `_limit_slope`
 
 
 def generate(
@@ -54,7 +54,7 @@ def generate(
 
 
 def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:
-    """Scales heights (ny, nx) linearly to [base_m, base_m + relief_m]; equal heights all become base_m."""
+    """Scales heights (ny, nx) linearly to [base_m, base_m + relief_m]; if all are equal, they become base_m."""
     low, extent = float(heights.min()), float(np.ptp(heights))
     fraction = (heights - low) / extent if extent > 0 else np.zeros_like(heights)
     return (base_m + relief_m * fraction.astype(np.float64)).astype(np.float32)
@@ -104,8 +104,8 @@ def _staircase(level: Heights) -> Heights:
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
     """Generates domes with steep, lobed flanks.
 
-    The domes are 0.25 to 0.9 m in radius, one per 3 square metres (at least three). Between them the height is
-    -relief_m.
+    There is one dome per 3 square metres (at least three), with a radius of 0.25 to 0.9 m. The height between the
+    domes is -relief_m.
     """
     result = np.full(shape, -relief_m, np.float32)
     ny, nx = shape
@@ -127,9 +127,9 @@ def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
 
 
 def _limit_slope(height: Heights, relief_m: float, grid_m: float) -> Heights:
-    """Smooths the heights until the 99.5th percentile of the slope is at most MAX_SLOPE; 12 times at most.
+    """Smooths heights (ny, nx), at most 12 times, until the 99.5th percentile of the slope is at most MAX_SLOPE.
 
-    The slope is that of the floor scaled to the relief `relief_m`.
+    The slope is computed after scaling the heights to the relief `relief_m`; the result is not scaled.
     """
     sigma_px = 0.5
     for _ in range(12):

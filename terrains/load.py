@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-import warnings
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
 from terrains.terrain import Terrain, texture_shape
 from terrains.textures import generate_texture, read_image, tile_image
+from terrains.vertical import Direction, VerticalAxis, upward_sign
+from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
-if TYPE_CHECKING:
-    import rasterio
 
-FIELD = "terrain.height_file"
-ALLOWED = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"
+class HeightGrid(NamedTuple):
+    """Heights as read from a file.
+
+    Args:
+        values: (ny, nx) elevations or depths in the unit of `axis`, row 0 = north, NaN in holes.
+        spacing_m: grid spacing [m].
+        axis: vertical axis as the file describes it.
+        georeference: position of the centre of the raster, with the zero of the vertical datum as z = 0; None if the
+            file has no coordinates.
+    """
+
+    values: NDArray[np.float64]
+    spacing_m: float
+    axis: VerticalAxis
+    georeference: Georeference | None = None
 
 
 def load(
@@ -28,6 +42,7 @@ def load(
     height_spacing_m: float,
     height_range_m: float,
     seed: int | np.random.SeedSequence,
+    z: Direction | None = None,
 ) -> Terrain:
     """Reads a terrain, fills its holes, centres it at the origin and moves its lowest point to z = 0.
 
@@ -35,16 +50,20 @@ def load(
         height_file: heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain is one
             cell smaller than the raster in both directions.
         texture_file: image that is repeated as tiles; None: the texture is generated.
-        texture_px_m: side of a texel, and of a pixel of the texture image on the floor.
+        texture_px_m: side of a texel on the floor, and of a pixel of the texture image.
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.
         seed: seed of the texture if it is generated.
+        z: direction in which the values of the file increase; None: recognised from the file.
     Raises:
-        TwinError: a file is missing or invalid.
+        TwinError: a file is missing, invalid or too large, or the direction of its values is not clear.
     """
-    raw, spacing_m = read_heights(Path(height_file), height_spacing_m, height_range_m)
-    height_m, n_filled = fill_holes(raw[::-1])
-    height_m = (height_m - height_m.min()).astype(np.float32)
+    read = read_heights(Path(height_file), height_spacing_m, height_range_m)
+    upward_m = upward_sign(read.values, read.axis, z, Path(height_file)) * read.axis.metres_per_unit
+    raw, n_filled = fill_holes(read.values[::-1] * upward_m)
+    lowest_m, spacing_m = raw.min(), read.spacing_m
+    height_m = (raw - lowest_m).astype(np.float32)
+    georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
     ny, nx = height_m.shape
     extent_m = ((nx - 1) * spacing_m, (ny - 1) * spacing_m)
     shape = texture_shape((ny, nx), spacing_m, texture_px_m)
@@ -53,32 +72,38 @@ def load(
         texture = tile_image(read_image(Path(texture_file)), texture_px_m, shape, extent_m)
     else:
         texture = generate_texture("file", height_m, shape, texel_m, np.random.default_rng(seed))
-    return Terrain(height_m, spacing_m, -extent_m[0] / 2, -extent_m[1] / 2, texture, texel_m, n_filled)
+    west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
+    return Terrain(height_m, spacing_m, west_m, south_m, texture, texel_m, n_filled, georeference)
 
 
-def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> tuple[NDArray[np.float64], float]:
-    """Returns the heights (ny, nx) of a file [m], row 0 = north, NaN in holes, and their grid spacing [m].
+def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightGrid:
+    """Reads the heights of a file. Checks their number in the header before it reads them.
 
     Args:
         file: GeoTIFF, 16-bit PNG or .npy.
         height_spacing_m: grid spacing if the file does not contain one.
         height_range_m: height difference between white and black in a PNG.
     Raises:
-        TwinError: the file cannot be read, does not contain heights, is all NaN, or has a single row or column.
+        TwinError: the file cannot be read, does not contain heights, is all NaN, has a single row or column, or has
+            more than MAX_NODES heights.
     """
     if not file.is_file():
-        raise TwinError(FIELD, f"no such file {str(file)!r}", ALLOWED)
+        raise TwinError(HEIGHT_FIELD, f"no such file {str(file)!r}", HEIGHT_FORMATS)
     suffix = file.suffix.lower()
+    named = VerticalAxis(texts=(file.stem,))
     if suffix in (".tif", ".tiff"):
-        heights, spacing_m = _read_tiff(file, height_spacing_m)
+        # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
+        from terrains.geotiff import read_geotiff
+
+        grid = HeightGrid(*read_geotiff(file, height_spacing_m))
     elif suffix == ".png":
-        heights, spacing_m = _read_png(file) * height_range_m, height_spacing_m
+        grid = HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named)
     elif suffix == ".npy":
-        heights, spacing_m = _read_npy(file), height_spacing_m
+        grid = HeightGrid(_read_npy(file), height_spacing_m, named)
     else:
-        raise TwinError(FIELD, f"{file.name!r} is not a height file", ALLOWED)
-    _check(heights, file)
-    return heights, spacing_m
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} is not a height file", HEIGHT_FORMATS)
+    _check(grid.values, file)
+    return grid
 
 
 def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
@@ -93,62 +118,31 @@ def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]
     return height_m[tuple(nearest)], int(holes.sum())
 
 
-def _read_tiff(file: Path, height_spacing_m: float) -> tuple[NDArray[np.float64], float]:
-    """Returns the heights of a GeoTIFF, NaN where it has no data, and their grid spacing [m]."""
-    import rasterio  # imported here: it takes 20 MB, and most terrains do not need it
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
-
-    try:
-        with warnings.catch_warnings(), rasterio.open(file) as source:
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            if source.count != 1 or source.dtypes[0] in ("uint8", "int8"):
-                bands = f"{source.count} band(s) of {source.dtypes[0]}"
-                raise TwinError(FIELD, f"{file.name!r} is an image, not heights: {bands}", ALLOWED)
-            spacing_m = _spacing(source, height_spacing_m, file)
-            band = source.read(1, masked=True)
-    except (RasterioError, OSError) as error:
-        raise TwinError(FIELD, f"{file.name!r} cannot be read: {error}", ALLOWED) from error
-    return np.ma.filled(band.astype(np.float64), np.nan), spacing_m
-
-
-def _spacing(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> float:
-    """Returns the grid spacing of a GeoTIFF [m].
-
-    Raises:
-        TwinError: the grid is in degrees, is not north up, or its cells are not square.
-    """
-    t = source.transform
-    if t.is_identity:
-        return height_spacing_m
-    if source.crs is not None and source.crs.is_geographic:
-        raise TwinError(FIELD, f"{file.name!r} is in degrees", "a projected or local grid in metres")
-    if t.b != 0 or t.d != 0 or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > 1e-3 * t.a:
-        raise TwinError(FIELD, f"{file.name!r} is rotated, or its cells are not square", "north up, square cells")
-    factor = source.crs.linear_units_factor[1] if source.crs is not None and source.crs.is_projected else 1.0
-    return float(t.a * factor)
-
-
 def _read_png(file: Path) -> NDArray[np.float64]:
     """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1."""
-    content = np.fromfile(file, np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    size = image_size(file)
+    if size is not None:
+        check_height_count(*size, file)
+    image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED) if size is not None else None
     if image is None:
-        raise TwinError(FIELD, f"{file.name!r} cannot be read as PNG", ALLOWED)
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read as PNG", HEIGHT_FORMATS)
     if image.ndim != 2 or image.dtype != np.uint16:
         kind = f"{8 * image.dtype.itemsize}-bit, {1 if image.ndim == 2 else image.shape[2]} channel(s)"
-        raise TwinError(FIELD, f"{file.name!r} is an image, not heights: {kind}", ALLOWED)
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {kind}", HEIGHT_FORMATS)
     return image.astype(np.float64) / 65535.0
 
 
 def _read_npy(file: Path) -> NDArray[np.float64]:
-    """Reads the heights of a .npy file [m]."""
+    """Reads the heights (rows, cols) of a .npy file [m]."""
     try:
-        array = np.load(file, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise TwinError(FIELD, f"{file.name!r} cannot be read: {error}", ALLOWED) from error
+        array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read
+    except (ValueError, OSError, EOFError, OverflowError) as error:
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read: {error}", HEIGHT_FORMATS) from error
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu" or array.dtype == np.uint8:
         shape = getattr(array, "shape", "no array")
-        raise TwinError(FIELD, f"{file.name!r} contains no heights: {shape} of {getattr(array, 'dtype', '?')}", ALLOWED)
+        problem = f"{file.name!r} contains no heights: {shape} of {getattr(array, 'dtype', '?')}"
+        raise TwinError(HEIGHT_FIELD, problem, HEIGHT_FORMATS)
+    check_height_count(array.shape[1], array.shape[0], file)
     return array.astype(np.float64)
 
 
@@ -156,6 +150,8 @@ def _check(height_m: NDArray[np.float64], file: Path) -> None:
     """Raises TwinError if there are fewer than 2 x 2 heights, or none is finite."""
     rows, cols = height_m.shape
     if rows < 2 or cols < 2:
-        raise TwinError(FIELD, f"{file.name!r} has {rows} row(s) and {cols} column(s)", "at least 2 x 2 heights")
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} has {rows} row(s) and {cols} column(s)", "at least 2 x 2 heights")
     if not np.isfinite(height_m).any():
-        raise TwinError(FIELD, f"{file.name!r} has no valid height (all NaN or nodata)", "at least one valid height")
+        raise TwinError(
+            HEIGHT_FIELD, f"{file.name!r} has no valid height (all NaN or nodata)", "one valid height or more"
+        )

@@ -1,4 +1,4 @@
-"""Random fields with detail at every scale, as sums of octaves of noise."""
+"""Random fields with detail at every scale: sums of octaves of noise."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def fractal_field(
 
     Args:
         shape: (rows, cols) of the field.
-        coarsest_px: wavelength of the coarsest octave [cells], at least 2.
+        coarsest_px: wavelength of the coarsest octave [cells]; values below 2 count as 2.
         gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
         rng: random generator.
     Returns:
@@ -41,9 +41,9 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Generates 8-bit pink noise.
 
-    Every octave has the same contrast, so images of the floor show texture at any distance. Starting with the coarsest
-    octave, the field is repeatedly doubled in size and the next octave is added. The total cost is 4/3 of the cost of
-    the finest octave.
+    Every octave has the same contrast, so an image of a floor with this texture shows detail at any distance. Starting
+    with the coarsest octave, the field is repeatedly doubled in size and the next octave is added. The total
+    computing time is 4/3 of that of the finest octave.
 
     Args:
         shape: (rows, cols) of the result.

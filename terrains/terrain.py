@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
-#: Limits set by memory: the rendered model needs about 400 bytes per node and 9 bytes per texel.
+#: Limits set by memory: the model for rendering takes about 400 bytes per node and 9 bytes per texel.
 MAX_NODES = 6_000_000
 MAX_TEXELS = 250_000_000
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """Seafloor over a rectangle whose south-west corner is (west_m, south_m); x east, y north, z up [m].
+    """Seafloor over a rectangle with its south-west corner at (west_m, south_m); x east, y north, z up [m].
 
     Args:
         height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west. The outermost nodes lie on
@@ -26,6 +27,7 @@ class Terrain:
         texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
         texture_px_m: side of a texel.
         n_filled: number of nodes without a height in the source, filled with the nearest height.
+        georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
     """
 
     height_m: NDArray[np.float32]
@@ -35,6 +37,7 @@ class Terrain:
     texture: NDArray[np.uint8]
     texture_px_m: float
     n_filled: int = 0
+    georeference: Georeference | None = None
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.file_header import TEXTURE_FIELD, check_texel_count, image_size
 from terrains.noise import fractal_field, pink_noise
 from twin.errors import TwinError
 
-#: Albedo of each material: dark, medium and bright tone, 8-bit RGB.
+#: Albedo of each material as 8-bit RGB: dark, medium and bright tone.
 SAND = ((104, 92, 70), (176, 161, 130), (236, 226, 204))
 DETRITUS = ((62, 52, 38), (122, 107, 82), (190, 176, 148))
 ROCK = ((32, 34, 32), (98, 98, 90), (178, 174, 160))
@@ -87,23 +88,25 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     """Reads an image file as (rows, cols, 3) uint8 RGB.
 
     Raises:
-        TwinError: the file does not exist or is not an image.
+        TwinError: the file does not exist, is not an image, or has more than MAX_TEXELS pixels.
     """
     if not file.is_file():
-        raise TwinError("terrain.texture_file", f"no such file {str(file)!r}", "an image file")
+        raise TwinError(TEXTURE_FIELD, f"no such file {str(file)!r}", "an image file")
+    if (size := image_size(file)) is not None:
+        check_texel_count(*size, file)
     try:
-        image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR_RGB)
+        image = None if size is None else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR_RGB)
     except (OSError, cv2.error):
         image = None
     if image is None:
-        raise TwinError("terrain.texture_file", f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
+        raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
     return np.asarray(image, dtype=np.uint8)
 
 
 def tile_image(
     image: NDArray[np.uint8], image_px_m: float, shape: tuple[int, int], extent_m: tuple[float, float]
 ) -> NDArray[np.uint8]:
-    """Returns a texture of repeated copies of an image from the north-west corner, sampled at the nearest pixel.
+    """Repeats an image as tiles from the north-west corner, with nearest-neighbour sampling; returns the texture.
 
     Args:
         image: (h, w, 3) image.
@@ -125,7 +128,7 @@ def _tiled_index(n: int, extent_m: float, image_px_m: float, period: int) -> NDA
         n: number of texels.
         extent_m: extent of the texture.
         image_px_m: side of an image pixel on the floor.
-        period: rows or columns of the image.
+        period: number of rows or columns of the image.
     """
     centres_m = (np.arange(n) + 0.5) * (extent_m / n)
     return np.floor(centres_m / image_px_m).astype(np.int64) % period

@@ -84,7 +84,8 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     keys = keys[~holding[keys]]
     rig = SCENARIO.believed_rig()
     grid = MapGrid(-2.5, 1.5, 0.02, 150, 250)
-    height = floor(*np.meshgrid(*grid.centres())).astype(np.float32)
+    grid_points = np.meshgrid(*grid.centres())
+    height = floor(*grid_points).astype(np.float32)
     y, x = np.mgrid[: grid.rows, : grid.cols]
     seen = np.hypot((x - 125) / 120, (y - 75) / 70) < 1
     sigma = np.full(height.shape, 0.008, np.float32)
@@ -99,7 +100,8 @@ def survey(seed: int = 0, rate_hz: float = 10.0) -> tuple[SurveyResult, Elevatio
     result.alignments = [Alignment(t, 100.0 * t, n, 3 * n, 2) for t, n in enumerate(ends, 1)]
     result.before_ga = [online.positions[keys[:n]] for n in ends]
     result.after_ga = [final.positions[keys[:n]] for n in ends]
-    truth = Truth(Trajectory(times, poses), reference, holding, track, height, seen)
+    asked = np.logical_and(*(np.abs(c) <= side / 2 for c, side in zip(grid_points, SCENARIO.plan.area_m, strict=True)))
+    truth = Truth(Trajectory(times, poses), reference, holding, track, height, seen, asked)
     return result, ElevationMap(grid, estimate, np.where(np.isfinite(estimate), sigma, np.nan), mosaic), truth, rig
 
 

@@ -28,7 +28,7 @@ METRICS = {
     "reason": "",
     "trajectory": {key: NUMBERS for key in ("f2f", "online", "final")},
     "consistency": {"nees_position_mean": 3.0},
-    "map": NUMBERS | {"completeness": 0.98, "sigma_ratio": 1.1},
+    "map": NUMBERS | {"completeness": 0.98, "sigma_ratio": 1.1, "completeness_area": 0.97, "le90_area_m": 0.034},
     "overlap": dict.fromkeys(("along_median", "along_planned", "across_median", "across_planned"), 0.9),
     "control": {"cross_track_rmse_m": 0.02},
     "timing": {"real_time_factor": 1.2, "frames": 10, "keyframes": 2},
@@ -70,6 +70,8 @@ def twin_command(monkeypatch, tmp_path, capsys):
         ({"status": "aborted", "reason": "vision lost"}, 1),
         ({"status": "aborted", "reason": "No space left on device"}, 1),
         ({"status": "aborted", "reason": "interrupted"}, 130),
+        ({"status": "aborted", "reason": "interrupted; map skipped"}, 130),
+        ({"status": "degraded", "reason": "the stereo residuals are too large"}, 1),
     ],
 )
 def test_the_exit_status_depends_on_the_outcome_of_the_survey(twin_command, changes, status):
@@ -168,6 +170,16 @@ def test_the_plan_is_a_table_and_a_picture(twin_command, tmp_path):
     done = twin_command("plan", "quickstart", "--set", "terrain.kind=flat", "--out", "plan.png")
     assert done.status == 0 and "frames per keyframe N" in done.out
     assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_plan_as_json_is_one_object_and_nothing_else(twin_command, tmp_path):
+    words = ("plan", "quickstart", "--set", "terrain.texture_px_m=0.05", "--set", "plan.tracks=1", "--out", "plan.png")
+    done = twin_command(*words, "--set", 'require={"map.le90_m"=0.0001}', "--json")
+    tree = json.loads(done.out)
+    assert (done.status, tree["name"], tree["picture"]) == (0, "quickstart", "plan.png")
+    assert not tree["require"]["map.le90_m"]["passed"]
+    strict = twin_command(*words, "--set", 'require={"map.le90_m"=0.0001}', "--strict")
+    assert strict.status == 1 and "Warning: map.le90_m is expected to miss its limit" in strict.err
 
 
 def test_progress_shows_simulated_time_real_time_factor_and_position_error():

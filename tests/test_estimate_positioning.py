@@ -83,6 +83,7 @@ def over_flat_floor(number, x_m, y_m, depth_m=2.4):
         measured,
         np.tile(np.eye(3) * 1e-8, (768, 1, 1)),
         xyz,
+        np.zeros(768),
     )
     return Keyframe(number, number, 1, scene.down_camera(x_m, y_m, depth_m), points, Readings())
 
@@ -109,6 +110,23 @@ def error_of(true, estimated):
     return geometry.log(geometry.inverse(true) @ estimated)
 
 
+def test_the_same_left_image_again_is_no_motion_even_if_the_rows_of_the_right_image_are_off(diver):
+    """A pitch of 0.05 deg between the cameras shifts the right image by 0.25 px; before, it appeared as 0.16 mrad."""
+    key, image, _ = diver.keyframe(scene.down_camera(0, 0, ALTITUDE_M))
+    left, right = diver.spool.gray(key.row)
+    moved = 0.75 * right + 0.25 * np.roll(right, 1, axis=0)
+    dense_px = np.full(left.shape, np.median(key.points.measured[:, 2]) * RIG.focal_px, np.float32)
+    points = stereo.match_stereo_points(left, moved, dense_px, RIG, 300, PATCH_PX)
+    assert np.median(points.row_difference_px) == pytest.approx(0.25, abs=0.03)
+    tracker = FrameToFrame(RIG, PATCH_PX)
+    tracker.step(image)
+    tracker.restart(image, points)
+    motion, status = tracker.step(image)
+    twist = geometry.log(motion.a_from_b)
+    assert status == "ok"
+    assert np.abs(twist[:3]).max() < 1e-5 and np.abs(twist[3:]).max() < 1e-5
+
+
 def test_normalised_images_are_invariant_to_a_uniform_gain():
     view, _ = scene.render_view(hills(), RIG, scene.down_camera(0, 0, ALTITUDE_M))
     image = colour(scene.digitise(view, np.random.default_rng(0), 0))
@@ -133,7 +151,8 @@ def test_stereo_points_are_unbiased_and_their_covariance_is_of_the_right_size(di
     assert len(error_px) > 150
     assert abs(np.mean(error_px)) < 0.03
     sigma_px = np.sqrt(np.median(key.points.cov[:, 2, 2])) * RIG.focal_px
-    assert sigma_px < np.std(error_px) < 4 * sigma_px  # relief in the patch comes on top
+    # relief in the patch comes on top; the scatter of the row differences of 250 points is known to about 7 %
+    assert 0.8 * sigma_px < np.std(error_px) < 4 * sigma_px
 
 
 def test_stereo_errors_on_a_slope_agree_with_their_covariance():
@@ -434,6 +453,9 @@ class Script:
 
     def rebuild_mosaic(self, keys):
         pass
+
+    def epipolar_error(self):
+        return None
 
     def discard(self, numbers):
         self.discarded |= set(numbers)

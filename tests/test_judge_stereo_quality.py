@@ -8,7 +8,7 @@ import pytest
 from judge_synthetic import survey, write_folder
 
 from twin.core.records import StereoObservation
-from twin.estimate.vision.matching import contrast, gray
+from twin.estimate.vision.matching import contrast, gray, saturated_fraction
 from twin.judge.stereo_quality import stereo_quality
 from twin.report.figures import stereo_quality_curves
 from twin.report.run_folder import load_run
@@ -47,8 +47,18 @@ def test_observations_without_images_have_points_but_no_contrast():
     assert quality["points_median"] == 7 and quality["contrast_median"] is None
     mixed = [StereoObservation(0, 7, None), StereoObservation(1, 7, 0.3)]
     assert stereo_quality(dataclasses.replace(RESULT, stereo_observations=mixed))["contrast_median"] == 0.3
-    none = {"points_median": None, "points_p10": None, "contrast_median": None, "blind_looks": 0}
+    none = dict.fromkeys(("points_median", "points_p10", "contrast_median", "saturated_median")) | {"blind_looks": 0}
     assert stereo_quality(RESULT) == none
+
+
+def test_the_saturated_fraction_counts_pixel_values_at_full_scale():
+    image = np.full((20, 30, 3), 254, np.uint8)
+    assert saturated_fraction(image) == 0
+    image[:5, :, 0] = 255
+    assert saturated_fraction(image) == pytest.approx(5 / 20 / 3)
+    observations = [StereoObservation(k, 100, 0.2, saturated) for k, saturated in enumerate((0.0, 0.01, 0.5, None))]
+    quality = stereo_quality(dataclasses.replace(RESULT, stereo_observations=observations))
+    assert quality["saturated_median"] == 0.01
 
 
 @pytest.mark.parametrize(("value", "n_panels"), [(0.2, 2), (None, 1)])

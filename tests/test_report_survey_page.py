@@ -48,13 +48,6 @@ def test_the_report_is_self_contained(folder):
     assert len(page) < 5_000_000
 
 
-def test_the_headline_contains_the_warning_of_the_metrics(folder):
-    metrics = json.loads((folder / "metrics.json").read_text())
-    assert "Warning" not in wording.headline(metrics | {"warning": ""}, load_run(folder).scenario)
-    warned = wording.headline(metrics | {"warning": "surrogate: too murky"}, load_run(folder).scenario)
-    assert warned.endswith("Warning: surrogate: too murky.")
-
-
 def test_the_report_contains_the_values_of_the_metrics(folder):
     metrics = json.loads((folder / "metrics.json").read_text())
     page = write_report(folder).read_text()
@@ -75,7 +68,7 @@ def test_the_report_contains_the_values_of_the_metrics(folder):
 
 def test_the_report_uses_metrics_that_are_not_written_yet(folder, tmp_path):
     metrics = json.loads((folder / "metrics.json").read_text()) | {"status": "aborted", "reason": "disk <full>"}
-    assert "aborted (disk &lt;full&gt;)" in write_report(folder, metrics).read_text()
+    assert "The survey was aborted: disk &lt;full&gt;." in write_report(folder, metrics).read_text()
 
 
 def test_the_report_of_an_unfinished_run_is_marked_as_unfinished(unfinished):

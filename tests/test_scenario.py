@@ -15,7 +15,10 @@ from twin.scenario.toml_lines import key_lines
 from twin.study.study_file import load_study
 from twin.study.surveys import surveys
 
-PLAN_KEYS = "pattern, area_m, altitude_m, speed_mps, overlap_along, overlap_across, tracks, clearance_m"
+PLAN_KEYS = (
+    "pattern, area_m, centre_m, centre_crs, heading_deg, polygon, turns, altitude_m, speed_mps, overlap_along, "
+    "overlap_across, overlap_reference, height, tracks, clearance_m"
+)
 TOP_KEYS = (
     "name, seed, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, snow, "
     "current, navigation, plan, control, estimate, map, beacons, require"

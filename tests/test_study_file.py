@@ -6,7 +6,7 @@ from study_surveys import STUDY, study_of
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.study.study_file import load_study
-from twin.study.surveys import check_samples, surveys
+from twin.study.surveys import refusals, surveys
 
 TURBIDITY = "water.turbidity = { log_uniform = [1.0, 40.0] }"
 
@@ -33,7 +33,11 @@ TURBIDITY = "water.turbidity = { log_uniform = [1.0, 40.0] }"
             "11: together.0.keys: is already given by vary.plan.altitude_m",
         ),
         ('["III", 0.0]', '["III"]', "12: together.0.rows: row 1 has 1 values (allowed: 2, one per key)"),
-        ('"map.le90_m" = 0.02', '"map.le90" = 0.02', "20: require.map.le90: no such metric, did you mean map.le90_m?"),
+        (
+            '"map.le90_m" = 0.02',
+            '"map.le90" = 0.02',
+            "20: require.map.le90: no such metric, did you mean map.le90_m",
+        ),
         ("probability = 0.8", "probability = 8", "19: require.probability: 8: not allowed (allowed: 0 to 1)"),
         ("probability = 0.8", "", "3: seek: needs a required pass probability (allowed: require.probability)"),
         ('seek = "water.turbidity"', 'seek = "water.jerlov"', "3: seek: 'water.jerlov' is not a varied numeric key"),
@@ -56,17 +60,35 @@ def test_all_errors_are_reported_together(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[1.6, 2.4]", "[-1.6, 2.4]", "8: vary.plan.altitude_m: -"),
+        ("[1.6, 2.4]", "[-2.4, -1.6]", "8: vary.plan.altitude_m: -"),
         ("plan.altitude_m = {", "plan.altitude = {", "8: vary.plan.altitude: unknown key (did you mean altitude_m?)"),
+    ],
+)
+def test_an_error_of_all_samples_is_reported_once_at_the_line_that_gives_the_key(tmp_path, old, new, message):
+    with pytest.raises(ScenarioError) as error:
+        refusals(study_of(tmp_path, STUDY, (old, new)))
+    line, conclusion = error.value.lines
+    assert conclusion.endswith("none of the 12 samples can be flown; nothing was flown")
+    assert line.startswith(f"{tmp_path / 'study.toml'}:{message}"), line
+    assert "in sample" in line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[1.6, 2.4]", "[-1.6, 2.4]", "8: vary.plan.altitude_m: -"),
         ('["III", 0.0]', '["murky", 0.0]', "11: together.0.keys: water.jerlov: 'murky': not allowed"),
     ],
 )
-def test_an_error_of_samples_is_reported_once_at_the_line_that_gives_the_key(tmp_path, old, new, message):
-    with pytest.raises(ScenarioError) as error:
-        check_samples(study_of(tmp_path, STUDY, (old, new)))
-    (line,) = error.value.lines
-    assert line.startswith(f"{tmp_path / 'study.toml'}:{message}"), line
-    assert "in sample" in line
+def test_an_error_of_some_samples_refuses_these_samples_at_the_line_that_gives_the_key(tmp_path, old, new, message):
+    study = study_of(tmp_path, STUDY, (old, new))
+    refused = refusals(study)
+    assert 0 < len(refused) < 12
+    for number, reason in refused.items():
+        assert reason.startswith(f"{tmp_path / 'study.toml'}:{message}"), reason
+        assert reason.endswith(f"in sample {number}")
+    flown = {survey.sample for survey in surveys(study, tmp_path, without=refused)}
+    assert flown == set(range(12)) - set(refused)
 
 
 def test_an_unknown_study_name_is_reported_with_the_known_names():

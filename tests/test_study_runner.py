@@ -56,7 +56,7 @@ def test_a_row_has_the_varied_keys_the_status_and_every_metric(table):
     assert table.num_rows == 16
     assert table["sample"].to_pylist() == sorted(2 * list(range(8)))
     assert table.column_names == [
-        *("sample", "seed", "status", "reason", "scenario_hash"),
+        *("sample", "seed", "status", "reason", "fidelity", "scenario_hash"),
         *("vary.plan.altitude_m", "vary.sun.illuminance_lx", "vary.water.jerlov", "vary.water.turbidity"),
         *("map.le90_m", "require.map.le90_m.limit", "require.map.le90_m.passed", "require.map.le90_m.value"),
     ]
@@ -161,20 +161,32 @@ def test_random_samples_can_be_added_to_a_study(tmp_path):
     assert (len(engine.flown), rows(tmp_path / "out").num_rows) == (8, 12)
 
 
-def test_nothing_is_flown_if_a_sample_is_invalid(tmp_path):
-    study, engine = study_of(tmp_path, STUDY, ("[1.6, 2.4]", "[-2.0, 2.4]")), SerialEngine()
+def test_nothing_is_flown_if_every_sample_is_invalid(tmp_path):
+    study, engine = study_of(tmp_path, STUDY, ("[1.6, 2.4]", "[-2.0, -1.0]")), SerialEngine()
     with pytest.raises(ScenarioError, match="altitude_m"):
         run_study(study, tmp_path / "out", engine)
     assert not engine.flown
     assert not (tmp_path / "out").exists()
 
 
+def test_invalid_samples_are_not_flown_and_are_in_the_table_as_refused(tmp_path):
+    study = study_of(tmp_path, STUDY, ("[1.6, 2.4]", "[-2.0, 2.0]"), ("samples = 12", "samples = 8\nseeds = 2"))
+    first, again = SerialEngine(), SerialEngine()
+    run_study(study, tmp_path / "out", first)
+    table = rows(tmp_path / "out")
+    altitude_m, status = (table[name].to_pylist() for name in ("vary.plan.altitude_m", "status"))
+    assert [value <= 0 for value in altitude_m] == [one == "refused" for one in status]
+    assert 0 < len(first.flown) == 16 - status.count("refused")
+    run_study(study, tmp_path / "out", again, resume=True)
+    assert (again.flown, rows(tmp_path / "out").equals(table)) == ([], True)
+
+
 SEEK = 'seek = "water.turbidity"'
 
 
-def test_a_study_with_seek_does_not_miss_its_requirement(tmp_path):
+def test_a_study_with_seek_below_its_required_probability_has_exit_status_1(tmp_path):
     study = study_of(tmp_path, STUDY, ("probability = 0.8", "probability = 0.99"))
-    assert study_command.exit_status(run_study(study, tmp_path / "out")) == 0
+    assert study_command.exit_status(run_study(study, tmp_path / "out")) == 1
 
 
 @pytest.mark.parametrize(

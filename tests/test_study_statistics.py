@@ -86,31 +86,30 @@ def test_explained_variance_of_a_sum_is_the_fraction_of_each_term():
     assert statistics.explained_variance(groups, (x - 0.5) ** 2) > 0.9  # no monotone trend, but explained
 
 
-@pytest.mark.parametrize("rising", [False, True])
-def test_the_threshold_of_separable_data_is_midway_between_the_two_classes(rising):
-    x = np.arange(20.0)
-    estimate = statistics.threshold(x, (x > 12) == rising, 0.9, rising, x)
-    assert estimate.value == 12.5
-    assert estimate.low <= 12.5 <= estimate.high
+def test_an_interval_of_equal_values_is_undefined_instead_of_zero_width():
+    assert np.isnan(statistics.bootstrap_interval(np.full(20, 3.0), statistics.median)[1:]).all()
 
 
-def test_the_threshold_estimates_the_crossing_of_the_pass_probability(monkeypatch):
-    monkeypatch.setattr(statistics, "RESAMPLES", 200)
-    rng, errors, covered = np.random.default_rng(0), [], 0
-    for _ in range(25):
-        x = rng.uniform(0, 10, 300)
-        estimate = statistics.threshold(x, rng.random(300) < 1 / (1 + np.exp(2 * (x - 6))), 0.8, False, np.arange(300))
-        truth = 6 - np.log(0.8 / 0.2) / 2
-        errors.append(estimate.value - truth)
-        covered += estimate.low <= truth <= estimate.high
-    assert abs(np.mean(errors)) < 3 * 0.3 / 5  # standard error of one estimate: 0.3
-    assert covered >= 18  # of 25; the bootstrap of isotonic regression has a coverage of 91 % instead of 95 %
+@pytest.mark.parametrize(("passed", "n", "required"), [(30, 32, 0.9), (1, 1, 0.9), (7, 8, 0.8), (12, 20, 0.7)])
+def test_the_stated_number_of_further_surveys_decides_at_the_same_fraction(passed, n, required):
+    record = np.arange(n) < passed
+    more = statistics.surveys_to_decide(record, np.arange(n), required)
+    fraction = passed / n
+    assert statistics.wilson_interval(passed, n).low < required < statistics.wilson_interval(passed, n).high
+    before, after = (statistics.wilson_interval(fraction * m, m) for m in (n + more - 1, n + more))
+    assert before.low < required < before.high
+    assert not after.low < required < after.high
 
 
-def test_a_threshold_outside_the_data_is_infinite():
-    x = np.arange(10.0)
-    assert statistics.threshold(x, x > -1, 0.5, False, x).value == np.inf
-    assert statistics.threshold(x, x < -1, 0.5, False, x).value == -np.inf
+@pytest.mark.parametrize(("passed", "required"), [([1, 0], 0.5), ([1, 1], 1.0), ([], 0.9)])
+def test_no_number_of_surveys_decides_at_the_required_fraction_or_for_certainty(passed, required):
+    assert statistics.surveys_to_decide(passed, np.arange(len(passed)), required) == np.inf
+
+
+@pytest.mark.parametrize(("passed", "clusters"), [([1], [0]), ([0] * 6, range(6)), ([1] * 6, [0] * 6), ([], [])])
+def test_the_interval_of_a_proportion_never_has_zero_width(passed, clusters):
+    interval = statistics.clustered_proportion(passed, list(clusters))
+    assert interval.high - interval.low > 0.1
 
 
 def test_probability_of_superiority_is_the_fraction_of_pairs():

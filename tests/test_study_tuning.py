@@ -8,10 +8,11 @@ from study_surveys import SerialEngine, study_of
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import load_scenario
 from twin.study import tuning_report
+from twin.study.candidates import Candidate, CandidateSurveys, pareto_front, tuning_config
 from twin.study.flight import row_of
 from twin.study.progress import StudyProgress
 from twin.study.statistics import wilson_interval
-from twin.study.tuning import Candidate, CandidateSurveys, pareto_front, tune, tuning_config
+from twin.study.tuning import tune
 
 TUNING = """
 scenario = "quickstart"

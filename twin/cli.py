@@ -1,20 +1,20 @@
 """Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 the survey failed or missed a requirement; 2 invalid input or missing system library;
-130 interrupted.
+Exit status: 0 success; 1 the survey is not complete or missed a requirement; 2 invalid input or missing system library;
+130 interrupted by Ctrl-C; 143 terminated by SIGTERM.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.app import console
+from twin.app import console, outputs
+from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
@@ -63,7 +63,9 @@ StudyOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to wr
 TuneOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/tune-NAME.")]
 JobsOption = Annotated[
     int | None,
-    typer.Option("--jobs", min=1, help="Parallel surveys, each a process or a SLURM job. Default: one per core."),
+    typer.Option(
+        "--jobs", min=1, max=1024, help="Parallel surveys, each a process or a SLURM job. Default: one per core."
+    ),
 ]
 SchedulerOption = Annotated[
     str | None,
@@ -76,18 +78,34 @@ SchedulerOption = Annotated[
 ResumeOption = Annotated[
     bool, typer.Option("--resume", help="Run only surveys that are missing in the folder or failed.")
 ]
+VerifyOption = Annotated[
+    int | None,
+    typer.Option(
+        "--verify",
+        min=0,
+        max=1000,
+        metavar="N",
+        help="Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
+    ),
+]
 LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
+PlanJsonOption = Annotated[bool, typer.Option("--json", help="Print only the predicted properties, as JSON.")]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="Exit with status 1 if a requirement is expected to be missed.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics, as JSON.")]
 
 
 def main() -> None:
-    """Runs the command line; prints a TwinError and exits with status 2 if one is raised."""
-    try:
-        app()
-    except TwinError as error:
-        console.print_error(str(error))
-        sys.exit(2)
+    """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
+    console.accept_any_text()
+    with sigterm_as_interrupt():
+        try:
+            app()
+        except TwinError as error:
+            console.print_error(str(error))
+            sys.exit(2)
 
 
 @app.command()
@@ -123,15 +141,26 @@ def plan(
     scene: SceneArgument,
     overrides: SetOption = [],  # noqa: B006 (typer copies it)
     out: PictureOption = None,
+    as_json: PlanJsonOption = False,
+    strict: StrictOption = False,
 ) -> None:
-    """Print the predicted properties of a survey plan and draw the plan, without simulation."""
-    from twin.app import plan as planning
+    """Print the predicted properties of a survey plan over its floor and draw the plan, without simulation."""
+    from twin.app import plan as drawing
+    from twin.app import plan_summary
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
 
-    mission = prepare(load_scenario(scene, overrides))
-    console.print_table(f"Plan of {mission.scenario.name}", planning.numbers(mission))
-    print(f"Picture: {planning.draw(mission, out or Path(f'runs/{mission.scenario.name}-plan.png'))}")
+    scenario = load_scenario(scene, overrides)
+    file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-plan.png"))
+    summary = plan_summary.summarise(prepare(scenario))
+    with outputs.writing(file):
+        drawing.draw(summary, file)
+    if as_json:
+        print(json.dumps(plan_summary.as_json(summary, str(file)), indent=1))
+    else:
+        console.print_plan(summary)
+        print(f"Picture: {file}")
+    raise typer.Exit(1 if strict and not summary.meets_requirements else 0)
 
 
 @app.command()
@@ -149,9 +178,12 @@ def look(
     from twin.world.mission import prepare
 
     position_m = None if at is None else viewing.parse_position(at)
-    mission = prepare(load_scenario(scene, overrides))
+    scenario = load_scenario(scene, overrides)
+    file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-look.png"))
+    mission = prepare(scenario)
     view = viewing.render_view(mission, position_m)
-    sheet = look_sheet.draw(mission.scenario, view, out or Path(f"runs/{mission.scenario.name}-look.png"))
+    with outputs.writing(file):
+        sheet = look_sheet.draw(mission.scenario, view, file)
     quality = viewing.image_quality(view)
     if as_json:
         print(json.dumps({"name": mission.scenario.name, "sheet": str(sheet)} | quality, indent=1))
@@ -165,8 +197,10 @@ def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: Summary
     """Render a block at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003) and plot contrast versus range."""
     from twin.reproduce import turbidity as experiment
 
+    outputs.output_file(out / "turbidity.png")
     _require_rendering()
-    summary = experiment.write(experiment.render_levels(), out)
+    with outputs.writing(out):
+        summary = experiment.write(experiment.render_levels(), out)
     if as_json:
         print(json.dumps(summary, indent=1))
     else:
@@ -183,6 +217,8 @@ def fit_surrogate(
     """Fit the error model of the surrogate to rendered surveys; finished surveys are reused."""
     from twin.app import fit_command
 
+    outputs.output_file(out)
+    outputs.output_file(runs / "study", "--runs")
     raise typer.Exit(fit_command.run(files or [], out, runs))
 
 
@@ -219,13 +255,15 @@ def tune(
     resume: ResumeOption = False,
     live: LinesOption = False,
     as_json: SummaryOption = False,
+    verify: VerifyOption = None,
 ) -> None:
     """Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario."""
     from twin.app import study_command
 
     if not scheduler:
         _require_rendering()
-    raise typer.Exit(study_command.tune(file, study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json)))
+    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify)
+    raise typer.Exit(study_command.tune(file, options))
 
 
 @app.command()
@@ -233,7 +271,8 @@ def report(folder: RunArgument) -> None:
     """Write the report of a run again, from the files in its folder."""
     from twin.report.survey_page import write_report
 
-    print(f"Report: {write_report(folder)}")
+    with outputs.writing(folder, "RUN"):
+        print(f"Report: {write_report(folder)}")
 
 
 @app.command()
@@ -241,7 +280,8 @@ def view(folder: RunArgument) -> None:
     """Open the recording of a run in Rerun."""
     from twin.report.recording import open_viewer
 
-    raise typer.Exit(open_viewer(folder))
+    with outputs.writing(folder, "RUN"):
+        raise typer.Exit(open_viewer(folder))
 
 
 @app.command()
@@ -264,15 +304,15 @@ def schema() -> None:
 
 
 def exit_status(result: RunResult) -> int:
-    """Returns the exit status of a survey: 130 interrupted; 1 failed or requirement missed; 0 otherwise."""
-    if result.metrics["reason"] == "interrupted":
-        return 130
+    """Returns the exit status of a survey: 130 interrupted; 1 aborted, degraded or requirement missed; 0 otherwise."""
+    if result.status == "aborted" and result.metrics["reason"].startswith("interrupted"):
+        return INTERRUPTED
     missed = [r for r in result.metrics["require"].values() if not r["passed"]]
     return 1 if result.status != "complete" or missed else 0
 
 
 def _run_survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
-    """Runs one survey with a progress bar."""
+    """Loads and runs one survey with a progress bar; returns its result."""
     from twin.scenario.file import load_scenario
 
     scenario = load_scenario(scene, overrides)
@@ -285,7 +325,7 @@ def _run_survey(scene: str, overrides: list[str], out: Path | None, live: bool) 
 
 
 def _require_rendering() -> None:
-    """Ends the command with exit status 2 if this machine cannot render."""
+    """Prints the reason and exits with status 2 if this machine cannot render."""
     from twin.app.doctor import check_rendering
 
     check = check_rendering()
@@ -295,26 +335,12 @@ def _require_rendering() -> None:
 
 
 def _new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """Returns the folder to write: `out`, or the first unused one of runs/NAME-SEED, runs/NAME-SEED-2, ..."""
+    """Returns the run folder: `out`, or the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty."""
     if out is not None:
-        return _writable(out)
-    first = Path("runs") / f"{scenario.name}-{scenario.seed}"
+        return outputs.new_folder(out)
+    first = Path("runs") / f"{outputs.file_stem(scenario.name)}-{scenario.seed}"
     folder, count = first, 1
-    while folder.exists() and not _empty(folder):
+    while folder.exists() and not outputs.is_empty(folder):
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
-    return _writable(folder)
-
-
-def _writable(folder: Path) -> Path:
-    """Returns the folder. Raises TwinError unless it is new or empty and can be written."""
-    parent = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    if folder.exists() and not _empty(folder):
-        raise TwinError("--out", f"{folder} is not empty", "a new or an empty folder")
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise TwinError("--out", f"{parent} is not writable", "a writable folder")
-    return folder
-
-
-def _empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
+    return outputs.new_folder(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from pathlib import Path
 
+from twin.core.interrupts import StageGuard
 from twin.core.records import Estimate, Frame
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
@@ -28,18 +29,24 @@ def run(
 ) -> RunResult:
     """Flies a scenario and writes a run folder; if the survey is aborted, the folder contains its partial results.
 
+    An interrupt (Ctrl-C) during the flight ends the flight. A later interrupt ends only the current stage: alignment,
+    elevation map, evaluation, map files, report or recording. The results of all other stages are written, and
+    metrics.json in any case.
+
     Args:
+        scenario: description of the survey.
         out: run folder.
         progress: function called with the progress after every frame.
         live: whether to show the survey in Rerun while it runs.
-        outputs: what to produce at the end, "report" or "recording" or both; None: write the metrics only.
+        outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
+            them. None: write the metrics only.
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
     """
     mission = prepare(scenario)
-    stopwatch, reason = Stopwatch(), ""
-    with open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
+    stopwatch, guard = Stopwatch(), StageGuard()
+    with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
         if mission.terrain.n_filled:
             folder.log("terrain holes filled", cells=mission.terrain.n_filled)
         for warning in world.warnings:
@@ -47,18 +54,21 @@ def run(
         monitor = SurveyMonitor(mission, folder, progress, live)
         with make_navigator(mission, world, out, stopwatch) as navigator:
             try:
-                fly(mission, world, navigator, monitor)
+                with guard.stage():
+                    fly(mission, world, navigator, monitor)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
-                reason = str(error) or "interrupted"
-            return conclude(Flight(mission, world, navigator, stopwatch, reason), folder, monitor)
+                guard.cause = str(error) or "interrupted"
+            return conclude(Flight(mission, world, navigator, stopwatch, guard), folder, monitor)
 
 
 def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[[Estimate, Frame], None]) -> None:
-    """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the true vehicle.
+    """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
+
+    After each track, the vehicle keeps station while the navigator runs a global alignment.
 
     Args:
         mission: the survey to fly.
-        world: executes the commands and returns the frames.
+        world: simulates the vehicle, which executes the commands, and returns the frames.
         navigator: estimates the pose from the frames.
         observe: called with the estimate and its frame after every update of the navigator.
     """

@@ -1,1 +1,1 @@
-"""Implementation of commands of `twin`: terminal output, machine check, survey plan, camera view, studies, fit."""
+"""Commands of `twin` (doctor, plan, look, study, tune, fit-surrogate) and their terminal output."""

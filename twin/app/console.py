@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,12 +15,20 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from twin.app.plan_summary import PlanSummary
     from twin.session.monitor import SurveyProgress
 
 
 def print_error(text: str) -> None:
-    """Prints an error on stderr, without line wrapping or colours."""
-    print(text, file=sys.stderr)
+    """Prints an error on stderr, without line wrapping or colours; control characters are shown as escapes."""
+    printable = (c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+    print("".join(printable), file=sys.stderr)
+
+
+def accept_any_text() -> None:
+    """Sets stdout to print a backslash escape for each character that its encoding cannot represent."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
@@ -38,7 +47,7 @@ def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
 def progress_note(now: SurveyProgress) -> str:
     """Returns the progress of a survey as text.
 
-    The text gives simulated time, real-time factor and position uncertainty; after the flight, only the wall time.
+    During the flight: simulated time, real-time factor and position uncertainty; otherwise: the wall time.
     """
     if not now.simulated_s:
         return f"{now.wall_s:.0f} s"
@@ -47,21 +56,40 @@ def progress_note(now: SurveyProgress) -> str:
 
 
 def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
-    """Prints a table on stdout, 120 characters wide if stdout is not a terminal, to avoid wrapped rows."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    """Prints a table on stdout; up to 120 characters wide if stdout is not a terminal, to avoid wrapped rows."""
+    console = Console(width=None if sys.stdout.isatty() else 120, markup=False, emoji=False)
     grid = Table(title=title, title_justify="left", show_header=False)
     for row in rows:
         grid.add_row(*row)
     console.print(grid)
 
 
+def print_plan(summary: PlanSummary) -> None:
+    """Prints the tables of a plan on stdout, and its warnings on stderr."""
+    from twin.app import plan_summary
+    from twin.report.wording import plain
+
+    print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))
+    print_table("Over the floor", plan_summary.floor_rows(summary))
+    if summary.require:
+        rows = [
+            (name, f"{plain(r['value'])} expected", f"limit {plain(r['limit'])}", "ok" if r["passed"] else "MISSED")
+            for name, r in summary.require.items()
+        ]
+        print_table("Required", rows)
+    for sentence in summary.warnings:
+        print_error(f"Warning: {sentence}.")
+
+
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """Prints the key figures of a survey and whether it meets each requirement."""
+    """Prints the verdict on a survey, the reasons and warnings, the key figures, and which requirements it meets."""
+    from twin.report.verdict import badge, first_lines
     from twin.report.wording import key_figures, plain
 
-    print_table(
-        f"{metrics['name']}, seed {metrics['seed']}: {metrics['status']}", [tuple(f) for f in key_figures(metrics)]
-    )
+    print(f"{metrics['name']}, seed {metrics['seed']}: {badge(metrics).text}")
+    for sentence in first_lines(metrics):
+        print(f"- {sentence}")
+    print_table("Key figures", [tuple(figure) for figure in key_figures(metrics)])
     if metrics["require"]:
         rows = [
             (name, plain(r["value"]), f"limit {plain(r['limit'])}", "passed" if r["passed"] else "MISSED")

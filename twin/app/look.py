@@ -1,4 +1,4 @@
-"""Rendering of a single stereo pair without a survey, with light components and quality of the left image."""
+"""Rendering of one stereo pair without a survey; light components and quality measures of its left image."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ViewLayers(NamedTuple):
 def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None) -> ViewLayers:
     """Renders a stereo pair and the light components of its left image.
 
-    The cameras look straight down and the bow points east.
+    The cameras look straight down and the bow points along the first leg.
 
     Args:
         at_m: position of the left camera in the world [m]; None: above the centre of the survey, at the planned
@@ -58,8 +58,9 @@ def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None
     Raises:
         TwinError: a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor.
     """
-    position_m = (0.0, 0.0, mission.scenario.plan.altitude_m) if at_m is None else at_m
-    world_from_left = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(position_m))
+    area = mission.plan.area
+    position_m = (*area.centre_m, mission.scenario.plan.altitude_m) if at_m is None else at_m
+    world_from_left = geometry.pose(geometry.rotations_of_down_camera(np.asarray(area.heading)), np.array(position_m))
     _check_rig(mission, world_from_left)
     with RenderedWorld(mission, Stopwatch()) as world:
         decomposed = world.camera.decompose(world_from_left)

@@ -104,7 +104,7 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
 def _light(
     title: str, unit: str, layer: NDArray[np.float32], gain: float, percentile: float = SHOWN_PERCENTILE
 ) -> Panel:
-    """Returns the panel of one light component in colour.
+    """Returns the colour panel of one light component.
 
     A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
     Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
@@ -112,7 +112,8 @@ def _light(
 
     Args:
         layer: (H, W, 3) values of the component.
-        gain: image brightness (fraction of full scale) per unit of the component; 0 if it is no part of the image.
+        gain: image brightness (fraction of full scale) per unit of the component; 0 if the image does not
+            contain the component.
         percentile: percentile of the values that determines the scale.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
@@ -154,7 +155,7 @@ def _in_numbers(values: NDArray[Any]) -> str:
 
 
 def _short(value: float) -> str:
-    """Returns the value with three significant digits, or as an integer from 100 on."""
+    """Returns the value with three significant digits, or as an integer if its magnitude is 100 or more."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

@@ -1,4 +1,4 @@
-"""Properties of a survey predicted from its plan, without simulation: a table and a drawing."""
+"""Drawing of a survey plan: the path over the sea floor, and the overlap of the images."""
 
 from __future__ import annotations
 
@@ -10,57 +10,60 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.patches import Patch, Polygon, Rectangle
 
-from controllers.forecast import forecast
+from twin.app.plan_summary import OVERLAP_TOLERANCE, PlanSummary, asked_overlaps
 from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
-from twin.report.wording import length, percent
 from twin.world.mission import Mission
 
-#: Standard deviation of the disparity on good texture [px]; the predicted depth error is proportional to it.
-DISPARITY_SIGMA_PX = 0.1
 _SHADE_SAMPLES = 400
-#: For each pattern: name of a swath, and the swaths that make up a track.
-_SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
 
 
-def numbers(mission: Mission) -> list[tuple[str, str]]:
-    """Returns the predicted properties of a survey as text: pairs (name, value with unit)."""
-    f = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
-    width_m, height_m = f.footprint_m
-    swath, of_track = _SWATHS[mission.scenario.plan.pattern]
-    tracks = len(mission.tracks)
-    hold_s = mission.scenario.control.hold_s * tracks
-    return [
-        (f"tracks L, {of_track} each", f"{tracks}"),
-        ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
-        (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
-        ("keyframes", f"{f.n_keyframes}"),
-        ("frames", f"{mission.n_frames}"),
-        ("time", f"{f.duration_s + hold_s:.0f} s, of which {hold_s:.0f} s station keeping"),
-        ("path", length(f.path_m)),
-        ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
-        ("footprint", f"{length(width_m)} across, {length(height_m)} along"),
-        ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {length(f.swath_spacing_m)} between {swath}s"),
-        ("overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
-        ("disparity", f"{f.disparity_px:.1f} px"),
-        ("depth error", f"{length(f.depth_sigma_m)} (1 sigma, for a disparity error of {DISPARITY_SIGMA_PX:g} px)"),
-    ]
+def draw(summary: PlanSummary, file: Path) -> Path:
+    """Writes a PNG of the plan from above; returns its path.
 
-
-def draw(mission: Mission, file: Path) -> Path:
-    """Writes a PNG of sea floor, planned path, image footprint and survey area from above; returns its path."""
+    The left panel shows sea floor, planned path, footprint of the first image and survey area. The right panel shows
+    the overlap over the floor and marks where it is less than asked.
+    """
+    mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(7.5, 6.5))
-        axes = figure.add_subplot()
-        _draw_floor(axes, mission)
-        _draw_path(axes, mission)
-        axes.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
-        axes.set_aspect("equal")
-        figure.legend(loc="outside lower center", ncols=4)
+        figure = Figure(figsize=(14, 6.5))
+        plan, overlap = figure.subplots(1, 2, sharex=True, sharey=True)
+        _draw_floor(plan, mission)
+        _draw_path(plan, mission)
+        _draw_overlap(overlap, summary)
+        plan.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
+        overlap.set(xlabel="x, east [m]", title="Overlap over the floor")
+        for axes in (plan, overlap):
+            axes.set_aspect("equal")
+        figure.legend(loc="outside lower center", ncols=5)
         file.parent.mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_png(str(file))
     return file
+
+
+def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
+    """Draws the overlap of each image pair midway between its two camera positions; a ring marks less than asked."""
+    floor, asked = summary.floor, asked_overlaps(summary.mission)
+    t = summary.mission.terrain
+    axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
+    axes.add_patch(_area(summary.mission, ec=COLOURS["limit"], ls="--", fill=False, linewidth=1.4))
+    pairs = (
+        ("along", "o", 14, floor.along_position_m, floor.overlap_along, asked.along),
+        ("across", "D", 9, floor.across_position_m, floor.overlap_across, asked.across),
+    )
+    short_label = "less than asked"
+    for name, marker, size, position, values, least in pairs:
+        shown = axes.scatter(
+            *position.T, s=size, c=values, marker=marker, cmap="viridis", vmin=0, vmax=1, label=f"overlap {name}"
+        )
+        short = values < least - OVERLAP_TOLERANCE
+        if short.any():
+            style = {"facecolors": "none", "edgecolors": COLOURS["limit"], "linewidths": 0.8}
+            axes.scatter(*position[short].T, s=2.2 * size, marker=marker, label=short_label, **style)
+            short_label = "_"
+        if name == "along":
+            axes.figure.colorbar(shown, ax=axes, label="overlap", shrink=0.8)
 
 
 def _draw_floor(axes: Axes, mission: Mission) -> None:
@@ -84,13 +87,11 @@ def _draw_path(axes: Axes, mission: Mission) -> None:
     across_m, along_m = mission.plan.footprint_m
     first_image = (path[0, 0] - along_m / 2, path[0, 1] - across_m / 2)
     style = {"fill": False, "linewidth": 1.4}
-    axes.add_patch(Rectangle(first_image, along_m, across_m, ec=COLOURS["f2f"], label="one image", **style))
+    turned = {"angle": np.degrees(mission.plan.area.heading), "rotation_point": "center"}
+    axes.add_patch(Rectangle(first_image, along_m, across_m, ec=COLOURS["f2f"], label="one image", **turned, **style))
     axes.add_patch(_area(mission, ec=COLOURS["limit"], ls="--", label="area", **style))
 
 
 def _area(mission: Mission, **style) -> Patch:
     """Returns the outline of the survey area."""
-    area_x, area_y = mission.plan.area_m
-    if mission.scenario.plan.pattern == "loops":
-        return Circle((0, 0), area_x / 2, **style)
-    return Rectangle((-area_x / 2, -area_y / 2), area_x, area_y, **style)
+    return Polygon(mission.plan.area.outline(), closed=True, **style)

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from twin.app import console
+from twin.app.outputs import file_stem, output_file
 from twin.errors import TwinError
-from twin.study import analysis, tuning, tuning_report, wording
+from twin.study import summary, tuning, tuning_report, wording
+from twin.study.candidates import tuning_config
 from twin.study.engine import Engine
 from twin.study.local_engine import LocalEngine, default_jobs
 from twin.study.progress import study_progress
@@ -30,9 +32,10 @@ class StudyOptions(NamedTuple):
     resume: bool = False
     live: bool = False
     as_json: bool = False
+    verify: int | None = None
 
     def engine(self) -> AbstractContextManager[Engine]:
-        """Returns the engine that these options select; see `open_engine`."""
+        """Returns a context manager that yields the engine selected by these options; see `open_engine`."""
         return open_engine(self.jobs, self.scheduler)
 
 
@@ -72,21 +75,21 @@ def run(file: str, options: StudyOptions) -> int:
         TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load_study(file)
-    folder = (options.out or Path("runs") / f"study-{study.name}").absolute()  # workers run in other folders
+    folder = _folder(options, "study", study)  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
         result = run_study(study, folder, options.resume, engine, progress)
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
     if options.as_json:
         identity = {"name": study.name, "out": str(folder), "throughput": result.throughput._asdict()}
-        print(json.dumps(analysis.summary(result.analysis, identity), indent=1))
+        print(json.dumps(summary.summary(result.analysis, identity), indent=1))
     else:
         _print_result(study, result)
     return exit_status(result)
 
 
 def tune(file: str, options: StudyOptions) -> int:
-    """Optimises the plan as a study file defines it, and prints the result.
+    """Optimises a survey plan as the study file defines, and prints the result.
 
     Returns:
         The exit status: 130 if interrupted; 1 if no plan is recommended; 0 otherwise.
@@ -95,8 +98,11 @@ def tune(file: str, options: StudyOptions) -> int:
         TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load_study(file)
-    config = tuning.tuning_config(study)
-    folder = (options.out or Path("runs") / f"tune-{study.name}").absolute()
+    config = tuning_config(study)
+    if options.verify is not None:
+        config = config.model_copy(update={"verify": options.verify})
+        study = study.model_copy(update={"tune": config})
+    folder = _folder(options, "tune", study)
     with options.engine() as engine, study_progress(options.live) as progress:
         result = tuning.tune(study, folder, options.resume, engine, progress)
     tuning_report.write_tuning_report(study, config, result, folder)
@@ -104,23 +110,44 @@ def tune(file: str, options: StudyOptions) -> int:
         print(json.dumps(tuning_report.summary(study, config, result), indent=1))
     else:
         print(tuning_report.headline(study, config, result))
+        for text in tuning_report.warnings(result):
+            print(f"Warning: {text}")
         print(f"Report: {folder / 'tuning.html'}")
         if result.recommended:
             print(f"Plan: {folder / 'recommended.toml'}")
     return 130 if result.interrupted else 0 if result.recommended else 1
 
 
+def _folder(options: StudyOptions, command: str, study: Study) -> Path:
+    """Returns the absolute path of the folder to write: `options.out`, or by default runs/COMMAND-NAME of the study.
+
+    Raises:
+        TwinError: the path can neither exist nor be created, or cannot be written.
+    """
+    folder = options.out or Path("runs") / f"{command}-{file_stem(study.name or command)}"
+    output_file(folder / "study.html")
+    return folder.absolute()
+
+
 def _print_result(study: Study, result: StudyResult) -> None:
-    print(wording.headline(study, result.analysis))
+    analysis = result.analysis
+    print(wording.headline(study, analysis))
+    for line in wording.answer_lines(analysis):
+        print(f"- {line}")
     rows = [
         (
             wording.metric_name(metric.name),
             wording.metric_interval(metric.name, metric.median),
             wording.metric_interval(metric.name, metric.bound),
         )
-        for metric in result.analysis.metric_summaries
+        for metric in analysis.metric_summaries
     ]
     console.print_table(f"{study.name}: median and 95 % bound of the surveys", rows)
+    if analysis.refusal_reasons:
+        reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
+        console.print_table(f"{len(analysis.refused_samples)} samples cannot be flown: surveys, reason", reasons)
+    for warning, count in analysis.warning_counts.items():
+        print(f"Warning in {count} of {analysis.rows.num_rows} surveys: {warning}")
     if result.throughput.surveys:
         print(wording.throughput(*result.throughput))
     if result.page.is_file():
@@ -130,10 +157,12 @@ def _print_result(study: Study, result: StudyResult) -> None:
 def exit_status(result: StudyResult) -> int:
     """Returns the exit status of a study.
 
-    130 if interrupted; 1 if too few surveys passed, none could be evaluated, or results could not be written;
-    0 otherwise.
+    130 if interrupted; 2 if every survey was refused; 1 if too few surveys passed, none could be evaluated, or results
+    could not be written; 0 otherwise.
     """
     if result.interrupted:
         return 130
     analysis = result.analysis
+    if len(analysis.refused) and analysis.refused.all():
+        return 2
     return 1 if analysis.requirement_missed or result.write_errors or not analysis.evaluated.any() else 0

@@ -23,8 +23,8 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 def copy_into(target: Array, values: Array) -> None:
     """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
-    Numba's own slice assignment compiles a check for unequal shapes, with its error message, into every caller; these
-    checks were a third of all compiled code.
+    Used instead of Numba's slice assignment, which compiles a shape check with an error message into every caller;
+    these checks made up a third of all compiled code.
     """
     for i in range(target.shape[0]):
         if target.ndim == 1:
@@ -64,7 +64,7 @@ def inverse(a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def compose(a_from_b: Array, b_from_c: Array) -> Array:
-    """Returns a_from_c (4, 4). Takes a third of the time of a matrix product by BLAS."""
+    """Returns a_from_c (4, 4), in a third of the time of a BLAS matrix product."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(4):
@@ -109,8 +109,9 @@ def product(a: Array, b: Array) -> Array:
 def nearest_rigid(matrices: Array) -> Array:
     """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    Removes the rounding errors of long products of motions. `inverse` assumes an orthogonal rotation and would double
-    its deviation from orthogonality.
+    Removes the rounding errors that long products of motions accumulate. `inverse` transposes the rotation, which is
+    exact only for an orthogonal matrix: if R deviates from orthogonality, R^T R deviates from the identity by twice as
+    much.
     """
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
@@ -359,3 +360,14 @@ def heading_of_camera(world_from_camera: Array) -> Array:
     """Returns the heading of the bow (...) [rad, counter-clockwise from east] of down-looking cameras (..., 4, 4)."""
     forward = -world_from_camera[..., :3, 1]  # the top of the image
     return np.arctan2(forward[..., 1], forward[..., 0])
+
+
+def rotations_of_down_camera(yaw: Array) -> Array:
+    """Returns world_from_camera rotations (..., 3, 3) of level cameras that look down, with the bow at `yaw` (...).
+
+    The yaw is the direction of the bow [rad, counter-clockwise from east]; the top of the image points to the bow.
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    world_from_body = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(*np.shape(c), 3, 3)
+    return world_from_body @ BODY_FROM_DOWN_CAMERA

@@ -1,4 +1,4 @@
-"""Measured motions between nodes of the keyframe network, stored as single records or as columns."""
+"""Measured motions between nodes of the keyframe network: one as a record, many as columns."""
 
 from __future__ import annotations
 
@@ -119,6 +119,11 @@ class Links(Sequence[Link]):
         return self.cov / self._table["shared_by"][:, None, None]
 
     @property
+    def shared_by(self) -> NDArray[np.int64]:
+        """Returns the number (n,) of links that share the stereo observation of the later keyframe."""
+        return self._table["shared_by"]
+
+    @property
     def information(self) -> Array:
         """Returns the information matrices (n, 6, 6), the inverses of `cov`."""
         return self._table["information"]
@@ -130,7 +135,7 @@ class Links(Sequence[Link]):
 
     @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
-        """Returns a mask (n,) of the links that have a closed-form motion, and these m motions (m, 4, 4)."""
+        """Returns the mask (n,) of the links that have a closed-form motion, and the closed-form motions (m, 4, 4)."""
         self._convert_pending()
         motions = [form for form in self._closed_forms if form is not None]
         return np.array([form is not None for form in self._closed_forms], bool), np.array(motions).reshape(-1, 4, 4)
@@ -142,7 +147,7 @@ class Links(Sequence[Link]):
         return self._rows.array
 
     def _convert_pending(self) -> None:
-        """Converts added links to rows, all at once."""
+        """Converts all links added since the last conversion to rows."""
         if self._pending:
             pending, self._pending = self._pending, []
             *columns, closed_forms = zip(*pending, strict=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.links import Links
+from twin.core.quality import EstimationQuality
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -20,8 +21,8 @@ Image = NDArray[np.uint8]
 class StereoRig:
     """Believed calibration of a rectified stereo pair.
 
-    Both are pinhole cameras with the same intrinsics and parallel axes; the right camera is displaced along +x of the
-    left one. The pair may look in any direction.
+    Both cameras are pinhole cameras with the same intrinsics and parallel axes. The right camera is displaced along the
+    +x axis of the left camera. The pair may look in any direction.
 
     Args:
         width_px, height_px: image size.
@@ -74,7 +75,7 @@ class StereoRig:
 
     @property
     def left_from_right(self) -> Array:
-        """(4, 4) pose of the right camera in the left camera."""
+        """(4, 4) pose of the right camera in the frame of the left camera."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
@@ -208,7 +209,7 @@ class Estimate(NamedTuple):
 
     Args:
         time_s: time of the frame.
-        world_from_camera: (4, 4) pose of the left camera, online.
+        world_from_camera: (4, 4) online pose of the left camera.
         f2f_from_start: (4, 4) pose of the left camera from frame-to-frame motion alone.
         camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
         sigma_m: standard deviation of the online position: root of the sum of the variances of x, y and z [m].
@@ -268,6 +269,7 @@ class Alignment(NamedTuple):
         ms: wall time [ms].
         nodes, edges: number of nodes (including fixed ones) and of links.
         dropped: number of links rejected as outliers.
+        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected.
     """
 
     track: int
@@ -275,20 +277,31 @@ class Alignment(NamedTuple):
     nodes: int
     edges: int
     dropped: int
+    link_chi2: float = 1.0
 
 
 class StereoObservation(NamedTuple):
-    """Image quality of one stereo pair, including pairs that did not become keyframes.
+    """Image quality of one stereo pair, whether or not its frame became a keyframe.
 
     Args:
         row: row of the pair's frame in the trajectories.
         n_points: number of matched points; with the surrogate, the number predicted by its error model.
         contrast: local RMS contrast of the left image (`matching.contrast`); None without an image.
+        saturated: fraction of the pixel values of the left image at full scale; None without an image.
+        row_offset_px: median row difference of the matched points, right minus left [px]; None without an image.
+        row_spread_px: robust standard deviation of the row differences [px]; None without an image.
+        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None without an image.
+        repetition: largest autocorrelation of the left image away from its main peak; None without an image.
     """
 
     row: int
     n_points: int
     contrast: float | None
+    saturated: float | None = None
+    row_offset_px: float | None = None
+    row_spread_px: float | None = None
+    row_sigma_px: float | None = None
+    repetition: float | None = None
 
 
 @dataclass
@@ -309,6 +322,7 @@ class SurveyResult:
         before_ga, after_ga: per track, positions (n, 3) of the keyframes so far, just before and just after the global
             alignment at the end of the track [m].
         stereo_observations: image quality of all stereo pairs, including those with too few points for a keyframe.
+        quality: consistency of the estimates, measured by the estimators.
     """
 
     f2f: Trajectory
@@ -323,6 +337,7 @@ class SurveyResult:
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
     stereo_observations: list[StereoObservation] = field(default_factory=list[StereoObservation])
+    quality: EstimationQuality = EstimationQuality()
 
     @property
     def step_cov(self) -> Array:
@@ -361,7 +376,7 @@ class MapGrid:
 class ElevationMap:
     """Digital elevation model with its uncertainty and orthomosaic.
 
-    Cells without a measurement are NaN, and black in the mosaic.
+    Cells without a measurement have NaN in `height_m` and `sigma_m`, and are black in `mosaic`.
 
     Args:
         grid: cells in x and y of the map frame.
@@ -388,6 +403,9 @@ class Truth:
         track: (n_frames,) number of the track, from 1.
         height_m: (rows, cols) float32, true height at the cell centres of the map grid [m].
         seen: (rows, cols) bool, cells that both cameras observed in at least one keyframe.
+        asked: (rows, cols) bool, cells whose centre lies in the asked area.
+        reference_yaw: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: the heading at
+            the start.
     """
 
     trajectory: Trajectory
@@ -396,3 +414,5 @@ class Truth:
     track: NDArray[np.int64]
     height_m: NDArray[np.float32]
     seen: NDArray[np.bool_]
+    asked: NDArray[np.bool_]
+    reference_yaw: Array | None = None

@@ -17,10 +17,12 @@ class EstimatorSettings:
     """Settings of motion estimation, the keyframe network and global alignment.
 
     Args:
-        window_tracks: number of previous tracks that the global alignment at the end of a track includes.
+        window_tracks: number of previous tracks that the global alignment at the end of a track adjusts, in addition to
+            this track.
         node_stride: every n-th keyframe is a node of the network.
         min_overlap: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's
-            matched points that project into the earlier image. The link to the last node is measured at any overlap.
+            matched points that project into the earlier image. The link to the previous node is measured at any
+            overlap.
         max_links: largest number of links from a node to earlier nodes.
         use_f2m: whether to register keyframes with the mosaic (F2M).
         use_ga: whether to align the network globally (GA) at the end of each track and of the survey.

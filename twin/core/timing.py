@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 import numpy as np
 
-#: Function of the name of a stage that returns a context manager which times the stage, such as a `Stopwatch`.
+#: Function, such as a `Stopwatch`, that takes the name of a stage and returns a context manager that times the stage.
 StageTimer = Callable[[str], AbstractContextManager[None]]
 #: Stages of a survey, in processing order.
 STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map")

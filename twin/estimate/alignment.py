@@ -1,8 +1,8 @@
-"""Global alignment: maximum-likelihood poses of all nodes given the motions measured between them.
+"""Global alignment: maximum-likelihood poses of the nodes, given the links between them and the sensor readings.
 
 Eliminating the Lagrange multipliers of the mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) leaves a
-least-squares problem with one residual block per link. It is solved as a factor graph with Huber loss; outlier links
-are removed and reported.
+least-squares problem with one residual block per link. Together with the readings of the navigation sensors, it is
+solved as a factor graph with a Huber loss on the links. Outlier links are removed and reported.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from twin.estimate.vision.keyframes import Keyframe
 Mask = NDArray[np.bool_]
 
 _OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; one inlier in 2 million exceeds it
-_MIN_SHARE_OF_WORST = 0.01  # links with a chi2 below this fraction of the largest are not removed in the same round
+_MIN_SHARE_OF_WORST = 0.01  # a link with a chi2 below this fraction of the largest is not removed in the same round
 _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
 _ROUND_ITERATIONS = 10  # iterations per round; the Huber weights converge slowly while the graph has gross outliers
@@ -38,11 +38,13 @@ class AlignmentResult(NamedTuple):
         poses: (n, 4, 4) aligned world_from_camera of the nodes.
         covs: (n, 6, 6) marginal covariances of the poses; zeros for nodes whose covariance was not requested.
         dropped: links that were removed as outliers.
+        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
     """
 
     poses: Array
     covs: Array
     dropped: list[Link]
+    link_chi2: float
 
 
 def align(
@@ -84,11 +86,21 @@ def align(
         state = solution.state
         del solution
         solution = window.optimise(state, _MAX_ITERATIONS)
-    return AlignmentResult(solution.state.poses, _marginals(solution, marginals_of, index_of), dropped)
+    link_chi2 = _mean_chi2(window.links, solution.chi2[0])
+    return AlignmentResult(solution.state.poses, _marginals(solution, marginals_of, index_of), dropped, link_chi2)
+
+
+def _mean_chi2(links: Links, chi2: Array) -> float:
+    """Returns the mean chi-square of the links per degree of freedom; 0 without links.
+
+    `chi2` (n,) was computed with inflated covariances (`link_selection.inflate_for_shared_noise`); the result refers to
+    the covariances before inflation.
+    """
+    return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
 
 
 class _Window(NamedTuple):
-    """Nodes that are aligned together.
+    """Factor graph of the nodes that are aligned together, and the links among its factors.
 
     Args:
         links: links between the nodes.
@@ -105,10 +117,10 @@ class _Window(NamedTuple):
         return adjustment.optimise(self.graph, start, max_iterations)
 
     def outliers(self, chi2: Array) -> Mask:
-        """Returns a mask (n,) of the links to remove, given the squared norms chi2 (n,) of all whitened residuals.
+        """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
 
-        If the chi2 of a link is large but far below the largest, the link with the largest chi2 may have distorted it;
-        such a link is kept until the next round. Links between consecutive keyframes are never removed.
+        A link whose chi2 is far below the largest one is not removed in this round, because the link with the largest
+        chi2 may have distorted its residual. Links between consecutive keyframes are never removed.
         """
         chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))

@@ -63,9 +63,10 @@ def choose_links(
 ) -> list[tuple[Keyframe, float]]:
     """Selects the earlier nodes to which a new node is linked.
 
-    Of the candidates with enough overlap, these are selected until there are `max_links`: the two previous nodes; the
-    farthest node of the same swath, for the longest baseline; the oldest node of other swaths, to close loops; then
-    nodes of other swaths by decreasing overlap, where neighbours of a selected node come last.
+    Up to `max_links` candidates with sufficient overlap are selected, in this order of priority: the two previous
+    nodes; the oldest node of the same swath, for the longest baseline; the oldest node of other swaths, to close loops;
+    the remaining nodes of other swaths by decreasing overlap, with direct neighbours of already selected ones at the
+    end.
 
     Args:
         node: the new node.
@@ -102,12 +103,15 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the indices of `linked` that descend from `newest` without a gap: nodes of the new node's swath."""
+    """Returns the run of consecutive indices newest, newest - 1, ... at the start of `linked` (descending).
+
+    These nodes lie on one swath. The run is empty if `linked` does not start with `newest`.
+    """
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """Returns up to `count` of the indices `others`, in their order; only neighbours of chosen nodes come last.
+    """Returns up to `count` of the indices `others` in their order, except that neighbours of chosen nodes come last.
 
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.

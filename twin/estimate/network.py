@@ -1,4 +1,4 @@
-"""The keyframe network: keyframes, the links between its nodes, and their global alignment."""
+"""The keyframe network: keyframes, links between those that are nodes, and the global alignment of the nodes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision_interface import Vision
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
-_FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are fixed
-_START_NODES = 4  # number of first nodes; always link candidates, because loops return to the reference position
+_FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are practically fixed
+_START_NODES = 4  # number of first nodes; candidates for every link, because loops return to the reference position
 _MOST_PENDING = 8  # largest number of nodes with link measurements in progress
 
 
 class LinkQueue:
-    """Queue of link measurements, in the order of their nodes.
+    """Queue of link measurements, one entry per node, in chronological order.
 
     Args:
         background: true to measure links in a separate thread, which is faster with images; otherwise `collect`
@@ -61,9 +61,13 @@ class LinkQueue:
             self._pending.popleft()
             yield links
 
+    def drop(self) -> None:
+        """Drops the pending measurements."""
+        self._pending.clear()
+
     def close(self) -> None:
         """Ends the thread; pending measurements are dropped."""
-        self._pending.clear()
+        self.drop()
         if self._executor is not None:
             self._executor.shutdown(cancel_futures=True)
 
@@ -77,12 +81,18 @@ class AlignmentHistory:
         dropped: links rejected as outliers by any alignment.
         before_ga: per track, positions (n, 3) of the keyframes just before the alignment of the track [m].
         after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
+        link_residuals: for each measured link, the residual of its points divided by the expected one; NaN where the
+            measurement failed.
+        nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
+            failed), because the link could not be measured.
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
     dropped: list[Link] = field(default_factory=list[Link])
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
+    link_residuals: list[float] = field(default_factory=list[float])
+    nodes_bridged: int = 0
 
 
 class KeyframeNetwork:
@@ -134,7 +144,7 @@ class KeyframeNetwork:
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
 
     def link_to_last_node(self, node: Keyframe) -> Link | None:
-        """Returns the measured link from the last node to a new one; None if it fails or the new node is the first."""
+        """Returns the measured link from the last node to a new one; None for the first node or if matching fails."""
         if not self.nodes:
             return None
         last = self.nodes[-1]
@@ -151,7 +161,8 @@ class KeyframeNetwork:
         Args:
             node: the new node.
             chain: measured link from the last node; None if the measurement failed or this is the first node.
-            bridge: link from the last node by the F2F motion, which replaces a failed `chain`; otherwise None.
+            bridge: link from the last node that consists of the F2F motion, to replace a `chain` that could not be
+                measured; otherwise None.
             displacement: displacement since the last node, measured by the DVL; None if it was not measured.
         """
         s = self.settings
@@ -164,6 +175,7 @@ class KeyframeNetwork:
         others = [(k, overlap) for k, overlap in chosen if k is not self.nodes[-1]]
         # a copy, because the points of the node are released before its links are measured
         self._queue.submit(partial(self._links_of, replace(node), others, chain, bridge))
+        self.history.nodes_bridged += bridge is not None
         self._collect_links(all_but=_MOST_PENDING)
         node.dvl_displacement = displacement if chain else None  # `bridge` already includes it
         self.nodes.append(node)
@@ -196,8 +208,9 @@ class KeyframeNetwork:
         """Aligns all nodes.
 
         Returns:
-            (n_keyframes, 6, 6) marginal covariance, for each keyframe, of the pose of the latest node up to this
-            keyframe; None if the global alignment is switched off or failed before, or with fewer than two nodes.
+            (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the pose of the latest node up to this
+            keyframe. None if the global alignment is switched off, if an earlier alignment or link measurement failed,
+            or if there are fewer than two nodes.
 
         Raises:
             SurveyAborted: the alignment failed; a second call returns None.
@@ -209,8 +222,13 @@ class KeyframeNetwork:
         numbers = [k.number for k in self.keyframes]
         return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
 
+    def abandon_alignment(self) -> None:
+        """Drops the links that are still being measured and disables `align_all`, as the network is incomplete."""
+        self._queue.drop()
+        self._alignable = False
+
     def truncate(self, n_frames: int) -> None:
-        """Removes keyframes, nodes and links after the first `n_frames` frames, such as those of an aborted frame."""
+        """Keeps the keyframes, nodes and links of the first `n_frames` frames; a frame may have been aborted midway."""
         self._collect_links()
         self.keyframes = [k for k in self.keyframes if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
@@ -226,8 +244,9 @@ class KeyframeNetwork:
         )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Measures the links from earlier nodes, given with their overlaps; returns those that could be measured."""
+        """Returns the links from earlier nodes (given as pairs of node and overlap) that could be measured."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
+        self.history.link_residuals += [np.nan if motion is None else motion.residual for motion in motions]
         return [
             link_selection.to_link(node, other, overlap, motion)
             for (other, overlap), motion in zip(others, motions, strict=True)
@@ -250,8 +269,8 @@ class KeyframeNetwork:
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
 
-        Older nodes that are linked to them are fixed. Keyframes between nodes keep their pose relative to the node
-        before them. Links rejected as outliers are removed from the network.
+        Older nodes that are linked to the given nodes are fixed. Keyframes between nodes keep their pose relative to
+        the preceding node. Links rejected as outliers are removed from the network.
 
         Args:
             nodes: nodes to align, in the order of time, up to the newest node.
@@ -273,7 +292,8 @@ class KeyframeNetwork:
             self._alignable = False
             raise SurveyAborted(f"global alignment failed: {error}") from None
         ms = (time.perf_counter() - start_s) * 1e3
-        self.history.alignments.append(Alignment(track, ms, len(everyone), len(links), len(aligned.dropped)))
+        n_nodes, n_dropped = len(everyone), len(aligned.dropped)
+        self.history.alignments.append(Alignment(track, ms, n_nodes, len(links), n_dropped, aligned.link_chi2))
         self.history.dropped += aligned.dropped
         if aligned.dropped:
             dropped = {link[:2] for link in aligned.dropped}
@@ -284,7 +304,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets the poses of nodes, by number; keyframes between nodes keep their pose relative to the node before."""
+        """Sets the poses of nodes, by number; keyframes between nodes keep their pose relative to the last node."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

@@ -18,6 +18,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link
+from twin.core.quality import EstimationQuality
 from twin.core.records import ElevationMap, Estimate, Frame, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
@@ -36,7 +37,7 @@ from twin.estimate.vision_interface import Vision
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
 _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # standard deviation due to resampling in the mosaic [rad, m]
-_SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
+_SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
 
 
 class MotionSinceNode(NamedTuple):
@@ -104,9 +105,9 @@ class Navigator:
     def update(self, frame: Frame, track: int = 1) -> Estimate:
         """Processes one frame and returns its online estimate.
 
-        Only a frame with a stereo pair can become a keyframe. It becomes one if `frame.keyframe` is True. If
-        `frame.keyframe` is None, it becomes one if there is no keyframe yet, if tracking failed, or if its overlap with
-        the last keyframe is below `settings.keyframe_overlap`.
+        Only a frame with a stereo pair can become a keyframe: always if `frame.keyframe` is True, never if it is False.
+        If it is None, the frame is made a keyframe if there is none yet, if tracking failed, or if its overlap with the
+        last keyframe is below `settings.keyframe_overlap`. A pair with too few matched points does not become one.
 
         Args:
             frame: images and sensor readings of the frame.
@@ -114,6 +115,7 @@ class Navigator:
         """
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
+        self.log.n_lost += status != "ok"
         aiding = readings_as_arrays(frame.readings)
         state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
@@ -135,10 +137,10 @@ class Navigator:
             self._follow_last_keyframe(node_cov)
 
     def finish(self) -> SurveyResult:
-        """Aligns all keyframes globally.
+        """Runs the final global alignment over all nodes.
 
         Returns:
-            The trajectories, the keyframes with their covariances, and the network.
+            The trajectories, the keyframes with their covariances, the links, and the quality of the estimation.
 
         Raises:
             SurveyAborted, OSError: the alignment or the measurement of links failed. A second call skips these steps
@@ -165,7 +167,12 @@ class Navigator:
             before_ga=history.before_ga,
             after_ga=history.after_ga,
             stereo_observations=[pair for pair in self.vision.stereo_observations if pair.row < len(log)],
+            quality=self._quality(),
         )
+
+    def abandon_alignment(self) -> None:
+        """Drops the links that are still being measured and disables the final alignment, so that `finish` is quick."""
+        self.network.abandon_alignment()
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
@@ -178,7 +185,7 @@ class Navigator:
         Args:
             result: result of the survey (`finish`).
             grid: grid of the map; by default it covers the images of all keyframes.
-            progress: called with the fraction of the keyframes that are done, 0 to 1.
+            progress: called with the fraction of the keyframes processed so far, 0 to 1.
 
         Returns:
             The map, or None if there is no keyframe.
@@ -198,6 +205,21 @@ class Navigator:
         found = self.vision.build_map(turned, cells, result.step_cov, report)
         return replace(found, map_from_world=map_from_world)
 
+    def _quality(self) -> EstimationQuality:
+        """Returns the quality of the estimation: lost frames, failed links, residuals and rectification errors."""
+        history = self.network.history
+        residuals = np.array(history.link_residuals)
+        failed = np.isnan(residuals)
+        return EstimationQuality(
+            frames_lost=self.log.n_lost,
+            nodes_bridged=history.nodes_bridged,
+            links_tried=len(residuals),
+            links_failed=int(failed.sum()),
+            link_residual=None if failed.all() else float(np.median(residuals[~failed])),
+            link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
+            epipolar=self.vision.epipolar_error(),
+        )
+
     @property
     def dead_reckoning(self) -> DeadReckoningState:
         """Dead-reckoning state at the last frame; `dead_reckon` advances it by one frame."""
@@ -215,16 +237,16 @@ class Navigator:
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
     def _image_vision(self, folder: Path | None) -> StereoVision:
-        """Creates the source of visual measurements from images; `folder` None creates a temporary folder.
+        """Creates the source of visual measurements from images, in `folder` or, if it is None, in a temporary folder.
 
-        `close` releases both.
+        `Navigator.close` closes the source and removes the temporary folder.
         """
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
 
     def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s]; the nominal interval if the difference is only rounding."""
+        """Returns the time since the last frame [s]; the nominal interval if the two differ by rounding only."""
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
@@ -287,9 +309,9 @@ class Navigator:
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
         """Corrects the online pose by registration with the mosaic (F2M).
 
-        The part of the mosaic that the image is registered with has the pose error of the keyframe that it was taken
-        from. The correction is therefore weighted by the covariance of the motion since that keyframe, not by that of
-        the pose.
+        The mosaic contains the pose errors of the keyframes it was made from. The correction is therefore weighted by
+        the covariance of the motion since the keyframe that the compared cells come from, not by the covariance of the
+        pose.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
@@ -307,7 +329,10 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Adds a node to the network; if `chain` is None, it is linked to the last node by the F2F motion."""
+        """Adds a node to the network, linked to the last node by `chain`, or by the F2F motion if `chain` is None.
+
+        The motion since the last node then restarts at this node.
+        """
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10

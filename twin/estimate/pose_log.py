@@ -7,9 +7,14 @@ from twin.core.growing_array import GrowingArray
 
 
 class PoseLog:
-    """Times and estimated poses of all frames; memory grows by 264 bytes per frame."""
+    """Times and estimated poses of all frames; memory grows by 264 bytes per frame.
+
+    Attributes:
+        n_lost: number of frames whose motion was not measured but predicted.
+    """
 
     def __init__(self) -> None:
+        self.n_lost = 0
         self._times_s, self._f2f, self._online = GrowingArray(), GrowingArray(4, 4), GrowingArray(4, 4)
 
     def __len__(self) -> int:

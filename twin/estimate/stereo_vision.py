@@ -5,28 +5,47 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
+from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
 from twin.estimate.viewing_plane import viewing_plane
-from twin.estimate.vision import disparity, image_scale, matching, stereo
+from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo
+from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
+from twin.estimate.vision.repetition import repetition
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe
-_SAME_INTERVAL = 1e-6  # relative tolerance, because timestamps are rounded
+_SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
+
+
+class _MatchedPair(NamedTuple):
+    """Matched stereo pair: right image without the known rectification errors, its grey levels, disparity and points.
+
+    Args:
+        right_image: right image at full size.
+        right: grey levels of the right image at the image scale.
+        dense_px: (H, W) disparity by semi-global matching [px], NaN where unknown.
+        points: matched points.
+    """
+
+    right_image: Image
+    right: matching.Gray
+    dense_px: NDArray[np.float32]
+    points: StereoPoints
 
 
 class StereoVision:
@@ -38,8 +57,8 @@ class StereoVision:
         rig: believed calibration.
         settings: settings of the estimators.
         folder: folder for the images of keyframes and the tiles of the mosaic.
-        cell_m: cell size of the mosaic at full image size [m], multiplied by the binning; by default the ground sample
-            distance of the first keyframe.
+        cell_m: cell size of the mosaic for images of full size [m]; binned images have cells larger by the binning. By
+            default the ground sample distance of the first keyframe.
         stopwatch: returns the context manager that times the stage of a given name.
     """
 
@@ -58,6 +77,7 @@ class StereoVision:
         self._cell_m, self._folder = cell_m, folder
         self._times_s: tuple[float, float] = (np.nan, np.nan)  # of the last two frames
         self._plane_from_world: Array | None = None
+        self.calibration = EpipolarCalibration()
         self._configure(binning=1)
         self.stereo_observations: list[StereoObservation] = []
         self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
@@ -134,18 +154,47 @@ class StereoVision:
         with self.stopwatch("stereo"):
             if self._points is None:
                 self._choose_scale(left_image, right_image)
-            right = matching.gray(right_image, self.binning)
-            dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
-            self.search_range.update(dense_px)
-            points = stereo.match_stereo_points(
-                self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
-            )
-        self.stereo_observations.append(StereoObservation(row, len(points.xyz), matching.contrast(self._gray)))
-        if len(points.xyz) < _MIN_POINTS:
+            pair = self._match_pair(right_image)
+            if len(pair.points.xyz) >= _MIN_POINTS:
+                self.calibration.add(pair.points, self.rig, self.settings.patch_px)
+                if self.calibration.update(self.full_rig):
+                    pair = self._match_pair(right_image)
+            self.stereo_observations.append(self._observation(row, frame.left, pair.points))
+        if len(pair.points.xyz) < _MIN_POINTS:
             return None
-        self._points, self._depth_m = points, _depth(dense_px, self.rig)
-        self.spool.put(row, left_image, right_image, (self._gray, right))
-        return points
+        self._points, self._depth_m = pair.points, _depth(pair.dense_px, self.rig)
+        self.spool.put(row, left_image, pair.right_image, (self._gray, pair.right))
+        return pair.points
+
+    def _match_pair(self, right_image: Image) -> _MatchedPair:
+        """Matches the current left image with a right image, after removal of the known rectification errors."""
+        right_image = self.calibration.rectify(right_image, self.full_rig)
+        right = matching.gray(right_image, self.binning)
+        dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
+        self.search_range.update(dense_px)
+        points = stereo.match_stereo_points(
+            self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
+        )
+        return _MatchedPair(right_image, right, dense_px, points)
+
+    def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
+        """Returns the number of matched points, image quality and row differences [px of the full image] of a pair."""
+        contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
+        repeated = repetition(self._image, self.settings.patch_px)
+        if not len(points.xyz):
+            return StereoObservation(row, 0, contrast, saturated, repetition=repeated)
+        offset_px = float(np.median(points.row_difference_px))
+        sigma_px = float(np.median(epipolar_calibration.row_sigma(points))) * self.rig.focal_px / points.noise_ratio
+        return StereoObservation(
+            row,
+            len(points.xyz),
+            contrast,
+            saturated,
+            row_offset_px=self.binning * offset_px,
+            row_spread_px=self.binning * epipolar_calibration.spread(points),
+            row_sigma_px=self.binning * sigma_px,
+            repetition=repeated,
+        )
 
     def restart_tracking(self) -> None:
         if self._points is not None:
@@ -177,6 +226,9 @@ class StereoVision:
                 motions.append(None if matched is None else self.matcher.motion(node, other, matched))
         return motions
 
+    def epipolar_error(self) -> EpipolarError:
+        return self.calibration.report()
+
     def discard(self, numbers: range) -> None:
         """Does nothing: the images are on disk, so there is no memory to release."""
 
@@ -199,8 +251,8 @@ class StereoVision:
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
     """Returns half the side of the square of the mosaic that is used for registration [m].
 
-    This is 0.6 times the width of the footprint at the 90th percentile of depth. The largest depth is not robust: one
-    mismatch with a disparity of 0.5 px would require a mosaic of 20 GB.
+    This is 0.6 times the width of the footprint at the 90th percentile of depth. The largest depth is not used: one
+    mismatch with a disparity of 0.5 px would make the square so large that it needs 20 GB of memory.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 

@@ -1,4 +1,4 @@
-"""Axes of a mosaic or an elevation map, in which heights are measured above the plane z = 0."""
+"""Choice of the axes of a mosaic or an elevation map: heights are measured along their z axis, towards the camera."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 
-#: Largest angle from straight down for which heights along z of the world describe the scene well.
+#: Largest angle of the optical axis from straight down for which heights are measured along z of the world.
 _MAX_TILT_RAD = np.deg2rad(45.0)
 
 

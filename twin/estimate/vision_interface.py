@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from twin.core.geometry import Array
+from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, SurveyResult
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
@@ -21,7 +22,7 @@ class Vision(Protocol):
     """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
 
     Attributes:
-        stereo_observations: number of matched points and contrast of every stereo pair so far.
+        stereo_observations: image quality and number of matched points of every stereo pair so far.
         runs_in_background: whether `measure_motions` takes long enough to justify a separate thread.
     """
 
@@ -29,7 +30,7 @@ class Vision(Protocol):
     stereo_observations: list[StereoObservation]
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        """F2F: returns the motion since the last frame, and "ok" or the reason why tracking failed."""
+        """Returns the frame-to-frame motion (F2F) since the last frame, and "ok" or the reason why tracking failed."""
         ...
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -49,15 +50,15 @@ class Vision(Protocol):
         ...
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        """F2M: returns the correction of the latest keyframe's predicted pose, or None if registration fails."""
+        """Returns the correction of the latest keyframe's predicted pose by F2M, or None if the registration fails."""
         ...
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        """Adds the latest keyframe to the mosaic under its number, at the given pose."""
+        """Adds the latest keyframe, with this keyframe number, to the mosaic at the given pose."""
         ...
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
-        """Clears the mosaic and rebuilds it from these keyframes, the latest of the path, at their current poses."""
+        """Clears the mosaic and rebuilds it from these keyframes, which are the most recent, at their current poses."""
         ...
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
@@ -67,8 +68,12 @@ class Vision(Protocol):
         """
         ...
 
+    def epipolar_error(self) -> EpipolarError | None:
+        """Returns the estimated errors of the rectification; None if the measurements do not come from images."""
+        ...
+
     def discard(self, numbers: range) -> None:
-        """Releases the data kept in memory for the keyframes with these numbers; no later link uses these keyframes."""
+        """Releases the data in memory of the keyframes with these numbers; they must not be linked afterwards."""
         ...
 
     def build_map(

@@ -1,4 +1,9 @@
-"""GeoTIFF files in local metric coordinates. Row 0 is the northernmost row; "no data" is NaN in float layers."""
+"""GeoTIFF files of maps. Row 0 is the northernmost row; the nodata value of float layers is NaN.
+
+Without a georeference, files are in the local metric coordinates of the scene. With the georeference of a measured DEM,
+they are in the CRS of the DEM, and elevations are metres above its vertical datum, positive upwards. Tags then hold the
+scene origin, from which `scene_placement` computes scene coordinates.
+"""
 
 from __future__ import annotations
 
@@ -11,45 +16,110 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, Image, MapGrid
 
 Layer = NDArray[np.float32]
 
-#: Local coordinate system: metres east and north of the origin of the survey.
+#: Local coordinate system: metres east and north of the scene origin.
 LOCAL_METRES = CRS.from_wkt(
     'LOCAL_CS["local metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
 
 
-def write_map(folder: Path, elevation_map: ElevationMap) -> None:
+_ORIGIN_TAGS = ("SCENE_ORIGIN_EASTING", "SCENE_ORIGIN_NORTHING", "SCENE_ORIGIN_ELEVATION_M")
+_UNIT_TAG = "SCENE_METRES_PER_UNIT"
+_ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include the elevation of the scene origin
+_DECIMALS = 6  # to which scene coordinates [m] are rounded; CRS coordinates have up to seven digits before the point
+
+
+def write_map(folder: Path, elevation_map: ElevationMap, georeference: Georeference | None = None) -> None:
     """Writes dem.tif, dem_sigma.tif and mosaic.tif into a folder."""
-    write_layer(folder / "dem.tif", elevation_map.height_m, elevation_map.grid, "elevation [m]")
-    write_layer(folder / "dem_sigma.tif", elevation_map.sigma_m, elevation_map.grid, "standard deviation [m]")
-    write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, elevation_map.grid)
+    grid = elevation_map.grid
+    write_elevations(folder / "dem.tif", elevation_map.height_m, grid, "elevation [m]", georeference)
+    write_layer(folder / "dem_sigma.tif", elevation_map.sigma_m, grid, "standard deviation [m]", georeference)
+    write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, grid, georeference)
 
 
-def write_layer(path: Path, values: Layer, grid: MapGrid, description: str) -> None:
+def write_elevations(
+    path: Path, height_m: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
+) -> None:
+    """Writes heights (rows, cols) above the plane z = 0 of the scene.
+
+    With a georeference, elevations in its vertical datum are written as float64, because float32 would round the
+    elevations of a deep site to 0.1 mm.
+    """
+    if georeference is None:
+        return write_layer(path, height_m, grid, description)
+    elevations = height_m.astype(np.float64) + georeference.elevation_m
+    with rasterio.open(path, "w", **_profile(grid, 1, "float64", georeference), nodata=np.nan, predictor=3) as file:
+        file.write(elevations, 1)
+        file.set_band_description(1, description)
+        file.update_tags(**_tags(georeference))
+        file.update_tags(1, **_ELEVATION_TAG)
+
+
+def write_layer(
+    path: Path, values: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
+) -> None:
     """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
-    with rasterio.open(path, "w", **_profile(grid, 1, "float32"), nodata=np.nan, predictor=3) as file:
+    with rasterio.open(path, "w", **_profile(grid, 1, "float32", georeference), nodata=np.nan, predictor=3) as file:
         file.write(values.astype(np.float32), 1)
         file.set_band_description(1, description)
+        file.update_tags(**_tags(georeference))
 
 
-def write_mosaic(path: Path, mosaic: Image, grid: MapGrid) -> None:
+def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
     """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
-    with rasterio.open(path, "w", **_profile(grid, 3, "uint8"), nodata=0, photometric="RGB") as file:
+    profile = _profile(grid, 3, "uint8", georeference)
+    with rasterio.open(path, "w", **profile, nodata=0, photometric="RGB") as file:
         file.write(np.moveaxis(mosaic, 2, 0))
+        file.update_tags(**_tags(georeference))
 
 
-def _profile(grid: MapGrid, bands: int, dtype: str) -> dict[str, Any]:
+def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
+    """Returns the grid of an open raster in scene coordinates, and the offset to subtract from its values [m].
+
+    The offset is the elevation of the scene origin if the raster holds elevations in a vertical datum, otherwise 0.
+
+    Raises:
+        ValueError: the raster is rotated or its cells are not square.
+    """
+    t, tags = source.transform, source.tags()
+    if t.b or t.d or t.a <= 0 or not np.isclose(t.a, -t.e, rtol=1e-6):
+        raise ValueError("the raster is rotated or its cells are not square")
+    if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
+        return MapGrid(t.c, t.f, t.a, source.height, source.width), 0.0
+    easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
+    origin = Georeference(easting, northing, elevation_m, metres_per_unit=float(tags[_UNIT_TAG]))
+    west, north = (round(float(value), _DECIMALS) for value in origin.to_scene(t.c, t.f))
+    cell_m = round(t.a * origin.metres_per_unit, 2 * _DECIMALS)
+    elevations = _ELEVATION_TAG.items() <= source.tags(1).items()
+    return MapGrid(west, north, cell_m, source.height, source.width), origin.elevation_m if elevations else 0.0
+
+
+def _profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
     """Returns the rasterio profile of a GeoTIFF file on `grid`."""
+    origin = georeference or Georeference(0.0, 0.0)
+    west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))
+    cell = grid.cell_m / origin.metres_per_unit
     return {
         "driver": "GTiff",
         "width": grid.cols,
         "height": grid.rows,
         "count": bands,
         "dtype": dtype,
-        "crs": LOCAL_METRES,
-        "transform": Affine(grid.cell_m, 0, grid.west_m, 0, -grid.cell_m, grid.north_m),
+        "crs": LOCAL_METRES if origin.crs_wkt is None else CRS.from_wkt(origin.crs_wkt),
+        "transform": Affine(cell, 0, west, 0, -cell, north),
         "compress": "deflate",
     }
+
+
+def _tags(georeference: Georeference | None) -> dict[str, str]:
+    """Returns the tags that hold the scene origin, the unit and the vertical datum; empty without a georeference."""
+    if georeference is None:
+        return {}
+    origin = (georeference.easting, georeference.northing, georeference.elevation_m)
+    tags = {name: repr(value) for name, value in zip(_ORIGIN_TAGS, origin, strict=True)}
+    datum = georeference.vertical_datum or "same as the source DEM"
+    return tags | {_UNIT_TAG: repr(georeference.metres_per_unit), "VERTICAL_DATUM": datum}

@@ -18,14 +18,14 @@ MAX_VERTICES = 400_000
 
 
 def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> None:
-    """Writes the mapped cells as a surface with the orthomosaic's colours; without triangles the scene is empty."""
+    """Writes the mapped cells as a surface in the orthomosaic's colours; without triangles, an empty scene."""
     mesh = map_mesh(elevation_map, max_vertices)
     scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
     path.write_bytes(export_glb(scene))
 
 
 def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
-    """Returns the triangle mesh of a map in the axes of glTF.
+    """Returns the triangle mesh of a map in glTF axes, with the colours of the orthomosaic.
 
     Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
     vertices and face upwards; cells that belong to no triangle are omitted.

@@ -1,1 +1,1 @@
-"""Image formation: from albedo and range of the floor to the digital image of a camera."""
+"""Image formation: from albedo and depth of the floor to the digital image of a camera."""

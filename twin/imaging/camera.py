@@ -1,4 +1,4 @@
-"""Stereo camera of the simulation: computes the images at a pose, from rendering and illumination to exposure."""
+"""Simulated stereo camera: renders the floor and computes light in the water, exposure and noise of each image."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ class StereoCapture(NamedTuple):
 
 
 class DecomposedImage(NamedTuple):
-    """Intermediate results in the computation of a left image.
+    """A left image without noise, with the intermediate results of its computation.
 
     Args:
         albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
         depth: (H, W) depth along the optical axis [m].
         components: direct signal, backscatter and other components of the radiance.
-        setting: exposure, metered on this image itself.
+        setting: exposure, metered on this image.
         noise_free: (H, W, 3) image without noise.
-        raw: digital numbers of the physical sensor, with the noise that the next capture will have: (H, W) with a Bayer
-            filter, otherwise (H, W, 3); None for the plain sensor.
+        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (H, W) with a
+            Bayer filter, otherwise (H, W, 3); None for the plain sensor.
     """
 
     albedo: Image
@@ -66,7 +66,7 @@ class DecomposedImage(NamedTuple):
 
 
 class StereoCamera:
-    """Stereo camera whose two cameras share one auto-exposure; their image noise is independent.
+    """Stereo camera: both cameras share one auto-exposure; their noise is independent.
 
     Args:
         renderer: renderer of albedo and depth of the floor.
@@ -105,8 +105,8 @@ class StereoCamera:
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            stereo: whether the right camera is used.
-            twist_body: (6,) true [angular, linear] velocity in the body [rad/s, m/s].
+            stereo: whether the right camera is used too.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
         self._n_captures += 1
@@ -121,7 +121,7 @@ class StereoCamera:
         return self._camera_from_body_twist[camera] @ twist_body
 
     def decompose(self, world_from_left: Array) -> DecomposedImage:
-        """Returns the left image at a pose and time 0 with its components; does not change the state of the camera."""
+        """Returns the left image at a pose and time 0 with intermediate results; has no effect on later captures."""
         albedo, depth = self._renderer.render(world_from_left)
         components = self._image_formation.components(albedo, depth, 0, StampedPose(world_from_left, 0.0))
         cameras = self._cameras

@@ -30,7 +30,7 @@ STREAM = 1 << 16  # key of the random stream for the waves
 
 
 class Caustics:
-    """Caustics of one survey, computed on the reference plane.
+    """Caustics of one survey: a time-dependent pattern, computed on the reference plane.
 
     Args:
         illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
@@ -50,7 +50,7 @@ class Caustics:
         weight = np.where(in_band & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
         height = np.sqrt(weight) * (rng.normal(size=k.shape) + 1j * rng.normal(size=k.shape))
         height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # the mean square of a sine is 1/2
-        # columns with waves below the shortest wavelength are zero and not stored
+        # columns in which all waves are shorter than the shortest wavelength are zero and are not stored
         columns = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))
         self._omega = np.sqrt(GRAVITY_MPS2 * k[:, columns])
         # 0.5: the spectrum of a real surface is Hermitian, and only one half of it is stored
@@ -86,8 +86,8 @@ class Caustics:
 def _blur(k: Array, depth_m: float, water: Medium) -> Array:
     """Returns the modulation transfer function of the blur by the solar disc and by forward scattering of green light.
 
-    With t the optical thickness of forward scattering, the fraction exp(-t) of the light is not scattered; the rest is
-    scattered t / (1 - exp(-t)) times on average.
+    With t the optical thickness of forward scattering over the depth, the fraction exp(-t) of the light is not
+    scattered; the rest is scattered t / (1 - exp(-t)) times on average.
 
     Args:
         k: wave numbers of the pattern, of any shape [rad/m].

@@ -3,7 +3,7 @@
 Light scattered by angles below a limit, with coefficient b_f < b, is not lost from the image. The radiance L of a
 floor at range r then arrives as L exp(-(c - b_f) r): the fraction exp(-b_f r) of this is the direct signal,
 L exp(-c r), and the fraction 1 - exp(-b_f r) is blurred. This is the form of McGlamery (1979) and Jaffe (1990),
-direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f, which is a + 0.26 b here.
+direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f; with the default phase function, G = a + 0.26 b.
 
 The width of the blur follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly
 distributed position along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance
@@ -32,16 +32,16 @@ from twin.imaging.water import SEA_WATER_MEAN_COSINE, Medium, phase_function
 Array = NDArray[np.float64]
 
 FORWARD_DEG = 15.0  # light scattered by a larger angle is lost from the image
-LEVELS = 4  # number of blur levels, of 1, 2, 4, 8 times the smallest variance; light in between is split between two
+LEVELS = 4  # number of blur levels, with 1, 2, 4, 8 times the smallest variance; other variances mix two levels
 STEP_M = 0.02  # range step of the table of levels
-MAX_LOG_GAIN = 60.0  # limit of b_f r; beyond it no light arrives
+MAX_LOG_GAIN = 60.0  # upper limit of b_f r, against overflow; no light arrives from such ranges
 
 
 class ForwardScattering(NamedTuple):
     """Scattering by angles below `FORWARD_DEG`.
 
     Args:
-        share: fraction of the scattering coefficient b.
+        share: fraction of the scattering coefficient b due to these angles.
         variance_rad2: variance of the scattering angle along one axis [rad^2].
     """
 
@@ -50,14 +50,14 @@ class ForwardScattering(NamedTuple):
 
 
 def forward_scattering(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> ForwardScattering:
-    """Returns fraction and variance of scattering by angles below `FORWARD_DEG`, integrated from the phase function."""
+    """Integrates the phase function over angles below `FORWARD_DEG`, for a mean cosine of the scattering angle."""
     angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
     density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
     return ForwardScattering(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
 
 
 class ForwardScatter:
-    """Model of the forward-scattered light from the floor, computed from the direct signal.
+    """Computes the forward-scattered light from the floor, given the direct signal.
 
     Args:
         rig: the rendered cameras.
@@ -109,7 +109,7 @@ class ForwardScatter:
 
 
 def _level_of(ratio: Array) -> Array:
-    """Returns the fractional blur level for variances of `ratio` times the smallest; linear between powers of two."""
+    """Returns the fractional blur level for variances `ratio` times the smallest; linear in `ratio` between levels."""
     below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
     return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
 
@@ -124,7 +124,7 @@ def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
 def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, end):
     """Adds the forward-scattered light of each pixel to its bin, split between two levels of the blur variance.
 
-    Fills rows `first` to `end` of the bins. The light is computed per pixel, the level for the mean range of each bin.
+    Fills rows `first` to `end` of the bins. The light is computed per pixel; the level per bin, from its mean range.
     """
     levels, _, cols, _ = bins.shape
     width, last = depth.shape[1], level.shape[0] - 1

@@ -18,11 +18,11 @@ class Daylight(NamedTuple):
     """Daylight from the zenith in the bands R, G, B.
 
     Args:
-        surface_lx: (3,) illuminance just below the water surface, or of the floor if there is no surface.
+        surface_lx: (3,) illuminance just below the water surface, or on the floor if there is no surface.
         illuminance_lx: (3,) illuminance on a horizontal plane at the planned altitude.
         attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
-        camera_depth_m: depth of the planned altitude below the surface; 0 where there is no surface.
+        camera_depth_m: depth of the cameras below the surface at the planned altitude; 0 where there is no surface.
         focused_share: fraction of the daylight that the surface waves focus into caustics.
     """
 
@@ -53,7 +53,7 @@ def illumination_of(scenario: Scenario) -> Illumination:
 
 
 def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
-    """Returns the daylight for cameras at an altitude above the reference plane, attenuated by the water above them.
+    """Returns the daylight for cameras at `altitude_m` above the reference plane, attenuated by the water above them.
 
     Raises:
         TwinError: the altitude is above the surface, or caustics are requested without a surface.

@@ -30,11 +30,13 @@ class RadianceComponents(NamedTuple):
     """Components of the light that reaches a camera, per colour band in photometric units; (H, W, 3) float32 each.
 
     Args:
-        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where too little of it reaches the camera.
+        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where the water transmits too little light
+            from the floor to the camera to compute it.
         direct: light from the floor that was not scattered on its path to the camera [cd/m2].
         forward: light from the floor that was scattered by small angles [cd/m2]; None if forward scatter is disabled.
         backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
-        snow: change of the radiance by marine snow [cd/m2], negative where it hides light; None if it is disabled.
+        snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than what they hide;
+            None if marine snow is disabled.
         total: sum of direct, forward, backscatter and snow [cd/m2].
     """
 
@@ -119,7 +121,7 @@ class ImageFormation:
         return self._shadows.lit(depth, self._world_from_camera(camera, pose), camera)
 
     def _water_surface(self, camera: int, pose: StampedPose) -> WaterSurface | None:
-        """Returns the water surface above a camera, or None if the scenario has none; daylight is then uniform."""
+        """Returns the water surface above a camera; None if the scenario has no surface, so daylight is uniform."""
         if not self._reference_depth_m:
             return None
         east, north, up = self._world_from_camera(camera, pose)[:3]

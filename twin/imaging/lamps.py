@@ -1,4 +1,4 @@
-"""Light sources in the axes of a camera: position, beam, intensity and colour of the lamps, and the daylight."""
+"""Light sources of a camera: the lamps in its axes, with beam, intensity and colour, and the daylight."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def light_sources_in_camera(
     """Returns the lamps, which are fixed to the body, in the axes of a camera (0 left, 1 right).
 
     Raises:
-        TwinError: the angles of a beam do not start at 0 and increase.
+        TwinError: the angles of a beam table do not start at 0, or do not increase.
     """
     camera_from_body = geometry.inverse(rig.body_from_camera @ (rig.left_from_right if camera else np.eye(4)))
     position = np.array([lamp.position_m for lamp in lamps]).reshape(-1, 3)
@@ -70,13 +70,13 @@ def light_sources_in_camera(
 
 
 def _beam_axis(lamp: LampConfig) -> Array:
-    """Returns the unit vector (3,) of a beam axis in the body: straight down, tilted to the bow and panned to port."""
+    """Returns the beam axis (3,), a unit vector in body axes: down, tilted towards the bow and panned towards port."""
     tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
     return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
 
 
 def _beam(number: int, lamp: LampConfig) -> Array:
-    """Returns the beam table (m, 2) of a lamp. Raises TwinError if its angles do not start at 0 and increase."""
+    """Returns the beam table (m, 2) of a lamp. Raises TwinError if its angles do not start at 0 or do not increase."""
     table = np.array(lamp.beam or LED_BEAM)
     if table[0, 0] != 0 or not (np.diff(table[:, 0]) > 0).all():
         raise TwinError(f"lamps.{number}.beam", "angles do not increase from 0", "as in [[0, 1], [30, 0.7], [60, 0]]")

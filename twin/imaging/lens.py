@@ -1,4 +1,4 @@
-"""Lens distortion by Brown and Conrady, in the form and order of OpenCV (Brown 1971, Close-range calibration).
+"""Brown-Conrady lens distortion, with the parameters of OpenCV (Brown 1971, Close-range camera calibration).
 
 A ray in front of the lens with direction (X, Y, Z) has the tangents x = X / Z, y = Y / Z. With r^2 = x^2 + y^2, its
 distorted image coordinates, in units of the focal length, are
@@ -18,7 +18,7 @@ from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
-STEPS, TOLERANCE = 30, 1e-12  # Newton's method: maximum number of steps, tolerance of tangents (1e-9 is about 1e-6 px)
+STEPS, TOLERANCE = 30, 1e-12  # Newton's method: maximum number of steps; residual at which it stops (about 1e-9 px)
 
 
 class Distortion(NamedTuple):

@@ -8,7 +8,7 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera an
 
 with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
 of the angle of incidence, E_sun the illuminance by daylight, psi_i the scattering angle, p the phase function, b the
-scattering coefficient and c the effective attenuation (`water.Medium`). The model has no free factors. Shadows,
+scattering coefficient and c the effective attenuation (`water.Medium`). The model has no free scale factors. Shadows,
 caustics and forward scatter are computed in other modules. Multiple scattering is neglected in the backscatter.
 """
 
@@ -35,13 +35,13 @@ Depth = NDArray[np.float32]
 Lit = NDArray[np.uint8]
 
 LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
-LEAST_TRANSMISSION = 1e-25  # below this, single precision cannot represent the direct signal
+LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the direct signal
 BACKSCATTER_GRID, BACKSCATTER_RANGES, BACKSCATTER_SUBSTEPS = (16, 20), 48, 8
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
 
 class WaterSurface(NamedTuple):
-    """The water surface above a camera.
+    """The water surface above a camera: the caustics that it casts, and its position relative to the camera.
 
     Args:
         caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
@@ -60,7 +60,8 @@ class _Tables(NamedTuple):
     Args:
         beams: (lamps, n) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)) in [0, 1].
         transmission: (3, n) exp(-c s) at even steps of the path length s.
-        backscatter: (rows, cols, 3, ranges) radiance on a coarse pixel grid; even steps of r / (r + scale), r = range.
+        backscatter: (rows, cols, 3, ranges) radiance on a coarse pixel grid, at even steps of
+            r / (r + `RANGE_SCALE_M`), with r the range.
     """
 
     beams: NDArray[np.float32]
@@ -101,7 +102,7 @@ class Optics:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
             lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; None = no shadows.
-            surface: the water surface; None = a calm surface above a camera that points straight down from the planned
+            surface: the water surface; None = a calm surface, for a camera that points straight down at the planned
                 altitude.
         """
         out = np.empty(albedo.shape, np.float32)

@@ -1,4 +1,4 @@
-"""Physical sensor (section [sensor] of a scenario): from photons to digital numbers; exposure and read-out time."""
+"""Physical sensor (section [sensor] of a scenario): radiance to digital numbers; exposure and read-out time."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
 
     Args:
         scenario: survey scenario.
-        raw_rig: rig with the size and focal length of the raw images; None = those of the frames.
+        raw_rig: rig with the size and focal length of the raw images; None = the rig of the frames.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
@@ -43,7 +43,7 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
 class PhotoSensor:
     """Physical sensor of both cameras, with auto-exposure that increases first the exposure time, then the gain.
 
-    If exposure time and gain reach their limits, images become dark or saturate. Auto-exposure meters the radiance, not
+    At the limits of exposure time and gain, images become dark or saturate. Auto-exposure meters the radiance, not
     the image, so it does not oscillate if an image saturates.
     """
 
@@ -56,7 +56,7 @@ class PhotoSensor:
         self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
         self._white = self._electrons_per_cd_s.max() / self._electrons_per_cd_s
         self._tones = self._tone_table()
-        # signal at 1 cd/m2 and gain 1 in the most sensitive band; white balance amplifies the other bands
+        # signal per second at 1 cd/m2 and gain 1 in the most sensitive band; white balance amplifies the others
         self._signal_per_s = float(self._electrons_per_cd_s.max()) / sensor.full_well_e
         self._shortest_s, self._longest_s = sensor.exposure_min_ms / 1000, sensor.exposure_max_ms / 1000
         self._most_gain = 10 ** (sensor.gain_max_db / 20)
@@ -65,7 +65,7 @@ class PhotoSensor:
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, metered on the previous frames; its radiance `light` affects later frames."""
+        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames."""
         gain = self._exposure.gain_for(float(_weighted_mean(light, self._vignetting).max()))
         product_s = gain / self._signal_per_s
         exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
@@ -119,7 +119,7 @@ class PhotoSensor:
         )  # fmt: skip
 
     def _tone_table(self) -> NDArray[np.uint8]:
-        """Returns a table (3, 2^bits) of the 8-bit value for each band and digital number."""
+        """Returns the tone table (3, 2^bits): the 8-bit value of each digital number in each band."""
         signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
         return np.clip(255 * self._white[:, None] * signal + 0.5, 0, 255).astype(np.uint8)
 

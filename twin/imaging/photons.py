@@ -1,9 +1,9 @@
-"""Radiometry of lens and pixel: number of photons and electrons for a given luminance, and vignetting.
+"""Radiometry of lens and pixel: photons and electrons per unit of luminance, and vignetting.
 
-Light has three bands. Each band is given as the luminance [cd/m2] of the white light that it is a part of: a white
-floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE illuminant E). A band is 100 nm
-wide; its centre is the wavelength lambda for which the water properties are given. In each band, one lux of white light
-yields, per second and square metre,
+Light has three bands. The radiance of a band is given as the luminance [cd/m2] of white light with this radiance in
+the band: a white floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE illuminant E).
+A band is 100 nm wide; its centre is the wavelength lambda for which the water properties are given. In each band, one
+lux of white light yields, per second and square metre,
 
     photons = width lambda / (h c Km Y),    Y = integral of V over wavelength
 
@@ -15,9 +15,9 @@ On the axis of a lens of f-number N, focused at infinity, the illuminance of the
 
     E = pi L / (4 n^2 N^2)
 
-with L the radiance in the water. It becomes L / n^2 where a ray passes from the water (index n) through the port into
-the air of the housing. Off the axis, the illuminance decreases as the fourth power of the cosine of the angle from the
-axis; other powers describe lenses that vignette less or more.
+with L the radiance in the water. The radiance decreases to L / n^2 as light passes from the water (index n) through
+the port into the air of the housing. Off the axis, the illuminance decreases as the fourth power of the cosine of the
+angle from the axis; other powers describe lenses with less or more vignetting.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 PLANCK_J_S, LIGHT_M_S = 6.62607015e-34, 299792458.0
 LUMENS_PER_WATT = 683.0
 LUMINOUS_EFFICIENCY_NM = 106.857  # integral of V over wavelength
-BAND_NM = (650.0, 550.0, 450.0)  # of R, G, B, as in the table of water types
+BAND_NM = (650.0, 550.0, 450.0)  # centres of the bands R, G, B, as in the table of water types
 BAND_WIDTH_NM = 100.0
 
 
@@ -50,7 +50,7 @@ def electrons_per_cd(sensor: SensorConfig, water_index: float) -> Array:
 
 
 def vignetting(rig: StereoRig, power: float) -> NDArray[np.float32]:
-    """Returns the illuminance of each pixel (H, W) relative to the axis: the cosine of the field angle, to a power."""
+    """Returns the illuminance (H, W) relative to the axis: the cosine of the field angle, raised to `power`."""
     x = (np.arange(rig.width_px) - rig.cx_px) / rig.focal_px
     y = (np.arange(rig.height_px) - rig.cy_px) / rig.focal_px
     return ((1 + x**2 + y[:, None] ** 2) ** (-power / 2)).astype(np.float32)

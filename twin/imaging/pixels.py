@@ -1,8 +1,9 @@
 """Pixel model: shot noise, full well, read noise, gain and quantization to digital numbers.
 
 The linear model of EMVA 1288: photons generate electrons with Poisson statistics, read-out adds normal noise, and the
-camera outputs a black level plus K (electrons + noise), clipped to the largest digital number. Dark current, which is
-negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels are not modelled.
+camera outputs a black level plus K (electrons + noise), with K the system gain, clipped to the largest digital number.
+Dark current, which is negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels are not
+modelled.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from twin.imaging.row_parallel import in_row_bands
 Raw = NDArray[np.uint16]
 
 FEW_ELECTRONS = 10  # below this mean: exact Poisson numbers; above: normal numbers corrected for skewness
-MOST_ELECTRONS = 80  # largest count of `_poisson`; practically never reached for means below ten
+MOST_ELECTRONS = 80  # largest number that `_poisson` returns; practically never reached for means below 10
 
 
 class PixelResponse(NamedTuple):
@@ -115,7 +116,7 @@ def _normal_to_poisson(expected, shot):
 
 @njit(cache=True, nogil=True)
 def _poisson(expected, uniform):
-    """Returns a Poisson-distributed number of electrons of mean `expected`, by inversion of 32 random bits."""
+    """Returns a Poisson-distributed number of electrons of mean `expected`, by inversion, from 32 random bits."""
     uniform = (np.float64(uniform) + 0.5) * 2.0**-32
     probability = np.exp(-np.float64(expected))
     below, count = probability, 0

@@ -21,7 +21,7 @@ from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
-STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: number of steps; step of differences, tolerance (tangents)
+STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: maximum steps; finite difference, tolerance (tangents)
 SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
@@ -111,7 +111,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the plane at `depth_m` from the inner face of a pane."""
+    """Returns intersections and normals (..., 3) of rays with the plane `depth_m` outside the inner face of a pane."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     along = ray @ normal
@@ -120,7 +120,7 @@ def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tup
 
 
 def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the sphere at `depth_m` from the inner face of a dome."""
+    """Returns intersections and normals (..., 3) of rays with the sphere `depth_m` outside the inner face of a dome."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre
     along = (from_centre * ray).sum(axis=-1)

@@ -131,7 +131,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the tiles that may be in view: their bounding box is outside no side of the view frustum.
+    """Returns a mask (n,) of the tiles that may be in view; the others lie outside one side of the view frustum.
 
     Args:
         scene: MuJoCo model of the scene.
@@ -141,7 +141,7 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
     low, high = scene.tile_low_m - world_from_camera[:3, 3], scene.tile_high_m - world_from_camera[:3, 3]
-    # per side, the corner of each box that is farthest inward: along each axis, the end to which the normal points
+    # per side, distance of the box corner that is farthest inward: on each axis, the end to which the normal points
     farthest = high @ np.maximum(inward, 0).T + low @ np.minimum(inward, 0).T
     return np.all(farthest >= 0, axis=1)
 

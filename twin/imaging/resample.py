@@ -1,8 +1,9 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline itself is the response
-of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Images of the sensor are
-interpolated: a prefilter makes the spline pass through every pixel (Unser et al. 1993, doi 10.1109/78.193221).
+OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline is the point spread
+function of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Sensor images
+are interpolated: a prefilter makes the spline pass through the value of every pixel (Unser et al. 1993, doi
+10.1109/78.193221).
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [
 
 REACH_PX = 2  # support of the spline to each side
 POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
-INTERSECTION_STEPS = 4  # at most; each multiplies the error by p / z (see `intersect`) times the slope of the floor
-INTERSECTION_PX = 1e-3  # iteration ends at steps below this; the remaining error is a few percent of the last step
+INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
+INTERSECTION_PX = 1e-3  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
     """Returns the radiance (h, w, 3) recorded by pixels at these positions in a radiance image (H, W, 3).
 
-    Beyond the image border the last row or column is repeated.
+    Beyond the image border, the values of the nearest border pixel are repeated.
     """
     return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
 

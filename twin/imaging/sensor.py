@@ -53,7 +53,7 @@ class AutoExposure:
         self._log_gain: float | None = None
 
     def gain(self, radiance: Radiance) -> float:
-        """Returns the gain of this frame [1 / (cd/m2)]; its radiance (H, W, 3) affects the gain of later frames."""
+        """Returns the gain of this frame [1 / (cd/m2)]; `radiance` (H, W, 3) affects the gain of later frames."""
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
@@ -88,7 +88,7 @@ class PlainSensor:
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, metered on the previous frames; its radiance `light` affects later frames."""
+        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames."""
         return ExposureSetting(self._exposure.gain(light))
 
     def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
@@ -104,12 +104,14 @@ class PlainSensor:
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """Returns the noisy 8-bit image (H, W, 3) of a radiance image; the noise variance is read^2 + shot^2 * signal.
+    """Returns the noisy 8-bit image (H, W, 3) of a radiance image.
+
+    With signals as fractions of full scale, the noise variance is noise_sd^2 + shot_noise^2 * signal.
 
     Args:
         radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
         gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
-        imaging: standard deviation of read noise, and of shot noise at full signal, as fractions of full scale.
+        imaging: standard deviations of read noise and of shot noise at full signal, as fractions of full scale.
         rng: random stream of this camera, from which one number is drawn per image.
     """
     image = np.empty(radiance.shape, np.uint8)

@@ -2,7 +2,7 @@
 
 A table lookup takes two loops over the row: the first computes the table cell and the fraction within the cell
 (`lookup`), the second reads the table. This lets the compiler vectorize the first loop. For the same reason, pixels of
-colour images are indexed in memory order.
+colour images are accessed in memory order.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from twin.imaging.powers import LOG2_E, two_to
 
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the transmission tables
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
-RANGE_SCALE_M = 2.0  # range scale of the backscatter table, which has even steps of r / (r + scale)
+RANGE_SCALE_M = 2.0  # scale of the backscatter table, whose steps are even in r / (r + scale), with r the range
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
@@ -100,10 +100,10 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
-    """Computes the geometry of the illumination by a lamp for the floor in a row of pixels.
+    """Computes the illumination of the floor by a lamp for a row of pixels, without beam pattern and attenuation.
 
-    Fills `out` (3, W) with the illuminance that an isotropic lamp would cause in clear water, with
-    sqrt(1 - cos(angle from the beam axis)), and with the distance from the lamp.
+    Fills `out` (3, W): row 0 with the illuminance that an isotropic lamp would cause in clear water, row 1 with
+    sqrt(1 - cos(angle from the beam axis)), row 2 with the distance from the lamp.
     """
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
@@ -178,7 +178,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light):
-    """Adds to `light` (3, W) the daylight on the floor, times `share`, attenuated on the path to the camera."""
+    """Adds to `light` (3, W) the daylight on the floor, times `share` (W,), attenuated on the path to the camera."""
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for c in range(3):
         incident, by_depth, by_range = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]

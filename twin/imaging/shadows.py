@@ -1,4 +1,4 @@
-"""Shadows that the floor casts in the light of the lamps; visible because the lamps are at a distance from the cameras.
+"""Shadows cast by the floor in the light of the lamps; the cameras see them, as lamps and cameras are apart.
 
 A point of the floor is in the shadow of a lamp if the straight ray to the lamp passes below the floor. The floor is the
 rendered surface: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses one of its
@@ -22,8 +22,8 @@ from twin.imaging.row_parallel import in_row_bands
 Array = NDArray[np.float64]
 
 BLOCK_CELLS = 8  # side of a block of cells; the highest point and the steepest slope of each block are stored
-STRIDE_PX = 4  # spacing of the pixels tested first; pixels between four equal results are not tested
-BIAS_M = 1e-4  # the floor must exceed the ray by this to occlude it, as depth is in single precision
+STRIDE_PX = 4  # spacing of the lattice of pixels tested first; pixels between four equal results take that result
+BIAS_M = 1e-4  # the floor must be this much higher than a ray to occlude it, as depth is in single precision
 
 
 class Heights(Protocol):
@@ -73,7 +73,7 @@ class Shadows:
         self._rig, self._lamps = rig, lamp_positions_m
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int) -> Lit:
-        """Returns a mask (lamps, H, W) uint8: 0 where the floor occludes the lamp, 1 elsewhere (also without floor).
+        """Returns a mask (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
 
         Args:
             depth: (H, W) depth along the optical axis [m].
@@ -101,7 +101,7 @@ def _blocks(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def _highest(values: NDArray[np.float32], border: int) -> NDArray[np.float32]:
-    """Returns the largest value of each block; with `border` 1, nodes on its north and east borders are included."""
+    """Returns the maximum of each block; with `border` 1, nodes on its north and east borders count too."""
     starts = [np.arange(0, n - border, BLOCK_CELLS) for n in values.shape]
     inner = np.maximum.reduceat(np.maximum.reduceat(values, starts[0], axis=0), starts[1], axis=1)
     if not border:
@@ -126,7 +126,7 @@ def _test_lattice(height, tops, rises, west, south, spacing, depth, focal, pose,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_between(height, tops, rises, west, south, spacing, depth, focal, pose, lamps, lattice, out, first, end):
-    """Fills `out` (lamps, H, W) between lattice rows; tests only pixels whose four lattice corners differ."""
+    """Fills `out` (lamps, H, W) from the lattice; tests only pixels between lattice points that differ."""
     for k in range(lamps.shape[0]):
         lamp = (lamps[k, 0] - west) / spacing, (lamps[k, 1] - south) / spacing, lamps[k, 2]
         for i in range(first, end):

@@ -6,10 +6,10 @@ A point of the floor at depth Z moves through the image of a camera with twist (
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
 
-Both effects are computed from the image at mid-exposure. With motion blur, the value of a pixel is the mean along its
-path: the flow times the exposure time, centred on the pixel. With a rolling shutter, it is the value at the position of
-the pixel minus the flow times the delay of its row. The pose and the true depth of a frame refer to mid-exposure of the
-middle row.
+Both effects are computed from the image at mid-exposure. With motion blur, the value of a pixel is the mean along a
+path: a line centred on the pixel, with the length and direction of the flow times the exposure time. With a rolling
+shutter, it is the value at the position of the pixel minus the flow times the delay of its row. The pose and the true
+depth of a frame refer to mid-exposure of the middle row.
 
 Limits: the flow of a pixel is constant during the exposure time T, so paths are straight (a rotation would bend them by
 less than f (|w| T)^2 / 8); vibration is not modelled. A path is computed with the depth at its own pixel: the blur of a
@@ -87,7 +87,7 @@ def _cubic(t):
 
 @njit(cache=True, nogil=True)
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Fills rows `first` to `end` of `out`; `flat` is the radiance (H W, 3)."""
+    """Fills rows `first` to `end` of `out` (see `blur_by_motion`); `flat` is the radiance (H W, 3)."""
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, near = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
@@ -135,10 +135,10 @@ def _blur_row(above, here, below, near, x, y, scale, twist, out):
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
     """Writes to `out` the mean radiance over a path centred on pixel (a, b), from 2 m + 1 samples.
 
-    The path extends by `length` along image axis a and by the smaller `aside` along axis b [px]. The samples are one
-    pixel apart along a and are interpolated along b, which does not change the variance along a. Their weights are
-    equal except at the two ends, where they are chosen such that this variance is that of a uniform distribution,
-    length^2 / 12.
+    The path extends by `length` along the first image axis and by `aside`, which is not longer, along the second [px].
+    The samples are one pixel apart along the first axis and are interpolated along the second, which does not change
+    the variance of their positions along the first. Their weights are equal except at the two ends, where they give
+    this variance the value of a uniform distribution, length^2 / 12.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]

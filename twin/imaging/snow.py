@@ -23,7 +23,7 @@ from twin.scenario.model import SnowConfig
 
 Array = NDArray[np.float64]
 
-BOX_M = 5.0  # side of the periodic box; along each axis of the world, snow is visible up to half of it
+BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible up to half a side from the left camera
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture
 PIXEL_BLUR_PX = 1.0

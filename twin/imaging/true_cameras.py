@@ -33,7 +33,7 @@ Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
 NEAREST_M = 0.3  # smallest depth of the floor for which the rendered margin suffices
-MARGIN_STEP_PX = 8  # the rendered margin is a multiple of this, so the image size keeps factors of two up to 16
+MARGIN_STEP_PX = 8  # margins are multiples of this; two of them add a multiple of 16 to the width or height
 WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
 
 
@@ -57,7 +57,11 @@ class CameraModel(NamedTuple):
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Returns origin [m] and direction (..., 3) of the rays of pixels (..., 2) in water; NaN if there is no ray."""
+        """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water.
+
+        Both are in axes of the believed camera. They are NaN for a pixel without a ray, e.g. if the ray is totally
+        reflected at the port.
+        """
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
             air = air / self.pinhole.focal_ratio
@@ -66,7 +70,10 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixels (..., 2) of points (..., 3) [m]; NaN if a point is not imaged or too far off the axis."""
+        """Returns the pixels (..., 2) that image points (..., 3) [m], given in believed-camera axes.
+
+        NaN for a point that is not imaged, or is too far off the optical axis for the distortion model.
+        """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_tangents(self.port, points_m)
         if self.port.kind == "none":
@@ -82,7 +89,7 @@ class SamplingMap(NamedTuple):
     Args:
         positions: (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px].
         parallax_px_m: (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is
-            `positions` + `parallax_px_m` / z. None if zero.
+            `positions` + `parallax_px_m` / z. None if it is zero for all pixels.
     """
 
     positions: Positions
@@ -139,10 +146,10 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixels (n, 2) in the frame of points (n, 3) [m], given in axes of the rendered camera.
+        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points that are not imaged.
 
         Args:
-            points_m: (n, 3) points; those that are not imaged have NaN pixels.
+            points_m: (n, 3) points in axes of the camera that was rendered.
             camera: 0 left, 1 right.
         """
         rig = self.rendered_rig
@@ -204,7 +211,11 @@ def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
 
 
 def _believed_model(scenario: Scenario) -> CameraModel:
-    """Returns the camera model for the rectification; an uncalibrated port only changes the focal length."""
+    """Returns the camera model for the rectification.
+
+    A port whose refraction was not calibrated (`port.calibrated_at_m` = 0) enters through its effect on the focal
+    length alone.
+    """
     rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
     lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
     port = scenario.port
@@ -215,7 +226,7 @@ def _believed_model(scenario: Scenario) -> CameraModel:
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:
-    """Returns the rotation error (3, 3) of the right camera: yaw about y (down), pitch about x and roll about z."""
+    """Returns the rotation error (3, 3) of the right camera: R_y(yaw) R_x(pitch) R_z(roll), with y pointing down."""
     roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
     x, y, z = np.eye(3)
     return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
@@ -258,7 +269,7 @@ def _enlarged(rig: StereoRig, border: NDArray[np.int64]) -> StereoRig:
 
 
 def _or_none(parallax: Array) -> Positions | None:
-    """Returns the parallax in single precision; None where it is zero."""
+    """Returns the parallax in single precision; None if it is zero for all pixels."""
     return parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
 
 
@@ -270,14 +281,17 @@ def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
 
 
 def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the border (columns, rows) [px] that an image needs for spline interpolation at `positions` [px]."""
+    """Returns the border (columns, rows) [px] that spline interpolation at `positions` [px] needs on each side."""
     last = np.array([rig.width_px - 1, rig.height_px - 1])
     missing = np.maximum(-positions.min(axis=(0, 1)), positions.max(axis=(0, 1)) - last)
     return np.maximum(np.ceil(missing + resample.REACH_PX), 0).astype(np.int64)
 
 
 def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the margin (columns, rows) [px] that the rendered image needs to cover all raw pixels."""
+    """Returns the margin (columns, rows) [px] that the rendered image needs on each side.
+
+    With this margin it covers the rays of all raw pixels for depths from `NEAREST_M` to infinity.
+    """
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
     margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX

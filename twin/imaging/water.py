@@ -1,4 +1,4 @@
-"""Inherent optical properties of water: absorption, scattering, and the phase function of scattering."""
+"""Optical properties of water: absorption, scattering, phase function, and diffuse attenuation of daylight."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.paths import is_file
 from twin.errors import TwinError
 from twin.scenario.model import WaterConfig
 
@@ -29,6 +30,8 @@ JERLOV_PER_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, fl
     "9C": ((0.6207, 0.3480, 1.0553), (2.1720, 3.1200, 4.5610)),
 }
 
+#: Largest size of a spectrum file.
+MAX_SPECTRUM_BYTES = 10_000_000
 #: Bands R, G, B [nm] over which a spectrum is averaged.
 BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
 #: Mean cosine of the scattering angle in sea water, g of the Henyey-Greenstein phase function.
@@ -42,7 +45,7 @@ class Medium(NamedTuple):
         absorption_per_m: (3,) absorption coefficient a [1/m].
         scattering_per_m: (3,) scattering coefficient b [1/m].
         mean_cosine: mean cosine g of the scattering angle.
-        kept_share: fraction k of the scattered light that is not counted as lost.
+        kept_share: fraction k of the scattered light that stays in the beam, i.e. does not count as attenuated.
     """
 
     absorption_per_m: Array
@@ -55,15 +58,15 @@ class Medium(NamedTuple):
         """Effective attenuation coefficient (3,) [1/m]: a + (1 - k) b.
 
         With k = 0 this is the beam attenuation coefficient c = a + b, which counts all scattered light as lost. Most
-        light is scattered by small angles, however, so in turbid water c overestimates the attenuation of the light
-        from a distant floor. With k = 0.74, the fraction scattered by less than 15 deg, the coefficient is
-        a + 0.26 b, close to a + 0.3 b measured for range-gated images.
+        light is scattered by small angles, however, so c overestimates the attenuation of the image signal in turbid
+        water. With k = 0.74, the fraction scattered by less than 15 deg, the coefficient is a + 0.26 b, close to the
+        a + 0.3 b that was measured in range-gated imaging.
         """
         return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
 
 
 def medium(water: WaterConfig) -> Medium:
-    """Returns the optical properties of a scenario's water; `turbidity` multiplies its scattering.
+    """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
 
     Raises:
         TwinError: absorption or scattering is missing or given twice, or the spectrum cannot be read.
@@ -97,12 +100,15 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
             negative.
     """
     key = "water.spectrum_file"
+    wanted = "rows of wavelength [nm], absorption, scattering [1/m]"
+    if file.exists() and not (is_file(file) and file.stat().st_size <= MAX_SPECTRUM_BYTES):
+        problem = "it is not a regular file" if not is_file(file) else f"it has {file.stat().st_size} bytes"
+        raise TwinError(key, f"{file} cannot be read: {problem}", f"up to {MAX_SPECTRUM_BYTES} bytes, {wanted}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # an empty file
             table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
     except (OSError, ValueError) as error:
-        wanted = "rows of wavelength [nm], absorption, scattering [1/m]"
         raise TwinError(key, f"{file} cannot be read: {error}", wanted) from None
     if table.shape[1] != 3 or len(table) < 2:
         raise TwinError(key, f"{file} has {table.shape[1]} columns and {len(table)} rows", "3 columns, 2 rows or more")

@@ -72,8 +72,10 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
     """Returns the RMSE [m] of estimated positions (n, 3) of the last n keyframes in `frames`; None if there are none.
 
+    The positions are anchored at the first true pose before they are compared.
+
     Args:
-        positions: (n, 3) estimated positions [m], which are anchored here.
+        positions: (n, 3) estimated positions, not yet anchored [m].
         frames: frame numbers of the keyframes.
     """
     n = min(len(positions), len(frames))

@@ -1,7 +1,7 @@
 """Computing time of each processing stage, compared with the real-time budget of Negahdaripour & Madjidi (2003).
 
-Frame-to-frame motion has to finish within one frame, all keyframe work within the N frames up to the next keyframe,
-and global alignment while the vehicle keeps station.
+Frame-to-frame motion has to be computed within one frame period, all work on a keyframe within the N frame periods up
+to the next keyframe, and global alignment while the vehicle keeps station.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-#: Stages of the estimators that run at each keyframe. Their total time is compared with the budget of a keyframe.
+#: Stages of the estimators that run at each keyframe. Their mean time per keyframe is compared with its budget.
 KEYFRAME_STAGES = ("stereo", "f2m", "network", "flow")
-#: Key of the row that sums `KEYFRAME_STAGES`.
+#: Key of the row with the total time of `KEYFRAME_STAGES`.
 KEYFRAME_WORK = "keyframe"
 
 

@@ -20,7 +20,7 @@ ALONG_NODES = 2
 
 
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
-    """Returns `links` of metrics.json: errors of the along and the across links.
+    """Returns `links` of metrics.json: errors of the links to the two previous nodes (along) and of others (across).
 
     `bridged` is the number of links that consist of frame-to-frame motion because no points were matched. The errors of
     these links are not evaluated.
@@ -76,7 +76,8 @@ def _motion_errors(true_i, true_j, estimates):
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
     """Returns number, RMS errors and mean NEES of links, and the RMS errors of their closed-form motions.
 
-    The closed-form errors cover the links with a closed-form motion. The mean NEES is 6 for consistent covariances.
+    Links without a closed-form motion are left out of the closed-form errors. The mean NEES is 6 for consistent
+    covariances.
     """
     errors = motion_errors(links, links.i_from_j, world_from_keyframe)
     has_closed_form, closed_forms = links.by_closed_form

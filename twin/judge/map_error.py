@@ -1,13 +1,20 @@
-"""Height errors of the elevation map, over the cells that at least one keyframe observed."""
+"""Height errors of the elevation map, over the cells that at least one keyframe observed and over the asked area."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
 from twin.core.records import Array, ElevationMap, Truth
 from twin.judge.summary_statistics import finite_float, mean, percentile, rms
 
-KEYS = ("cell_m", "completeness", "bias_m", "rmse_m", "nmad_m", "p85_m", "le90_m", "le95_m", "max_m", "sigma_ratio")
+KEYS = (
+    "cell_m", "completeness", "bias_m", "rmse_m", "nmad_m", "p85_m", "le90_m", "le95_m", "max_m", "sigma_ratio",
+    "completeness_area", "le90_area_m",
+)  # fmt: skip
+#: Metrics that are infinite, and therefore written as None, if the map has too many holes.
+INFINITE_WITH_HOLES = ("map.le90_area_m",)
 
 
 def height_error(elevation: ElevationMap, truth: Truth) -> Array:
@@ -22,9 +29,13 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
     completeness is the fraction of observed cells that have an estimate. For height errors e, NMAD is
     1.4826 median |e - median e|, and LE90 is the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the
     sigma calibration: the RMS of error / sigma, which is 1 if the estimated standard deviations are correct.
+    completeness_area is the fraction of the cells of the asked area that have an estimate. le90_area_m is the 90th
+    percentile of |e| over these cells, where a cell without an estimate (a hole) counts as an infinite error; an
+    infinite percentile is given as None.
     """
     if elevation is None:
         return dict.fromkeys(KEYS)
+    asked = np.abs(elevation.height_m.astype(float) - truth.height_m)[truth.asked]
     errors = height_error(elevation, truth)
     estimated = np.isfinite(errors)
     error, size = errors[estimated], np.abs(errors[estimated])
@@ -39,7 +50,39 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
         "le95_m": percentile(size, 95),
         "max_m": percentile(size, 100),
         "sigma_ratio": rms(normalised_error(elevation, truth)),
+        "completeness_area": mean(np.isfinite(asked)),
+        "le90_area_m": percentile_with_holes(asked, 90),
     }
+
+
+def completeness_metric(metric: str) -> str | None:
+    """Returns the completeness metric to report beside a map metric; None for other metrics and for completeness.
+
+    A statistic of the height errors does not cover the cells without a height, so it is never reported alone.
+    """
+    if not metric.startswith("map.") or metric.startswith("map.completeness") or metric == "map.cell_m":
+        return None
+    return "map.completeness_area" if "_area" in metric else "map.completeness"
+
+
+def with_completeness(metrics: Iterable[str]) -> list[str]:
+    """Returns the metrics without duplicates, with the completeness metric of each map statistic added."""
+    return list(dict.fromkeys(name for metric in metrics for name in (metric, completeness_metric(metric)) if name))
+
+
+def percentile_with_holes(size: Array, percent: float) -> float | None:
+    """Returns a percentile (0 to 100) of absolute errors (n,), linearly interpolated, with NaN as an infinite error.
+
+    Returns None if no value is finite, or if the percentile is infinite because an infinite error enters the
+    interpolation.
+    """
+    known = np.isfinite(size)
+    if not known.any():
+        return None
+    # the upper of the two values between which the percentile lies must be finite: infinity cannot be interpolated
+    if np.isinf(np.percentile(np.where(known, size, np.inf), percent, method="higher")):
+        return None
+    return percentile(np.where(known, size, size[known].max()), percent)
 
 
 def normalised_error(elevation: ElevationMap, truth: Truth) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,13 +17,17 @@ from twin.judge.links import link_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.overlap import overlap_metrics
 from twin.judge.require import check_metric_names, judge_requirements
+from twin.judge.self_check import self_check_metrics
 from twin.judge.stages import stage_metrics
 from twin.judge.stereo_quality import stereo_quality
 from twin.judge.summary_statistics import finite_float, finite_tree
 from twin.judge.trajectory import path_errors, trajectory_metrics
+from twin.judge.warnings import metric_warnings
 
 SCHEMA = "twin.metrics/2"
-_IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason", "warning")
+_IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason")
+
+_VERDICTS = ("warnings", "warning", "idealisations")  # None until `_judged` fills them in from the other metrics
 
 
 @dataclass(frozen=True)
@@ -35,11 +39,13 @@ class EvaluationInput:
         elevation: elevation map; None if none was built.
         truth: true trajectory and floor, and the reference path.
         rig: nominal stereo rig.
-        plan: pattern, overlap_along and overlap_across of the plan.
+        plan: pattern, requested and forecast overlaps of the plan: the argument `planned` of `overlap_metrics`.
         timing: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
-        identity: name, seed, version, scenario_hash, status ("complete" or "aborted"), reason of an abort, warning;
-            the last two are "" if there is none.
+        identity: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and the reason for a
+            status other than "complete", or "".
         require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
+        warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
+        idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
     """
 
     result: SurveyResult
@@ -50,6 +56,8 @@ class EvaluationInput:
     timing: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
     require: Mapping[str, float] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+    idealisations: Sequence[str] = ()
 
 
 def evaluate(survey: EvaluationInput) -> dict[str, Any]:
@@ -64,23 +72,45 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
     metrics = {
         "schema": SCHEMA,
         **{key: survey.identity.get(key) for key in _IDENTITY},
+        **dict.fromkeys(_VERDICTS),
         "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in paths.items()},
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),
         "consistency": consistency_metrics(result, elevation, truth),
         "links": link_metrics(result, truth),
         "vision": stereo_quality(result),
+        "self_check": self_check_metrics(result),
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth),
         "overlap": overlap_metrics(result, truth, survey.rig, grid, dict(survey.plan)),
         "timing": _timing(survey.timing, len(result.online), len(result.keyframe_rows)),
     }
-    metrics = finite_tree(metrics)
-    return metrics | {"require": judge_requirements(survey.require, metrics)}
+    return _judged(finite_tree(metrics), survey)
+
+
+def _judged(metrics: dict[str, Any], survey: EvaluationInput) -> dict[str, Any]:
+    """Returns the metrics with `warnings`, `warning` (all warnings as one text), `idealisations` and `require`."""
+    warnings = [*survey.warnings, *metric_warnings(metrics)]
+    verdicts = {"warnings": warnings, "warning": " ".join(warnings), "idealisations": list(survey.idealisations)}
+    return metrics | verdicts | {"require": judge_requirements(survey.require, metrics)}
+
+
+def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
+    """Returns the metrics of a survey that was not compared with the truth: identity and timing; all others None or 0.
+
+    A requirement on a metric that is None fails.
+    """
+    result, known = survey.result, {key: survey.identity.get(key) for key in _IDENTITY}
+    timing = _timing(survey.timing, len(result.online), len(result.keyframe_rows))
+    return _judged(empty_metrics() | finite_tree(known | {"timing": timing}), survey)
 
 
 def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
-    """Returns the result without keyframes and stereo observations of frames that an aborted survey did not record."""
+    """Returns the result without keyframes, links and stereo observations of frames that are not fully recorded.
+
+    A frame is fully recorded if it has an online and a final estimate, a true pose and a reference position; the last
+    frames of an aborted survey may lack some of these.
+    """
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
     observations = [observation for observation in result.stereo_observations if observation.row < n_frames]
@@ -110,7 +140,8 @@ def empty_metrics() -> dict[str, Any]:
     no_keyframes = np.zeros(0, dtype=np.int64)
     result = SurveyResult(none, none, none, no_keyframes, no_keyframes, np.zeros((0, 6, 6)))
     empty = np.zeros((0, 0))
-    truth = Truth(none, np.zeros((0, 3)), np.zeros(0, bool), no_keyframes, empty.astype(np.float32), empty.astype(bool))
+    cells = empty.astype(np.float32), empty.astype(bool), empty.astype(bool)
+    truth = Truth(none, np.zeros((0, 3)), np.zeros(0, bool), no_keyframes, *cells)
     rig = StereoRig(1, 1, 1.0, 1.0, 1.0, np.eye(4))
     return evaluate(EvaluationInput(result, None, truth, rig, timing={"stages": Stopwatch().summary()}))
 

@@ -47,7 +47,7 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
 
 
 def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    """Yields the dotted path of every number and every None in the sections of `metrics`."""
+    """Yields the dotted path of every number and every None in the tables of `metrics`, not at its top level."""
     for key, value in metrics.items():
         if isinstance(value, Mapping):
             yield from number_paths(value, f"{prefix}{key}.")
@@ -70,5 +70,9 @@ def _value(metrics: Mapping[str, Any], name: str) -> float | None:
 
 def _verdict(name: str, value: float | None, limit: float) -> dict[str, Any]:
     """Returns the value, the limit and whether the value meets the limit."""
-    passed = value is not None and (value >= limit if more_is_better(name) else value <= limit)
-    return {"value": value, "limit": limit, "passed": passed}
+    return {"value": value, "limit": limit, "passed": meets_limit(name, value, limit)}
+
+
+def meets_limit(name: str, value: float | None, limit: float) -> bool:
+    """Returns whether the value of a metric meets its limit; None does not."""
+    return value is not None and (value >= limit if more_is_better(name) else value <= limit)

@@ -12,15 +12,18 @@ def stereo_quality(result: SurveyResult) -> dict[str, Any]:
     """Returns `vision` of metrics.json, over all stereo observations, including those that gave no keyframe.
 
     points_median and points_p10 are the median and the 10th percentile of the number of matched points.
-    contrast_median is None if no images are rendered. blind_looks is the number of stereo observations with too few
-    points for a keyframe.
+    contrast_median and saturated_median are the medians of the contrast and of the saturated fraction of the pixel
+    values; both are None if no images are rendered. blind_looks is the number of stereo observations that did not give
+    a keyframe because they have too few matched points.
     """
     points = [observation.n_points for observation in result.stereo_observations]
     contrast = [observation.contrast for observation in result.stereo_observations if observation.contrast is not None]
+    saturated = [pair.saturated for pair in result.stereo_observations if pair.saturated is not None]
     observed, keyframes = {observation.row for observation in result.stereo_observations}, result.keyframe_rows
     return {
         "points_median": percentile(points, 50),
         "points_p10": percentile(points, 10),
         "contrast_median": percentile(contrast, 50),
+        "saturated_median": percentile(saturated, 50),
         "blind_looks": len(observed - {int(row) for row in keyframes}),
     }

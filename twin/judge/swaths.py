@@ -10,6 +10,8 @@ from twin.core.records import Array, Truth
 #: A frame belongs to a leg if |cos| of the angle between its direction of travel and the axis of the legs exceeds
 #: this value (angle below 26 deg).
 ON_LEG_COSINE = 0.9
+#: Smallest step of the planned heading between two frames of a turn [rad].
+TURNING_STEP = 1e-9
 
 
 def travel_direction(reference: Array) -> Array:
@@ -31,8 +33,20 @@ def travel_direction(reference: Array) -> Array:
 
 
 def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
-    """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs."""
-    return truth.track - 1 if pattern == "loops" else leg_numbers(truth.reference)
+    """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs and during turns."""
+    if pattern == "loops":
+        return truth.track - 1
+    numbers = leg_numbers(truth.reference)
+    return numbers if truth.reference_yaw is None else np.where(is_turning(truth.reference_yaw), -1, numbers)
+
+
+def is_turning(yaw: Array) -> NDArray[np.bool_]:
+    """Returns a mask (n,) of the frames whose planned heading [rad] differs from the previous or the next one."""
+    steps = np.abs(np.diff(yaw)) > TURNING_STEP
+    turning = np.zeros(len(yaw), np.bool_)
+    turning[1:] |= steps
+    turning[:-1] |= steps
+    return turning
 
 
 def leg_numbers(reference: Array) -> NDArray[np.int64]:

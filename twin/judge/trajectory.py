@@ -36,7 +36,7 @@ def anchor(first_estimated: Array, first_true: Array) -> Array:
 
 
 def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
-    """Returns the errors at the frames that both trajectories have, after anchoring at the first of them."""
+    """Returns the errors at the frames of both trajectories, with the estimate anchored at the first true pose."""
     n = min(len(estimate), len(truth))
     true = truth.world_from_camera[:n]
     if n == 0:

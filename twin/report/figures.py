@@ -78,7 +78,7 @@ def plan_view(run: Run) -> Figure | None:
 
 
 def _add_keyframes(axes: Axes, run: Run) -> None:
-    """Adds the final keyframe positions, or the online ones if there is no final trajectory."""
+    """Plots the keyframes at their final positions, or at their online ones if there is no final trajectory."""
     name = "final" if "final" in run.trajectories else "online"
     if name in run.trajectories and len(run.keyframes.frames):
         positions = run.trajectories[name].positions

@@ -1,4 +1,4 @@
-"""HTML pages from Jinja templates, which share a style sheet, number filters and a list of terms."""
+"""Renders HTML pages from Jinja templates; all pages share one style sheet, number filters and a list of terms."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SHARED_TEMPLATES = "twin.report"
 
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
-    """Renders a template to self-contained HTML.
+    """Returns a template rendered as self-contained HTML.
 
     Args:
-        package: package that contains the template; files that the template includes may also be in `twin.report`.
+        package: package that contains the template; it and the files it includes may also be in `twin.report`.
         template: file name of the template.
         context: variables of the template.
     """

@@ -1,4 +1,4 @@
-"""Reading image files and encoding reduced JPEG copies."""
+"""Reads image files and encodes images as downscaled JPEG data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ JPEG_QUALITY = 78
 
 
 def jpeg_bytes(image: Image, longest_px: int) -> bytes:
-    """Returns an RGB image as JPEG data, reduced if necessary until its longer side is `longest_px`."""
+    """Returns an RGB image as JPEG data, downscaled to a longer side of `longest_px` if it is larger."""
     if (scale := longest_px / max(image.shape[:2])) < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])

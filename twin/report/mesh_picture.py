@@ -24,7 +24,7 @@ LIMIT_S = 15.0
 WIDTH_PX, HEIGHT_PX, VFOV_DEG = 1400, 900, 30.0
 #: Viewing direction: depression angle, and angle of the camera's position from south towards east.
 DEPRESSION_DEG, EAST_DEG = 42.0, 20.0
-MARGIN = 1.04
+MARGIN = 1.04  # camera distance / smallest distance with all vertices in view
 #: The picture shows all vertices with coordinates between these percentiles; outliers may be cut off.
 FRAMED_PERCENT = (0.2, 99.8)
 #: Direction to the light in the axes of glTF (east, up, south): north-west, as in all maps of the report.
@@ -83,7 +83,7 @@ def shaded_colours(colours: Image, normals: Array) -> Image:
 
 
 def camera_pose(vertices: Array) -> Array:
-    """Returns the pose (4, 4) of an OpenGL camera (viewing along -z) as near as possible with the vertices in view.
+    """Returns the pose (4, 4) of an OpenGL camera (viewing along -z), as near as possible with all vertices in view.
 
     The viewing direction is fixed (`DEPRESSION_DEG`, `EAST_DEG`), and outliers are ignored (`FRAMED_PERCENT`). Let the
     camera be at distance d from the centre of the vertices, and q a vertex relative to this centre in camera axes. The

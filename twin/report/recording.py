@@ -19,6 +19,7 @@ from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
+from twin.report.verdict import badge, first_lines
 from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
@@ -26,7 +27,7 @@ N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
 
 #: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
-#: The true floor is translucent and lowered, because it would flicker (z-fighting) where an accurate map coincides.
+#: The true floor is translucent and lowered: it would flicker (z-fighting) where an accurate map coincides with it.
 TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
 
 
@@ -102,7 +103,9 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
     """Logs the static entities: axes, true floor, planned path, mosaic and the summary."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     summary = "\n".join(
-        [f"# {run.scenario.get('name', run.folder.name)}", wording.headline(run.metrics, run.scenario), ""]
+        [f"# {run.scenario.get('name', run.folder.name)}: {badge(run.metrics).text}", ""]
+        + [f"- {sentence}" for sentence in (first_lines(run.metrics) if run.metrics else ())]
+        + ["", wording.headline(run.metrics, run.scenario), ""]
         + [f"- **{row.label}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
     )
     recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
@@ -119,7 +122,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part that exists by then."""
+    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time as far as they exist by then."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
         for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
@@ -287,7 +290,7 @@ def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Me
 
 
 def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
-    """Returns an RGB image as a Rerun JPEG image, reduced if necessary until its longer side is `longest_px`."""
+    """Returns an RGB image as a Rerun JPEG image, downscaled to a longer side of `longest_px` if it is larger."""
     return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
 
 

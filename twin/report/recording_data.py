@@ -32,7 +32,10 @@ def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
 
 
 def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
-    """Returns times and durations [ms], by stage: global alignment, and stages called once per frame or keyframe."""
+    """Returns the times and durations [ms] of all calls, by stage.
+
+    The stages are global alignment and those called once per frame or once per keyframe; long series are subsampled.
+    """
     path = run.trajectories.get("online")
     if path is None:
         return {}
@@ -46,9 +49,9 @@ def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
 
 
 def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns, as item "ga", the last frame and the duration [ms] of each global alignment; {} if there is none.
+    """Returns, as item "ga", a frame number and the duration [ms] of each global alignment; {} if there is none.
 
-    The last frame is that of the last keyframe of the aligned track.
+    An alignment is plotted at the frame of the last keyframe of its track.
     """
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]

@@ -54,7 +54,7 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def _surface(raster: Raster, colours: Image) -> Surface:
-    """Returns the mesh of a raster: every n-th row and column as vertices; triangles if all corners have a height."""
+    """Returns the mesh of a raster, subsampled to about `N_VERTICES`; all corners of its triangles have a height."""
     step = int(np.ceil(np.sqrt(raster.values.size / N_VERTICES)))
     x, y = raster.grid.centres()
     height = raster.values[::step, ::step]
@@ -67,7 +67,7 @@ def _surface(raster: Raster, colours: Image) -> Surface:
 
 
 def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the number (n,) of the first camera group that has each point in view; `NOT_OBSERVED` if none has.
+    """Returns the number (n,) of the first camera group that views each point; `NOT_OBSERVED` if no group does.
 
     Args:
         points: (n, 3) in the world [m].

@@ -1,9 +1,9 @@
-"""Reading a run folder. Missing files are allowed; a folder without metrics.json is an unfinished survey."""
+"""Reads a run folder. Only the scenario file is required; a folder without metrics.json is an unfinished survey."""
 
 from __future__ import annotations
 
 import json
-import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,16 +13,21 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.errors import RasterioError
 
-from twin.core.records import Array, MapGrid, StereoObservation, Trajectory
+from twin.core.paths import is_file
+from twin.core.records import Array, MapGrid, Trajectory
 from twin.errors import TwinError
+from twin.exchange import geotiff
+from twin.report.run_files import checked_environment, checked_index, checked_metrics, checked_scenario
+from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
 SCENARIO_FILE = "scenario.resolved.toml"
+_OBSERVATION_KEYS = ("row", "n_points", "contrast")  # columns of `Keyframes.stereo_observations`
 RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error", "mosaic")
 
 
 class Raster(NamedTuple):
-    """A georeferenced raster.
+    """A raster in scene coordinates.
 
     Args:
         grid: position and size of its cells.
@@ -102,13 +107,13 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     folder = Path(folder)
-    if not (folder / SCENARIO_FILE).is_file():
+    if not is_file(folder / SCENARIO_FILE):
         raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
     return Run(
         folder,
-        _read(folder / SCENARIO_FILE, lambda f: tomllib.loads(f.read_text(encoding="utf-8"))),
-        _read_json(folder / "env.json") or {},
-        metrics or _read_json(folder / "metrics.json"),
+        _read(folder / SCENARIO_FILE, lambda f: checked_scenario(parse_toml(f.read_text(encoding="utf-8")))),
+        _read_json(folder / "env.json", checked_environment) or {},
+        metrics or _read_json(folder / "metrics.json", checked_metrics),
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
         _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster),
         _read_existing({"network": folder / "posegraph.g2o"}, read_network).get("network", _empty_network()),
@@ -117,23 +122,24 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
 
 def read_raster(file: Path) -> Raster:
-    """Reads a GeoTIFF; row 0 is the northernmost, and nodata becomes NaN.
+    """Reads a GeoTIFF as a raster in scene coordinates; row 0 is the northernmost.
+
+    In a raster with one band, cells without data become NaN, and elevations in a vertical datum become heights in the
+    scene.
 
     Raises:
         ValueError: the raster is rotated or its cells are not square.
     """
     with rasterio.open(file) as source:
-        transform, bands = source.transform, source.read(masked=source.count == 1)
-        if transform.b or transform.d or transform.a <= 0 or not np.isclose(transform.a, -transform.e, rtol=1e-6):
-            raise ValueError("the raster is rotated or its cells are not square")
-        grid = MapGrid(transform.c, transform.f, transform.a, source.height, source.width)
+        grid, elevation_m = geotiff.scene_placement(source)
+        bands = source.read(masked=source.count == 1)
     if len(bands) == 1:
-        return Raster(grid, bands[0].astype(float).filled(np.nan))
+        return Raster(grid, bands[0].astype(float).filled(np.nan) - elevation_m)
     return Raster(grid, np.moveaxis(bands[:3], 0, 2))
 
 
 def read_network(file: Path) -> Network:
-    """Reads node positions and edges of a g2o pose graph (SE3:QUAT)."""
+    """Reads the node positions and the edges of a g2o pose graph (SE3:QUAT)."""
     lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
@@ -149,23 +155,23 @@ def _empty_network() -> Network:
 
 def _read_keyframes(file: Path) -> Keyframes:
     """Reads keyframes/index.json; returns no keyframes if the file is missing."""
-    index = _read_json(file) or {}
+    index = _read_json(file, checked_index) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
     observations = [
-        [observation[key] for key in StereoObservation._fields] for observation in index.get("stereo_observations", [])
+        [observation[key] for key in _OBSERVATION_KEYS] for observation in index.get("stereo_observations", [])
     ]
     stereo_observations = np.array(observations, float).reshape(-1, 3)
     return Keyframes(frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations)
 
 
-def _read_json(file: Path) -> Any:
-    """Returns the contents of a JSON file; None if it does not exist."""
-    return _read(file, lambda f: json.loads(f.read_text(encoding="utf-8"))) if file.is_file() else None
+def _read_json(file: Path, checked: Callable[[Any], dict[str, Any]]) -> dict[str, Any] | None:
+    """Returns the contents of a JSON file, passed through `checked`; None if the file does not exist."""
+    return _read(file, lambda f: checked(json.loads(f.read_text(encoding="utf-8")))) if file.is_file() else None
 
 
 def _read_existing(files: dict[str, Path], reader: Any) -> dict[str, Any]:
-    """Returns the contents, as `reader` returns them, of those files that exist and are not empty."""
+    """Returns `reader(file)` for each file that exists and is not empty, by the key of the file."""
     return {key: _read(file, reader) for key, file in files.items() if file.is_file() and file.stat().st_size > 0}
 
 
@@ -173,5 +179,7 @@ def _read(file: Path, reader: Any) -> Any:
     """Returns `reader(file)`; raises TwinError if the file cannot be read."""
     try:
         return reader(file)
+    except RecursionError:
+        raise TwinError(str(file), "cannot be read: nested too deeply", "a file written by `twin run`") from None
     except (OSError, ValueError, KeyError, IndexError, RasterioError) as error:
         raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None

@@ -1,11 +1,11 @@
-"""Writing a run folder: scenario and log during the survey, results after the survey, metrics.json last."""
+"""Writes a run folder: scenario and log during the survey, results after the survey, metrics.json last."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -14,6 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from twin.core import geometry
+from twin.core.georeference import Georeference
+from twin.core.interrupts import StageGuard
 from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
@@ -23,6 +26,8 @@ from twin.scenario.model import Scenario
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 PICTURES = ("report", "recording")
+#: Glob patterns of the files that each interruptible stage of the writing creates.
+_FILES = {"maps": ("*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
 
 
@@ -35,10 +40,12 @@ class SurveyRecord:
         elevation: elevation map; None if none was built.
         truth: true trajectory and floor, and the reference path.
         grid: cells of the maps.
-        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path.
+        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless
+            the truth has a planned heading per frame.
         n_frames_per_keyframe: planned frames from one keyframe to the next.
         stopwatch: durations of the processing stages.
         metrics: contents of metrics.json.
+        georeference: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
     """
 
     result: SurveyResult
@@ -49,6 +56,7 @@ class SurveyRecord:
     n_frames_per_keyframe: int
     stopwatch: Stopwatch
     metrics: dict[str, Any]
+    georeference: Georeference | None = None
 
 
 class RunFolder:
@@ -57,8 +65,8 @@ class RunFolder:
     Args:
         folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run.
-        outputs: members of `PICTURES` to write at the end, which may take longer than a short survey. None: write
-            neither these nor trajectories and maps, only the metrics.
+        outputs: members of `PICTURES` to write at the end; writing them may take longer than a short survey. None: of
+            the results, write the metrics only, without trajectories and maps.
 
     Raises:
         TwinError: the folder cannot be written.
@@ -91,12 +99,17 @@ class RunFolder:
         except OSError:
             pass
 
-    def finish(self, record: SurveyRecord) -> dict[str, Any]:
+    def finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
         """Writes all results and returns the metrics as written.
 
         The metrics are written first under a temporary name and renamed to metrics.json last, because a folder without
         metrics.json counts as unfinished. If another result cannot be written, e.g. because the disk is full, the
-        status becomes "aborted".
+        status becomes "aborted". An interrupt while the maps, the report or the recording are written ends this stage
+        only: its files are deleted, and the status becomes "aborted" with a reason that names the stage.
+
+        Args:
+            record: the results.
+            guard: lets an interrupt end a single stage, and records why the survey ended early, if it did.
         """
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
@@ -105,14 +118,27 @@ class RunFolder:
         try:
             if self._outputs is not None:
                 self._write_trajectories(record)
-                self._write_maps(record)
-                self._write_pictures(self._outputs, metrics)
+                self._attempt(guard, "maps", lambda: self._write_maps(record))
+                for name in PICTURES:
+                    if name in self._outputs:
+                        self._attempt(guard, name, lambda name=name: self._write_picture(name, metrics))
         except OSError as error:
-            metrics = metrics | {"status": "aborted", "reason": metrics["reason"] or str(error)}
+            guard.cause = guard.cause or str(error)
+        if guard.reason:
+            degraded = f"; {metrics['reason']}" if metrics["status"] == "degraded" else ""
+            metrics = metrics | {"status": "aborted", "reason": guard.reason + degraded}
             self._write(temporary, json.dumps(metrics, indent=1))
         (self.path / temporary).replace(self.path / "metrics.json")
         self.log(metrics["status"], reason=metrics["reason"])
         return metrics
+
+    def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None]) -> None:
+        """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete."""
+        n_skipped = len(guard.skipped)
+        guard.attempt(stage, write)
+        if len(guard.skipped) > n_skipped:
+            for file in (file for pattern in _FILES[stage] for file in self.path.glob(pattern)):
+                file.unlink()
 
     def _write(self, name: str, text: str) -> None:
         """Writes a text file of this folder."""
@@ -123,6 +149,8 @@ class RunFolder:
         result, truth = record.result, record.truth
         planned = np.tile(record.start, (len(truth.reference), 1, 1))
         planned[:, :3, 3] = truth.reference
+        if truth.reference_yaw is not None:
+            planned[:, :3, :3] = geometry.rotations_of_down_camera(truth.reference_yaw)
         paths = {"truth": truth.trajectory, "f2f": result.f2f, "online": result.online, "final": result.final}
         for name, path in (paths | {"reference": Trajectory(truth.trajectory.times_s, planned)}).items():
             path.save(self.path / f"trajectory_{name}.tum")
@@ -141,22 +169,23 @@ class RunFolder:
         """Writes the true, estimated and error rasters, the orthomosaic and the mesh."""
         from twin.exchange import geotiff, mesh
 
-        truth, grid, elevation = record.truth, record.grid, record.elevation
-        geotiff.write_layer(self.path / "dem_truth.tif", truth.height_m, grid, "true elevation [m]")
+        truth, grid, elevation, origin = record.truth, record.grid, record.elevation, record.georeference
+        geotiff.write_elevations(self.path / "dem_truth.tif", truth.height_m, grid, "true elevation [m]", origin)
         if elevation is None:
             return
-        geotiff.write_map(self.path, elevation)
+        geotiff.write_map(self.path, elevation, origin)
         error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
-        geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, "estimated minus true elevation [m]")
+        description = "estimated minus true elevation [m]"
+        geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, description, origin)
         mesh.write_glb(self.path / "mesh.glb", elevation)
 
-    def _write_pictures(self, outputs: Collection[str], metrics: dict[str, Any]) -> None:
-        """Writes the requested report and recording; their libraries are imported only when needed."""
-        if "report" in outputs:
+    def _write_picture(self, name: str, metrics: dict[str, Any]) -> None:
+        """Writes the report or the recording; the libraries for each are imported only when needed."""
+        if name == "report":
             from twin.report import survey_page
 
             survey_page.write_report(self.path, metrics)
-        if "recording" in outputs:
+        else:
             from twin.report import recording
 
             recording.write_recording(self.path, metrics)

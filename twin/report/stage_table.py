@@ -48,7 +48,7 @@ def _inputs(stage: str, scenario: Mapping[str, Any]) -> str:
 
 
 def _disabled(stage: str, scenario: Mapping[str, Any]) -> str:
-    """Returns a note on the parts of a stage that the scenario disables."""
+    """Returns a note such as "F2M disabled" on the parts of a stage that the scenario disables; "" if none."""
     parts = {"online": ("F2M", "GA"), "final": ("GA",)}.get(stage, ())
     disabled = [part for part in parts if not _enabled(scenario)[part]]
     return f"{' and '.join(disabled)} disabled" if disabled else ""

@@ -30,6 +30,7 @@ FIGURE_STYLE: dict[Any, Any] = {
     "savefig.dpi": 110,
     "figure.constrained_layout.use": True,
     "font.size": 9,
+    "text.parse_math": False,  # names may contain "$"
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.spines.top": False,

@@ -20,10 +20,11 @@ from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, LABELS
+from twin.report.verdict import badge, first_lines
 
 #: Longest side of an image in the report [px].
 IMAGE_PX = 1400
-#: Number of keyframes whose images are shown.
+#: Largest number of keyframes whose images are shown.
 N_SAMPLES = 4
 
 
@@ -32,7 +33,7 @@ def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
 
     Args:
         folder: the run folder.
-        metrics: contents of metrics.json, if that file does not exist yet; None: the file is read.
+        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
 
     Raises:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
@@ -52,7 +53,8 @@ def context(run: Run) -> dict[str, Any]:
     metrics = run.metrics or {}
     return {
         "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
-        "finished": run.finished,
+        "badge": badge(run.metrics),
+        "first_lines": first_lines(metrics) if metrics else [],
         "headline": wording.headline(run.metrics, run.scenario),
         "metrics": metrics,
         "key_figures": wording.key_figures(metrics),

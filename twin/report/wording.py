@@ -1,4 +1,4 @@
-"""Text of the reports: numbers with units, the summary and key figures of a survey, and definitions of terms."""
+"""Texts of the reports: numbers with units, summary and key figures of a survey, and definitions of terms."""
 
 from __future__ import annotations
 
@@ -33,8 +33,10 @@ TERMS = {
     "values mean that the estimate is overconfident.",
     "NEES": "Normalised estimation error squared, e' C^-1 e, of an error e with the estimated covariance C. Its mean "
     "is 3 for consistent positions and 6 for consistent motions; larger values mean overconfident covariances.",
-    "Completeness": "Fraction of the observed map cells with an estimated height. A cell is observed if both images of "
-    "at least one keyframe show it.",
+    "Completeness": "Fraction of the map cells with an estimated height, of the asked area or of the observed floor. A "
+    "cell is observed if both images of at least one keyframe show it.",
+    "Asked area": "Area that the planned tracks are to cover. LE90 over this area counts a cell without a height as an "
+    "infinite error, so it is infinite if more than 10 % of the area has no height.",
     "Keyframe": "Frame with a stereo pair that is a node of the network and contributes to the map.",
     "Link": "Measured motion between two keyframes.",
     "F2F": "Frame-to-frame motion: camera motion between consecutive frames, from optical flow.",
@@ -50,7 +52,7 @@ class KeyFigure(NamedTuple):
     Args:
         label: name of the quantity.
         value: its value with unit.
-        meaning: definition of the quantity, its reference value or a related value.
+        meaning: a short note: definition of the quantity, a reference value or a related value.
     """
 
     label: str
@@ -120,7 +122,9 @@ def plain(value: Any) -> str:
 
 
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
-    """Returns the summary of a survey as text: status, conditions, final position error, map quality and warnings.
+    """Returns the summary of a survey as text: status, conditions, final position error and map quality.
+
+    The limitations of these results are not included; `verdict.first_lines` returns them.
 
     Args:
         metrics: contents of metrics.json; None for an unfinished survey.
@@ -128,12 +132,8 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
     """
     if metrics is None:
         return f"This survey is unfinished: it has no metrics.json. The survey is planned {conditions(scenario)}."
-    warning = f" Warning: {metrics['warning']}." if metrics.get("warning") else ""
-    if metrics["status"] != "complete":
-        status = f"The survey was aborted ({metrics['reason']}). It was flown {conditions(scenario)}."
-    else:
-        status = f"The survey is complete. It was flown {conditions(scenario)}."
-    return f"{status} {_results(metrics)}{warning}"
+    verb = "was" if metrics["status"] == "aborted" else "is"
+    return f"The survey {verb} {metrics['status']}. It was flown {conditions(scenario)}. {_results(metrics)}"
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
@@ -149,16 +149,29 @@ def conditions(scenario: Mapping[str, Any]) -> str:
 
 
 def _results(metrics: Mapping[str, Any]) -> str:
-    """Returns position error and map quality in one or two sentences."""
+    """Returns the position error and the map quality as text, one sentence for each available result."""
     final, elevation = metrics["trajectory"]["final"], metrics["map"]
     sentences = []
     if final["ate_rmse_m"] is not None:
         error, path = length(final["ate_rmse_m"]), length(final["path_m"])
         sentences.append(f"The position error of the final trajectory is {error} (RMSE) over a path of {path}.")
+    if elevation.get("completeness_area") is not None:
+        share, error = percent(elevation["completeness_area"]), area_le90(elevation)
+        sentences.append(f"The map covers {share} of the asked area; LE90 of its heights over this area is {error}.")
     if elevation["le90_m"] is not None:
         share, error = percent(elevation["completeness"]), length(elevation["le90_m"])
-        sentences.append(f"The map covers {share} of the observed floor; LE90 of its heights is {error}.")
+        sentences.append(f"It covers {share} of the observed floor, with an LE90 of {error} over these cells.")
     return " ".join(sentences) or "There is no trajectory and no map to evaluate."
+
+
+def area_le90(elevation: Mapping[str, Any]) -> str:
+    """Returns LE90 over the asked area as text: "infinite (holes)" if holes make it infinite, a dash without a map.
+
+    Args:
+        elevation: section `map` of the metrics.
+    """
+    value, known = elevation.get("le90_area_m"), elevation.get("completeness_area")
+    return length(value) if value is not None or known is None else "infinite (holes)"
 
 
 def closed_form_comparison(links: Mapping[str, Any]) -> str:
@@ -200,11 +213,14 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     le90, bias = length(elevation["le90_m"]), length(elevation["bias_m"])
     rmse, nmad = length(elevation["rmse_m"]), length(elevation["nmad_m"])
     completeness, cell = percent(elevation["completeness"]), length(elevation["cell_m"])
+    area = percent(elevation.get("completeness_area"))
+    mapped = f"over the mapped {completeness} of the observed floor"
     return [
-        KeyFigure("Map LE90", le90, f"90th percentile of absolute height error; NMAD {nmad}"),
-        KeyFigure("Map bias", bias, f"mean height error; RMSE {rmse}"),
-        KeyFigure("Completeness", completeness, f"of the observed floor; cell size {cell}"),
-        KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), "RMS of height error / sigma; 1 is right"),
+        KeyFigure("Completeness", area, f"of the asked area; {completeness} of the observed floor; cell size {cell}"),
+        KeyFigure("Map LE90, asked area", area_le90(elevation), f"a hole counts as infinite; {area} has a height"),
+        KeyFigure("Map LE90, mapped floor", le90, f"{mapped}; NMAD {nmad}"),
+        KeyFigure("Map bias", bias, f"{mapped}; RMSE {rmse}"),
+        KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), f"RMS of error / sigma, 1 is right; {mapped}"),
     ]
 
 
@@ -215,8 +231,8 @@ def _survey_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     along_planned, sidelap_planned = percent(overlap["along_planned"]), percent(overlap["across_planned"])
     counts = f"{timing['frames']} frames, {timing['keyframes']} keyframes"
     return [
-        KeyFigure("Overlap along the swath", along, f"median; {along_planned} planned"),
-        KeyFigure("Sidelap", sidelap, f"median; {sidelap_planned} planned"),
+        KeyFigure("Overlap along the swath", along, f"median over the floor; {along_planned} planned"),
+        KeyFigure("Sidelap", sidelap, f"median over the floor; {sidelap_planned} planned"),
         KeyFigure("Cross-track error", length(control["cross_track_rmse_m"]), "RMS distance from the planned path"),
         KeyFigure("Real-time factor", plain(timing["real_time_factor"]), counts),
     ]

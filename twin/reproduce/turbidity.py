@@ -1,6 +1,6 @@
 """Reproduction of Fig. 8 of Negahdaripour & Madjidi (2003): simulated images of one object at five turbidity levels.
 
-Contrast as a function of range is computed in addition.
+In addition, contrast is computed as a function of range.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ RANGES_M: Array = np.arange(0.3, 12.01, 0.05)
 def render_levels(
     turbidities: Sequence[float] = TURBIDITIES, settings: Sequence[str] = (), ranges_m: Array = RANGES_M
 ) -> list[TurbidityLevel]:
-    """Renders the block at each turbidity and computes the contrast as a function of range.
+    """Returns one level per turbidity: image of the test object, a block on sand, its quality, and contrast over range.
 
     Args:
         turbidities: values of `water.turbidity`.
@@ -62,7 +62,7 @@ def render_levels(
 def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: Array) -> Array:
     """Returns the contrast of fine detail on a level floor, relative to clear water.
 
-    The direct signal carries the detail; forward scatter (a blur) and backscatter add light without detail. The
+    Only the direct signal carries fine detail; forward scatter (a blur) and backscatter add light without it. The
     contrast C relative to its value C0 in clear water is therefore C / C0 = direct / (direct + forward + backscatter)
     (Duntley 1963, here for lamps that are fixed to the camera).
 

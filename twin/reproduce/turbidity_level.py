@@ -1,4 +1,4 @@
-"""Image of one object at one turbidity level, with its image quality and the contrast as a function of range."""
+"""Results for one turbidity level: the image of the object, its quality, and the contrast as a function of range."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class TurbidityLevel(NamedTuple):
         scenario: scenario with this turbidity.
         water: optical properties of the water.
         image: (H, W, 3) image of the left camera.
-        quality: image quality, see `look.image_quality`.
+        quality: measures of the quality of `image`, see `twin.app.look.image_quality`.
         ranges_m: (n,) ranges at which `contrast` is given.
         contrast: (n, 3) contrast of fine detail relative to clear water for R, G, B.
     """
@@ -38,6 +38,6 @@ class TurbidityLevel(NamedTuple):
 
     @property
     def visibility_m(self) -> float | None:
-        """Shortest range at which the green contrast is below `MIN_VISIBLE_CONTRAST`; None if there is none."""
+        """Returns the shortest range at which the contrast in green is below `MIN_VISIBLE_CONTRAST`, or None."""
         invisible = np.flatnonzero(self.contrast[:, 1] < MIN_VISIBLE_CONTRAST)
         return float(self.ranges_m[invisible[0]]) if invisible.size else None

@@ -52,7 +52,7 @@ def _picture(axes: Axes, level: TurbidityLevel) -> None:
 
 
 def _histogram_of(image: Any, band: int) -> Any:
-    """Returns the histogram (128,) of a colour band: the fraction of pixels in each bin, two grey levels wide."""
+    """Returns the histogram (128,) of a colour band: the fraction of pixels in each bin of two grey levels."""
     return np.histogram(image[..., band], bins=128, range=(0, 256))[0] / image[..., band].size
 
 

@@ -1,1 +1,1 @@
-"""The scenario: its data model, and reading and writing of its TOML file."""
+"""Data model of a scenario, and reading, validation and writing of scenario files (TOML)."""

@@ -8,28 +8,35 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
 
+from twin.core.paths import is_file, resolved
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.model import Scenario, Source
 from twin.scenario.toml_lines import key_lines
+from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
 
 Model = TypeVar("Model", bound=BaseModel)
-_PATH_KEYS = ("imaging.error_model", "terrain.height_file", "terrain.texture_file", "water.spectrum_file")
+_PATH_KEYS = (
+    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.texture_file", "water.spectrum_file",
+)  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {"calibration": "calibration_error", "imaging.calibration": "imaging.error_model"}
 _ABSENT = object()
+#: Largest number of errors of one file that are listed.
+_MAX_ERRORS = 20
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads a scenario file and the files that it extends, and applies overrides.
+    """Returns the validated scenario of a file, merged over the files that it extends, with overrides applied.
 
     Args:
-        path: a file, or a name in scenes/.
+        path: path of a scenario file, or name of a scenario in scenes/.
         overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is a string.
 
     Raises:
@@ -53,10 +60,10 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
-    """Returns the keys and values of a scenario, merged over its base file; the values are not validated.
+    """Returns the keys and values of a scenario, merged over those of its base file; the values are not validated.
 
     Args:
-        path: a file, or a name in scenes/.
+        path: path of a scenario file, or name of a scenario in scenes/.
 
     Raises:
         ScenarioError: a file cannot be read or contains the old name of a renamed key.
@@ -68,7 +75,7 @@ def read_tree(path: str | Path) -> dict[str, Any]:
 
 
 def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
-    """Returns the validated scenario of a tree of keys, some of which are given new values.
+    """Sets keys of a scenario to new values and returns the validated scenario.
 
     Args:
         tree: keys and values of a scenario; not modified.
@@ -98,30 +105,32 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ScenarioError([source.describe(_as_twin_error(item, model)) for item in error.errors()]) from None
+        items = error.errors(include_url=False)
+        lines = [source.describe(_as_twin_error(item, model)) for item in items[:_MAX_ERRORS]]
+        more = [f"... and {len(items) - _MAX_ERRORS} more"] if len(items) > _MAX_ERRORS else []
+        raise ScenarioError(lines + more) from None
 
 
 def find_scene(path: str | Path) -> Path:
-    """Returns the file of a scenario.
+    """Returns the path of a scenario file.
 
     Args:
-        path: an existing file, or a name in scenes/.
+        path: path of an existing file, or name of a scenario in scenes/, with or without ".toml".
 
     Raises:
-        ScenarioError: no such file or name exists.
+        ScenarioError: there is neither a file nor a scenario of this name.
     """
     import scenes
 
     candidate = Path(path)
-    if candidate.is_file():
+    if is_file(candidate):
         return candidate
     folder = Path(scenes.__file__).parent
     names = sorted(p.stem for p in folder.glob("*.toml"))
     if str(path).removesuffix(".toml").removeprefix("scenes/") in names:
         return folder / (str(path).removesuffix(".toml").removeprefix("scenes/") + ".toml")
-    raise ScenarioError(
-        [f"{path}: no such scenario{_hint(str(path), names)} (allowed: a file, or one of {', '.join(names)})"]
-    )
+    hint, allowed = _hint(str(path), names), f"a file, or one of {', '.join(names)}"
+    raise ScenarioError([f"{shown(str(path))}: no such scenario{hint} (allowed: {allowed})"])
 
 
 def dump_toml(scenario: Scenario) -> str:
@@ -142,16 +151,20 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         ScenarioError: the file cannot be read, or is not TOML.
     """
     try:
-        text = file.read_text(encoding="utf-8")
+        with file.open(encoding="utf-8") as stream:
+            text = stream.read(MAX_CHARACTERS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
     try:
-        tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        tree = parse_toml(text)
+    except ValueError as error:
         line = re.search(r"line (\d+)", str(error))
-        number = line[1] if line else len(text.splitlines())
+        number = line[1] if line else min(len(text.splitlines()), text.count("\n") + 1)
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
-    return tree, key_lines(text)
+    lines = key_lines(text)
+    if errors := [Source(path=file, lines=lines).describe(error) for error in islice(value_errors(tree), 20)]:
+        raise ScenarioError(errors)
+    return tree, lines
 
 
 def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict[str, Any], Source, list[str]]:
@@ -164,7 +177,7 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
         The merged keys and values, with absolute file paths and without old names of renamed keys; the files and line
         numbers that they come from; and one error for each old name.
     """
-    if file.resolve() in including_files:
+    if resolved(file) in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
     tree, lines = read_toml(file)
     errors = [
@@ -174,10 +187,11 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
     base = tree.pop("extends", None)
     if base is None:
         return tree, Source(path=file, lines=lines), errors
-    base_file = (file.parent / str(base)).resolve()
-    if not base_file.is_file():
-        raise ScenarioError([*errors, f"{file}:{lines.get('extends', 1)}: extends: no such file {str(base)!r}"])
-    base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, file.resolve()))
+    base_file = resolved(file.parent / str(base))
+    if not is_file(base_file):
+        line, name = lines.get("extends", 1), shown(repr(str(base)))
+        raise ScenarioError([*errors, f"{file}:{line}: extends: no such file {name}"])
+    base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, resolved(file)))
     return _merge(base_tree, tree), Source(path=file, lines=lines, base=base_source), errors + base_errors
 
 
@@ -199,15 +213,15 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """Returns an absolute path with ${TWIN_DATA} expanded; a relative path without it refers to `folder`."""
+    """Returns the absolute path; ${TWIN_DATA} is expanded, and a path without it is relative to `folder`."""
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
-        return Path(value.replace("${TWIN_DATA}", data)).resolve()
-    return (folder / value).resolve()
+        return resolved(Path(value.replace("${TWIN_DATA}", data)))
+    return resolved(folder / value)
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Returns two trees merged; where both contain a key, the value in `top` takes precedence."""
+    """Returns two trees merged at all levels; where both give a value to a key, that in `top` takes precedence."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -220,21 +234,36 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
-        raise ScenarioError([f"--set {override}: not of the form key=value (for instance plan.tracks=2)"])
+        raise ScenarioError([f"--set {shown(override)}: not of the form key=value (for instance plan.tracks=2)"])
+    if len(key) > MAX_KEY_CHARACTERS or key.count(".") >= MAX_LEVELS:
+        raise ScenarioError([f"--set {shown(override)}: not a key (allowed: up to {MAX_KEY_CHARACTERS} characters)"])
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
+    value = _override_value(key, text)
+    is_path = key in _PATH_KEYS and not isinstance(value, list)
+    _assign(tree, key, str(_expand(str(value), Path.cwd())) if is_path else value, f"--set {shown(override)}")
+
+
+def _override_value(key: str, text: str) -> Any:
+    """Returns the value of an override: the TOML value that the text contains; the text itself if it is not TOML."""
     try:
-        value = tomllib.loads(f"v = {text}")["v"]
+        given = parse_toml(f"v = {text}")
     except tomllib.TOMLDecodeError:
-        value = text
-    _assign(tree, key, str(_expand(str(value), Path.cwd())) if key in _PATH_KEYS else value, f"--set {override}")
+        return text
+    except ValueError as error:
+        raise ScenarioError([f"--set: {TwinError(key, str(error))}"]) from None
+    if given.keys() != {"v"}:  # the text has further lines with keys of their own
+        return text
+    for error in value_errors({key: given["v"]}):
+        raise ScenarioError([f"--set: {error}"])
+    return given["v"]
 
 
 def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
     """Sets a dotted key in the tree.
 
     Args:
-        origin: source of the value, with which error messages begin.
+        origin: text that names the source of the value, at the beginning of error messages.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -273,10 +302,10 @@ def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
         allowed = _fields(item["loc"][:-1], model)
         return TwinError(field, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
     value = item.get("input")
-    shown = "" if isinstance(value, dict) else f"{value!r}: "
+    text = "" if isinstance(value, dict) else f"{shown(repr(value))}: "
     if item["type"] == "missing":
         return TwinError(field, "missing", "a value must be given")
-    return TwinError(field, f"{shown}not allowed", _ALLOWED.get(item["type"]) or item["msg"].removeprefix(_PREFIX))
+    return TwinError(field, f"{text}not allowed", _ALLOWED.get(item["type"]) or item["msg"].removeprefix(_PREFIX))
 
 
 _PREFIX = "Input should be "
@@ -297,6 +326,11 @@ _ALLOWED = {
 }
 
 
+def shown(text: str, longest: int = 200) -> str:
+    """Returns a text for a message, shortened if it has more than `longest` characters."""
+    return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
+
+
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
     """Returns the keys allowed in a section of the model, given the path to the section."""
     for part in location:
@@ -310,5 +344,5 @@ def _fields(location: Iterable[Any], model: Any) -> list[str]:
 
 def _hint(word: str, names: Sequence[str]) -> str:
     """Returns ` (did you mean NAME?)` with the name most similar to the word, or "" if none is similar."""
-    close = difflib.get_close_matches(word, names, n=1)
+    close = difflib.get_close_matches(word[:100], names, n=1)
     return f" (did you mean {close[0]}?)" if close else ""

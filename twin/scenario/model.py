@@ -3,27 +3,40 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
 from twin.core import geometry
+from twin.core.paths import path_problem
 from twin.core.records import SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.errors import TwinError
 
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
-Metres = Annotated[float, Field(gt=0)]
+Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
+Vector2 = tuple[Coordinate, Coordinate]
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Metres = Annotated[float, Field(gt=0, le=1e5)]
 Efficiency = Annotated[float, Field(gt=0, le=1)]
 PerMetre = Annotated[float, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[float, Field(ge=0, le=90)]
 RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
+
+
+def _path(text: str) -> str:
+    """Returns the text unchanged. Raises PydanticCustomError if it cannot be a path."""
+    if problem := path_problem(Path(text)):
+        raise PydanticCustomError("path", "a path; it {problem}", {"problem": problem})
+    return text
+
+
+FilePath = Annotated[str, AfterValidator(_path)]
 
 
 class Section(BaseModel):
@@ -57,8 +70,10 @@ class TerrainConfig(Section):
         default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane z = 0 [m]"
     )
     grid_m: float = Field(default=0.05, gt=0.001, le=1, description="spacing of a generated height grid [m]")
-    height_file: str | None = Field(
-        default=None, description="DEM: GeoTIFF, 16-bit PNG or .npy [m]; ${TWIN_DATA} is expanded"
+    height_file: FilePath | None = Field(
+        default=None,
+        description="DEM: GeoTIFF, 16-bit PNG or .npy; heights are in metres unless a GeoTIFF names another unit; "
+        "${TWIN_DATA} is expanded",
     )
     height_spacing_m: float = Field(
         default=0.01, gt=0, le=10, description="grid spacing of a PNG or .npy height file [m]"
@@ -66,8 +81,13 @@ class TerrainConfig(Section):
     height_range_m: float = Field(
         default=1.0, gt=0, le=1000, description="height of full white above full black in a PNG height file [m]"
     )
-    texture_file: str | None = Field(
-        default=None, description="image that is tiled over the sea floor; generated where missing"
+    z: Literal["up", "down"] | None = Field(
+        default=None,
+        description="direction in which the values of height_file increase: up for elevations, down for depths; "
+        "default: determined from the file; an ambiguous file is an error",
+    )
+    texture_file: FilePath | None = Field(
+        default=None, description="image that is tiled over the sea floor; default: a generated texture"
     )
     texture_px_m: float = Field(
         default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the sea floor [m]"
@@ -75,7 +95,7 @@ class TerrainConfig(Section):
 
 
 class VehicleConfig(Section):
-    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); a study can vary its drag and added mass by factors."""
+    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); factors scale its drag and its added mass."""
 
     dynamics: Literal["rigid", "kinematic"] = Field(
         default="rigid",
@@ -112,7 +132,7 @@ class ImagingConfig(Section):
         description="rendered: images are rendered and matched; surrogate: measurements are sampled from a fitted "
         "error model, about a hundred times faster",
     )
-    error_model: str | None = Field(
+    error_model: FilePath | None = Field(
         default=None, description="error model of the surrogate, written by `twin fit-surrogate`; default: built-in"
     )
     gray_level: float = Field(
@@ -141,7 +161,7 @@ class SensorConfig(Section):
     exposure_min_ms: float = Field(default=0.05, gt=0, le=1000, description="shortest exposure time [ms]")
     exposure_max_ms: float = Field(
         default=15.0, gt=0, le=1000,
-        description="longest exposure time, at most the frame interval; beyond it the gain is raised [ms]",
+        description="longest exposure time, at most the frame interval; in less light the gain is raised [ms]",
     )  # fmt: skip
     exposure_lag_s: float = Field(default=0.5, ge=0, le=60, description="time constant (1/e) of auto-exposure [s]")
     gain_max_db: float = Field(
@@ -175,8 +195,8 @@ class SensorConfig(Section):
 class LensConfig(Section):
     """True distortion of both lenses (Brown-Conrady, as in OpenCV); images are rectified with calibrated coefficients.
 
-    The coefficients apply to tangents of field angles, measured in the air behind the port, or in water if there is no
-    port.
+    The calibrated coefficients differ from the true ones by `calibration_error.k1_error` and `k2_error`. The image
+    coordinates of the model are tangents of field angles in the air behind the port, or in water if there is no port.
     """
 
     k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, coefficient of r^2")
@@ -187,11 +207,11 @@ class LensConfig(Section):
 
 
 class PortConfig(Section):
-    """Window in front of each lens; every ray is refracted at both of its faces.
+    """Window in front of each lens; every ray is refracted at both faces of the window.
 
-    `rig.hfov_deg` is the field of view of the equivalent pinhole camera in water, whose image agrees near the centre,
-    at any distance, with the image through the port if the port is neither tilted nor laterally offset. The position of
-    a camera is that of this pinhole.
+    `rig.hfov_deg` is the field of view of the equivalent pinhole camera in water. For a port that is neither tilted nor
+    laterally offset, the image of this pinhole camera equals the image through the port near its centre, at any
+    distance. The position of a camera is the projection centre of its equivalent pinhole camera.
     """
 
     kind: Literal["none", "flat", "dome"] = Field(
@@ -216,8 +236,8 @@ class PortConfig(Section):
     water_index: float = Field(default=1.339, ge=1, le=2, description="refractive index of sea water")
     calibrated_at_m: float = Field(
         default=0.0, ge=0, le=100,
-        description="depth for which images are rectified exactly, as after a calibration in water; 0: the port is "
-        "modelled as a change of focal length [m]",
+        description="depth along the optical axis for which images are rectified exactly, as after a calibration in "
+        "water; 0: the port is modelled as a change of focal length [m]",
     )  # fmt: skip
 
 
@@ -259,7 +279,7 @@ class WaterConfig(Section):
         default=None,
         description="scattering coefficient for R, G, B; replaces the Jerlov type; needs absorption_per_m [1/m]",
     )
-    spectrum_file: str | None = Field(
+    spectrum_file: FilePath | None = Field(
         default=None,
         description="CSV of wavelength [nm], absorption and scattering [1/m]; replaces the Jerlov type; "
         "${TWIN_DATA} is expanded",
@@ -294,10 +314,10 @@ class LampConfig(Section):
     )
     intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the beam axis [cd]")
     beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(
-        default=(),
+        default=(), max_length=1000,
         description="beam pattern: pairs of angle off the axis [deg], from 0, and intensity relative to the axis, "
         "interpolated linearly, dark beyond the last angle; empty: the measured beam of an LED lamp",
-    )
+    )  # fmt: skip
     colour_temperature_k: float = Field(
         default=6500.0, ge=1000, le=40000,
         description="colour temperature; 6500 is white; the luminous intensity does not change with it [K]",
@@ -382,8 +402,27 @@ class PlanConfig(Section):
     )
     area_m: tuple[Metres, Metres] = Field(
         default=(4.0, 2.0),
-        description="extent along x (along the legs) and y, centred at the origin; for loops, both are the diameter "
-        "of the disc [m]",
+        description="extent along and across the legs, centred at centre_m; for loops, both are the diameter of the "
+        "disc; unused with polygon [m]",
+    )
+    centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of the area: x, y in the scene [m]")
+    centre_crs: tuple[float, float] | None = Field(
+        default=None,
+        description="centre of the area: easting, northing in the CRS of the DEM, in its unit; replaces centre_m",
+    )
+    heading_deg: float = Field(
+        default=0.0, ge=-360, le=360,
+        description="direction of the first leg, and of the bow on it, counter-clockwise from x (east) [deg]",
+    )  # fmt: skip
+    polygon: str | tuple[Vector2, ...] | None = Field(
+        default=None,
+        description="area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file "
+        "with one polygon in the CRS of the DEM; ${TWIN_DATA} is expanded",
+    )
+    turns: Literal["reverse", "bow_first"] = Field(
+        default="reverse",
+        description="reverse: every second leg is flown backwards; bow_first: the vehicle yaws by 180 deg at the end "
+        "of each leg, so that it flies every leg forwards",
     )
     altitude_m: float = Field(
         default=2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
@@ -392,10 +431,19 @@ class PlanConfig(Section):
         default=0.25, gt=0.01, le=2, description="speed along legs and loops; lower on tight loops [m/s]"
     )
     overlap_along: float = Field(
-        default=0.9, gt=0, lt=1, description="overlap of consecutive keyframes, a fraction of the footprint"
+        default=0.9, gt=0, lt=1, description="overlap of consecutive keyframes, a fraction of the image width"
     )
     overlap_across: float = Field(
         default=0.8, gt=0, lt=1, description="sidelap of neighbouring swaths, a fraction of the footprint"
+    )
+    overlap_reference: Literal["floor", "plane"] = Field(
+        default="floor",
+        description="floor: 95 % of the keyframes reach the overlaps over the sea floor; plane: the overlaps refer to "
+        "the reference plane z = 0",
+    )
+    height: Literal["plane", "floor"] = Field(
+        default="plane",
+        description="plane: altitude_m above the reference plane; floor: altitude_m above the smoothed sea floor",
     )
     tracks: int = Field(
         default=0, ge=0, le=1000, description="number of tracks (two legs, or one loop); 0: enough to cover the area"
@@ -403,6 +451,19 @@ class PlanConfig(Section):
     clearance_m: float = Field(
         default=0.3, ge=0, le=10, description="smallest allowed vertical distance from the cameras to the sea floor [m]"
     )
+
+    @field_validator("polygon", mode="before")
+    @classmethod
+    def _require_corners(cls, value: Any) -> Any:
+        """Raises one error for a value that is neither a file nor a list of corners; pydantic would raise several."""
+        if isinstance(value, list | tuple):
+            corners = all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in value)
+            numbers = corners and all(type(c) in (int, float) and math.isfinite(c) for pair in value for c in pair)
+        else:
+            numbers = value is None or isinstance(value, str)
+        if not numbers:
+            raise PydanticCustomError("polygon_type", "a list of corners [x, y], or a GeoJSON file")
+        return value
 
 
 class ControlConfig(Section):
@@ -414,6 +475,11 @@ class ControlConfig(Section):
     natural_frequency_radps: float = Field(
         default=1.2, gt=0.05, le=10, description="natural frequency of the closed position loop [rad/s]"
     )
+    off_course_m: float | None = Field(
+        default=None, gt=0, le=1000,
+        description="largest distance from the planned path; beyond it for one second, the survey is degraded; "
+        "default: a quarter of the shorter side of the footprint [m]",
+    )  # fmt: skip
 
 
 class EstimateConfig(Section):
@@ -456,7 +522,7 @@ class MapConfig(Section):
 
 
 class Source(BaseModel):
-    """Origin of a scenario's keys, for the file and line of error messages.
+    """File, line numbers and overrides that a scenario's keys come from; error messages name them.
 
     Args:
         path: file of the scenario.
@@ -473,13 +539,14 @@ class Source(BaseModel):
     def describe(self, error: TwinError) -> str:
         """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, or `--set: ...` for an overridden key.
 
-        FILE and LINE are those of the key or, if no file contains the key, of the innermost section around it.
+        FILE and LINE locate the key or, if no file contains the key, the innermost section around it.
         """
         overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
         in_overridden_section = error.field not in self.lines and any(
             k.startswith(f"{error.field}.") for k in overridden
         )
-        if error.field in overridden or in_overridden_section:
+        within_override = any(error.field.startswith(f"{k}.") for k in overridden)
+        if error.field in overridden or in_overridden_section or within_override:
             return f"--set: {error}"
         key = error.field
         while "." in key and not any(key in file.lines for file in self._files()):
@@ -508,7 +575,7 @@ class Scenario(Section):
     port: PortConfig = PortConfig()
     calibration_error: CalibrationErrorConfig = CalibrationErrorConfig()
     water: WaterConfig = WaterConfig()
-    lamps: tuple[LampConfig, ...] = Field(default=(), description="lamps on the vehicle")
+    lamps: tuple[LampConfig, ...] = Field(default=(), max_length=64, description="lamps on the vehicle")
     sun: SunConfig = SunConfig()
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
@@ -517,7 +584,9 @@ class Scenario(Section):
     control: ControlConfig = ControlConfig()
     estimate: EstimateConfig = EstimateConfig()
     map: MapConfig = MapConfig()
-    beacons: tuple[BeaconConfig, ...] = Field(default=(), description="small lights at surveyed positions")
+    beacons: tuple[BeaconConfig, ...] = Field(
+        default=(), max_length=1000, description="small lights at surveyed positions"
+    )
     require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))

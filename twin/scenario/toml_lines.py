@@ -7,10 +7,17 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import tomlkit
+from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AbstractTable, AoT, Array, Item, Key, Table
 
 #: Commas, whitespace and comments between the items of an array.
 _SEPARATOR = re.compile(r"(?:[\s,]|#[^\n]*)*")
+
+#: Longest text that is parsed for line numbers; tomlkit takes up to 0.1 ms per character.
+_MAX_PARSED = 50_000
+#: A row with a table header, and the beginning of a row with a key; quotes in a key are part of the match.
+_HEADER = re.compile(r"\s*\[(\[?)([^\[\]=#]{1,400})\]\]?\s*(?:#.*)?$")
+_KEY = re.compile(r"\s*([\w\"'.\- \t]{1,400}?)\s*=")
 
 _Body = Sequence[tuple[Key | None, Item]]
 
@@ -32,17 +39,49 @@ class _Block(NamedTuple):
 def key_lines(text: str) -> dict[str, int]:
     """Returns the line number, counted from 1, of every key and table of a TOML text.
 
-    Keys are dotted and without quotes; items of arrays are counted from 0 (`lamps.0.position_m`).
-
-    Raises:
-        tomlkit.exceptions.TOMLKitError: the text is not TOML.
+    Keys are dotted and without quotes; items of arrays are counted from 0 (`lamps.0.position_m`). In a text of more
+    than 50,000 characters, and in a valid text that tomlkit rejects, only table headers and keys that begin a row are
+    found.
     """
+    if len(text) > _MAX_PARSED:
+        return _keys_of_rows(text)
+    try:
+        return _parsed_key_lines(text)
+    except TOMLKitError:
+        return _keys_of_rows(text)
+
+
+def _keys_of_rows(text: str) -> dict[str, int]:
+    """Returns the line number of every table header, and of every key that begins a row."""
+    lines: dict[str, int] = {}
+    n_items: dict[str, int] = {}
+    table = ""
+    for number, row in enumerate(text.split("\n"), start=1):
+        if header := _HEADER.match(row):
+            name = table = _unquoted(header[2])
+            if header[1]:  # an item of an array of tables
+                table = f"{name}.{n_items.setdefault(name, 0)}"
+                n_items[name] += 1
+            lines.setdefault(name, number)
+            lines.setdefault(table, number)
+        elif key := _KEY.match(row):
+            lines.setdefault(f"{table}.{_unquoted(key[1])}".removeprefix("."), number)
+    return lines
+
+
+def _unquoted(key: str) -> str:
+    """Returns a dotted key without quotes and spaces."""
+    return re.sub(r"[\s\"']", "", key)
+
+
+def _parsed_key_lines(text: str) -> dict[str, int]:
+    """Returns the line number of every key and table of a TOML text. Raises TOMLKitError if tomlkit rejects it."""
     rows = ["".join(row.split()) for row in text.split("\n")]
     blocks = list(_blocks("", "", tomlkit.parse(text).body, 0))
     lines: dict[str, int] = {}
     first_row = 0
     while blocks:
-        # tomlkit keeps the tables of one array together, even where the file has other tables between them
+        # tomlkit keeps the tables of one array together, even if the file has other tables between them
         row = rows[min(first_row, len(rows) - 1)]
         block = next((block for block in blocks if row.startswith(block.header)), blocks[0])
         blocks.remove(block)
@@ -82,7 +121,7 @@ def _blocks(header: str, path: str, body: _Body, n_header_lines: int) -> Iterato
 
 
 def _with_parent(name: str, blocks: Iterator[_Block]) -> Iterator[_Block]:
-    """Yields the blocks; the first one is given the key `name` of the parent, which has no header of its own."""
+    """Yields the blocks and adds the key `name` of their parent, which has no header of its own, to the first block."""
     for position, block in enumerate(blocks):
         if position == 0:
             block.keys.insert(0, (name, 0))

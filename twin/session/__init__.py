@@ -1,1 +1,1 @@
-"""Assembly of one survey, its monitoring, and its evaluation and output."""
+"""Assembly, monitoring, evaluation and output of one survey."""

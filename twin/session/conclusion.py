@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import resource
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from twin.core.interrupts import StageGuard
+from twin.core.quality import Finding
+from twin.core.records import SurveyResult
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
-from twin.judge.metrics import EvaluationInput, evaluate
+from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_writer import RunFolder, SurveyRecord
+from twin.scenario.idealisations import idealisations
 from twin.session.monitor import SurveyMonitor
+from twin.session.survey_check import calibration_notes, survey_findings
+from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
 from twin.world.world import World
 
 
 class RunResult(NamedTuple):
-    """Outcome of a survey: status "complete" or "aborted", its metrics (metrics.json), and its folder."""
+    """Outcome of a survey: status "complete", "degraded" or "aborted", its metrics (metrics.json), and its folder."""
 
     status: str
     metrics: dict[str, Any]
@@ -33,41 +40,76 @@ class Flight(NamedTuple):
         world: the simulated world, with the ground truth.
         navigator: the estimators, with their estimates.
         stopwatch: durations of the stages.
-        reason: why the survey was aborted; "" if it is complete.
+        guard: limits the effect of an interrupt to one stage; also holds the reason why the flight ended early, if any.
     """
 
     mission: Mission
     world: World
     navigator: Navigator
     stopwatch: Stopwatch
-    reason: str
+    guard: StageGuard
 
 
 def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
-    """Aligns all keyframes, builds the map, compares trajectories and map with the truth, and writes the run folder."""
-    mission, world, navigator, stopwatch, reason = flight
-    try:
-        result = navigator.finish()
-    except (SurveyAborted, OSError) as error:
-        result, reason = navigator.finish(), reason or str(error)
+    """Aligns all keyframes, builds the map, compares trajectories and map with the truth, and writes the run folder.
+
+    An interrupt ends only the current stage; the survey then has the status "aborted" with a reason that names the
+    stage.
+    """
+    mission, world, navigator, stopwatch, guard = flight
+    result = _align(navigator, guard)
     for link in navigator.network.history.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
     for alignment in result.alignments:
         folder.log("aligned", **alignment._asdict())
     with stopwatch("map"):
-        elevation = navigator.build_map(result, mission.grid, lambda share: monitor.report_stage("map", share))
+        elevation = guard.attempt(
+            "map",
+            lambda: navigator.build_map(result, mission.grid, lambda share: monitor.report_stage("map", share)),
+        )
     wall_s = monitor.wall_s
     truth, scenario = world.truth(), mission.scenario
+    along, across = planned_overlap(mission)
     plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
+    plan |= {"along_median": along, "across_median": across}
     timing = _timing(len(result.online) / mission.rig.frame_rate_hz, wall_s, stopwatch)
-    identity = _identity(mission, reason, "; ".join(world.warnings))
-    metrics = evaluate(EvaluationInput(result, elevation, truth, mission.rig, plan, timing, identity, scenario.require))
+    findings = survey_findings(mission, result, elevation, truth.reference)
+    for finding in findings:
+        folder.log("finding", **finding._asdict())
+    identity = _identity(mission, guard.reason, findings)
+    survey = EvaluationInput(
+        result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
+        [*world.warnings, *calibration_notes(result, mission.rig)], idealisations(scenario),
+    )  # fmt: skip
+    metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
     monitor.report_stage("report", 0.0)
     n_frames_per_keyframe = mission.plan.n_frames_per_keyframe
     metrics = folder.finish(
-        SurveyRecord(result, elevation, truth, mission.grid, mission.start, n_frames_per_keyframe, stopwatch, metrics)
+        SurveyRecord(
+            result,
+            elevation,
+            truth,
+            mission.grid,
+            mission.start,
+            n_frames_per_keyframe,
+            stopwatch,
+            metrics,
+            mission.terrain.georeference,
+        ),
+        guard,
     )
     return RunResult(metrics["status"], metrics, folder.path)
+
+
+def _align(navigator: Navigator, guard: StageGuard) -> SurveyResult:
+    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted."""
+    try:
+        if (result := guard.attempt("alignment", navigator.finish)) is not None:
+            return result
+    except (SurveyAborted, OSError) as error:
+        guard.cause = guard.cause or str(error)
+    navigator.abandon_alignment()
+    return navigator.finish()
 
 
 def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
@@ -80,15 +122,20 @@ def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str
     }
 
 
-def _identity(mission: Mission, reason: str, warning: str) -> dict[str, Any]:
-    """Returns name, seed, program version, scenario hash, status, reason for an abort, and warnings of a survey."""
+def _identity(mission: Mission, abort_reason: str, findings: Sequence[Finding]) -> dict[str, Any]:
+    """Returns name, seed, program version and scenario hash of the survey, its status, and the reason for the status.
+
+    The status is "aborted" if there is a reason for an abort, otherwise "degraded" if there are findings, otherwise
+    "complete".
+    """
     scenario = mission.scenario
+    reasons = [abort_reason] if abort_reason else [finding.sentence for finding in findings]
+    status = "aborted" if abort_reason else "degraded" if findings else "complete"
     return {
         "name": scenario.name,
         "seed": scenario.seed,
         "version": version("seabed-twin"),
         "scenario_hash": scenario.fingerprint(),
-        "status": "aborted" if reason else "complete",
-        "reason": reason,
-        "warning": warning,
+        "status": status,
+        "reason": "; ".join(reasons),
     }

@@ -1,4 +1,4 @@
-"""Monitoring of a running survey: progress, log and live view; abort if vision stays lost."""
+"""Monitoring of a running survey: progress, log, live view, and abort if vision or position is lost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from twin.errors import SurveyAborted
 from twin.report.run_writer import RunFolder
 from twin.world.mission import Mission
 
-_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for a longer time
+_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for longer
+_MAX_SIGMA = 0.5  # largest ratio of position sigma to shorter side of the footprint; the survey is aborted beyond it
 
 
 class SurveyProgress(NamedTuple):
@@ -32,7 +33,7 @@ class SurveyProgress(NamedTuple):
 
 
 class SurveyMonitor:
-    """Reports the progress of a survey at every frame, and aborts the survey if vision is lost for too long.
+    """Reports the progress of a survey at every frame; aborts it if vision is lost or the position too uncertain.
 
     Args:
         progress: function called with the progress after every frame and during the later stages.
@@ -51,12 +52,14 @@ class SurveyMonitor:
 
             self.live = LiveViewer(mission.rig)
         self.n_blind, self.status = 0, "ok"
+        self.max_sigma_m = _MAX_SIGMA * min(mission.plan.footprint_m)
 
     def __call__(self, estimate: Estimate, frame: Frame) -> None:
         """Reports the progress and the vision status of one frame.
 
         Raises:
-            SurveyAborted: vision has been lost for too long.
+            SurveyAborted: vision has been lost for too long, or the position has become too uncertain to find the
+                neighbouring swath.
         """
         self.n_blind = 0 if estimate.status == "ok" else self.n_blind + 1
         if estimate.status != self.status:
@@ -68,6 +71,11 @@ class SurveyMonitor:
         self.progress(SurveyProgress(estimate.time_s, self.wall_s, share, estimate.sigma_m, "survey"))
         if self.n_blind > _MAX_BLIND_S * self.rate_hz:
             raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
+        if estimate.sigma_m > self.max_sigma_m:
+            raise SurveyAborted(
+                f"the standard deviation of the position reached {estimate.sigma_m:.2f} m at {estimate.time_s:.1f} s"
+                f" (at most {self.max_sigma_m:.2f} m allowed)"
+            )
 
     def report_stage(self, stage: str, share: float) -> None:
         """Reports the completed fraction of a stage that follows the flight, "map" or "report"."""

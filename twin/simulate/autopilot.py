@@ -1,6 +1,7 @@
-"""Pose controller of the BlueROV2, designed with published vehicle parameters.
+"""Pose controller, top speed and thruster loads of the BlueROV2.
 
-The controller ignores the drag and added-mass factors of the scenario, which therefore act as model errors.
+The controller is designed with the published vehicle parameters and ignores the drag and added-mass factors of the
+scenario, which therefore act as model errors.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controllers.allocation import pseudo_inverse_allocation
-from controllers.tracking import HullModel, PoseController
+from controllers.tracking import HullModel, PoseController, feedforward_wrench
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import trimmed_hull
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:
-    """Returns a pose controller for the published hull and thruster parameters, which gives one command per frame."""
+    """Returns a pose controller that is designed for the published vehicle and computes one command per frame."""
     hull = trimmed_hull(VehicleConfig.model_validate({}))
     model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
     allocation = pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
@@ -30,8 +31,8 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     """Returns the greatest steady speed in still water along a direction, at which the first thruster saturates [m/s].
 
-    Drag along each axis is linear v + quadratic v |v|. Each thruster therefore needs the thrust p v + q v^2, with p and
-    q from the thrust allocation.
+    Drag along each axis is a v + b v |v| with the coefficients a of linear and b of quadratic drag. At the speed v,
+    each thruster therefore needs the thrust p v + q v^2; p and q follow from a, b and the thrust allocation.
 
     Args:
         vehicle: vehicle settings of the scenario, with the factor on drag.
@@ -46,6 +47,26 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     roots = np.concatenate([np.roots([q, p, sign * full_n]) for q, p in coefficients for sign in (-1, 1)])
     real = roots[np.isreal(roots)].real
     return float(real[real > 0].min())
+
+
+def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
+    """Returns the steady thrust (n,) of the most loaded thruster at each velocity, as a fraction of full thrust.
+
+    The hull is level. The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the moments in roll and
+    pitch are left to the righting moment.
+
+    Args:
+        vehicle: vehicle settings of the scenario, with the factors on drag and added mass and the buoyancy.
+        velocities: (n, 3) velocities through the water, in body axes [m/s].
+    """
+    hull = trimmed_hull(vehicle)
+    model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
+    wrenches = np.array([feedforward_wrench(model, np.asarray(v, np.float64)) for v in velocities]).reshape(-1, 6)
+    wrenches[:, :2] = 0.0
+    wrenches[:, 5] += hull.weight_n - hull.buoyancy_n
+    configuration = angular_first(BLUEROV2_HEAVY.thrust_configuration)
+    thrusts = wrenches @ pseudo_inverse_allocation(configuration, _thrust_n).thrusts_from_wrench.T
+    return np.abs(thrusts).max(axis=1, initial=0.0) / float(_thrust_n(np.ones(1))[0])
 
 
 def _thrust_n(command: Array) -> Array:

@@ -1,8 +1,8 @@
 """Compiled rigid-body simulation of the vehicle without MuJoCo, for surveys that are not rendered.
 
-The integration is that of MuJoCo for a free body without contacts: velocity first, then position with the new velocity,
-then rotation with the new angular velocity. The results equal those of `mujoco_vehicle.MujocoVehicle` within rounding
-errors.
+The integration scheme is that of MuJoCo for a free body without contacts: it updates the velocity first, then the
+position with the new velocity and the rotation with the new angular velocity. The results equal those of
+`mujoco_vehicle.MujocoVehicle` within rounding errors.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class RigidBodyState(NamedTuple):
         velocity: (6,) [linear in world axes, angular in body axes] velocity [m/s, rad/s], half a timestep before the
             time of the pose, modified in place.
         acceleration: (6,) rate of change of `velocity` in the last step [m/s2, rad/s2], modified in place.
-        kick: (1,) number of timesteps by which the next step advances the velocity: 0.5 in the first step, then 1;
-            modified in place.
+        kick: (1,) number of timesteps over which the next step integrates the acceleration: 0.5 in the first step
+            (leapfrog), then 1; modified in place.
         thrusters: thrusters of the vehicle, modified in place.
         hull: hull of the vehicle.
         current: (3,) velocity of the steady current in the world [m/s].
@@ -85,7 +85,7 @@ class CompiledVehicle:
         return body_twist(self.state)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates a duration, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
+        """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
             SurveyAborted: the physics diverged.
@@ -94,7 +94,7 @@ class CompiledVehicle:
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
-        """Advances the simulated time and checks the state; called after `advance` has advanced the state.
+        """Advances the clock and checks the state for divergence; to be called after `advance`.
 
         Raises:
             SurveyAborted: the physics diverged.

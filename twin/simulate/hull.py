@@ -21,7 +21,7 @@ def physics_timestep_s(frame_rate_hz: float) -> float:
 
 
 def trimmed_hull(vehicle: VehicleConfig) -> Hull:
-    """Returns the hull parameters of the BlueROV2, with the vehicle settings of a scenario."""
+    """Returns the hull parameters of the BlueROV2 with the drag, added mass and buoyancy of a scenario."""
     rov = BLUEROV2_HEAVY
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(

@@ -31,7 +31,7 @@ class KinematicVehicle:
         return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Moves the vehicle for a duration with the horizontal part of a velocity command (3,) in the world [m/s].
+        """Moves the vehicle for a duration at the horizontal part of a velocity command (3,) in world axes [m/s].
 
         Raises:
             SurveyAborted: the command is not finite.

@@ -1,4 +1,4 @@
-"""Vehicle simulated by MuJoCo; the applied force yields the acceleration of the hydrodynamic model."""
+"""Vehicle simulated by MuJoCo under a force that produces the acceleration of the hydrodynamic model."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class MujocoVehicle:
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates a duration, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
+        """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
             SurveyAborted: the physics diverged.

@@ -85,7 +85,7 @@ class NavigationSensors:
         )  # fmt: skip
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Draws the standard normal numbers that `read` would draw over the next frames for the per-frame sensors.
+        """Draws the standard normal numbers that `read` would draw for the per-frame sensors in the next frames.
 
         Returns:
             Numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the Doppler velocity log.
@@ -149,7 +149,7 @@ def read_pressure_and_attitude(
     """Simulates the pressure sensor and the attitude and heading reference system (AHRS).
 
     The pressure sensor is in the housing of the left camera and measures the height of this camera; its reading
-    therefore needs no lever arm correction, in which attitude errors would enter. The AHRS measures roll, pitch and yaw
+    therefore needs no lever-arm correction, which attitude errors would affect. The AHRS measures roll, pitch and yaw
     of the body. Noise is drawn for both sensors even if unused, so that random numbers do not depend on `aiding`.
 
     Args:
@@ -168,7 +168,7 @@ def read_pressure_and_attitude(
 
 @njit(cache=True, nogil=True)
 def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, attitude_sigmas_rad, numbers):
-    """Returns measured camera height [m] and roll, pitch, yaw (3,) [rad]; noise from standard normal numbers (4,)."""
+    """Returns measured camera height [m] and roll, pitch, yaw (3,) [rad]; `numbers` (4,) are standard normal."""
     up, arm = world_from_body[2], body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
     angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_sigmas_rad * numbers[1:]
@@ -194,7 +194,7 @@ class DopplerVelocityLog:
 
 @njit(cache=True, nogil=True)
 def _dvl_velocity(velocity_mps, gain, sigma_mps, numbers):
-    """Returns the measured velocity (3,) [m/s], with noise from standard normal numbers (3,)."""
+    """Returns the measured velocity (3,) [m/s]; `numbers` (3,) are standard normal."""
     return gain * velocity_mps + sigma_mps * numbers
 
 

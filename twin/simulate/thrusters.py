@@ -51,7 +51,7 @@ class ThrusterState(NamedTuple):
 
 
 class LaggedThrusters:
-    """Thrusters of a vehicle; each thrust follows the commanded steady thrust with a linear lag.
+    """Thrusters of a vehicle; the thrust of each follows the steady thrust of its command with a linear lag.
 
     The lag is discretised exactly for commands that are constant over a timestep (zero-order hold).
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -11,13 +11,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from twin.judge.map_error import with_completeness
 from twin.judge.require import more_is_better
 from twin.study import statistics
+from twin.study.answers import Answer, PassRecord, answers_of_ranges, answers_of_values
 from twin.study.design import axis_names
 from twin.study.statistics import Array, Interval, SobolIndex
 from twin.study.study_file import Study
 
 _MAX_REASONS = 12
+_MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
 
 
 class MetricSummary(NamedTuple):
@@ -35,7 +38,7 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for text) and explained fraction of the rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN for a text key), explained fraction of rank variance."""
 
     key: str
     metric: str
@@ -64,22 +67,55 @@ class FailureReason(NamedTuple):
     surveys: int
 
 
-class StudyAnalysis:
-    """Statistics of the results table of a study, which has one row per survey; array attributes follow its rows."""
+class RefusedSample(NamedTuple):
+    """A sample whose scenario cannot be flown: its number, number of surveys, value of each varied key, reason."""
 
-    def __init__(self, rows: pa.Table, study: Study):
+    sample: int
+    surveys: int
+    values: dict[str, Any]
+    reason: str
+
+
+class StudyAnalysis:
+    """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
+
+    Refused and failed surveys have no result and are excluded from every statistic. Surveys of the same scenario with
+    the same seed are identical and count once.
+
+    Args:
+        rows: results table.
+        study: the study.
+        planned: number of surveys of the study; None: all are in the table.
+    """
+
+    def __init__(self, rows: pa.Table, study: Study, planned: int | None = None):
         self.rows, self.study, self.required_probability = rows, study, study.probability
+        self.not_flown = max(0, (planned or 0) - rows.num_rows)
         self.status, self.reason, self.warning = (self._texts(name) for name in ("status", "reason", "warning"))
-        self.evaluated = self.status != "failed"
-        self.complete = self.status == "complete"
+        self.refused, self.failed = self.status == "refused", self.status == "failed"
+        self.duplicate = self._duplicates()
+        self.evaluated = ~(self.refused | self.failed | self.duplicate)
+        self.complete = self.evaluated & (self.status == "complete")
         self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
         self.limits = self._limits()
-        self.metrics = [name for name in dict.fromkeys([*self.limits, *study.show]) if self._has_values(name)]
+        names = with_completeness([*self.limits, *study.show])
+        self.metrics = [name for name in names if self._has_values(name)]
         self.passed = self._passed()
 
     def _texts(self, name: str) -> NDArray:
         column = self.rows[name].to_pylist() if name in self.rows.column_names else []
         return np.array(["" if value is None else str(value) for value in column], dtype=object)
+
+    def _duplicates(self) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the surveys with the scenario and seed of an earlier survey that has a result."""
+        hashes, seeds = self._texts("scenario_hash"), self.numbers("seed")
+        seen: set[tuple[str, float]] = set()
+        duplicate = np.zeros(self.rows.num_rows, np.bool_)
+        for k in np.flatnonzero(~(self.refused | self.failed)) if len(hashes) else ():
+            identity = hashes[k], float(seeds[k])
+            duplicate[k] = bool(hashes[k]) and identity in seen
+            seen.add(identity)
+        return duplicate
 
     def numbers(self, name: str) -> Array:
         """Returns a numeric column of the table (n,), with NaN where a survey has no value."""
@@ -96,7 +132,7 @@ class StudyAnalysis:
         """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
 
         These are the complete surveys with a value of the metric. The statistics of image quality metrics ("vision.")
-        also include aborted surveys.
+        also include degraded and aborted surveys.
         """
         flown = self.evaluated if metric.startswith("vision.") else self.complete
         return flown & np.isfinite(self.numbers(metric))
@@ -132,8 +168,8 @@ class StudyAnalysis:
 
     @property
     def requirement_missed(self) -> bool:
-        """Returns whether the pass probability is below the required value; always False for a study with `seek`."""
-        required = self.required_probability if self.study.seek is None else None
+        """Returns whether the pass probability over all samples is below the required value, or is not known."""
+        required = self.required_probability
         return required is not None and not self.pass_probability.value >= required
 
     def key_numbers(self, key: str) -> Array | None:
@@ -200,28 +236,56 @@ class StudyAnalysis:
 
     def _mean_of_samples(self, metric: str) -> Array:
         """Returns the mean of a metric over the surveys of each sample; NaN if any of them was not completed."""
-        values = np.where(self.complete, self.numbers(metric), np.nan)
+        values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
 
     @cached_property
-    def threshold(self) -> tuple[Interval, bool] | None:
-        """Returns the value of the `seek` key at which the pass probability equals the required one.
+    def answers(self) -> dict[str, list[Answer]]:
+        """Returns, for each key, where the pass probability reaches the required value, is below it, or is undecided.
 
-        The second value is True if the pass probability increases with the key, else False. Returns None if the study
-        has no numeric `seek` key or no required pass probability, or if no survey could be evaluated.
+        A key with a distribution has one answer per range, a key with listed values one per value; the other keys vary
+        as the study specifies. Empty without a required pass probability, or if no survey was evaluated.
         """
-        key = self.study.seek
-        x = self.key_numbers(key) if key is not None and key in self.keys else None
-        if x is None or self.required_probability is None or not self.evaluated.any():
-            return None
-        x, passed, clusters = x[self.evaluated], self.passed[self.evaluated], self.clusters[self.evaluated]
-        rising = bool(statistics.probability_of_superiority(x[passed], x[~passed]) >= 0.5)
-        return statistics.threshold(x, passed, self.required_probability, rising, clusters), rising
+        if self.required_probability is None or not self.evaluated.any():
+            return {}
+        return {key: self._answers(key, self.required_probability) for key in self.keys}
+
+    def _answers(self, key: str, required: float) -> list[Answer]:
+        chosen = self.evaluated
+        record = PassRecord(self.passed[chosen], self.clusters[chosen], required)
+        x, distribution = self.key_numbers(key), self.study.vary.get(key)
+        if x is None:
+            return answers_of_values(self._texts(f"vary.{key}")[chosen].astype(str), record)
+        is_listed = distribution is None or distribution.kind in ("choice", "grid")
+        if len(np.unique(x[chosen])) == 1 or (is_listed and len(np.unique(x[chosen])) <= _MAX_LISTED):
+            return answers_of_values(x[chosen], record)
+        return answers_of_ranges(x[chosen], record)
+
+    @cached_property
+    def refused_samples(self) -> list[RefusedSample]:
+        """Returns the samples with refused surveys, in ascending order of their numbers."""
+        listed: dict[int, RefusedSample] = {}
+        sample = self.numbers("sample")
+        for k in np.flatnonzero(self.refused):
+            number = int(sample[k])
+            values = {key: self.rows[f"vary.{key}"][int(k)].as_py() for key in self.keys}
+            earlier = listed.get(number, RefusedSample(number, 0, values, self.reason[k]))
+            listed[number] = earlier._replace(surveys=earlier.surveys + 1)
+        return [listed[number] for number in sorted(listed)]
+
+    @cached_property
+    def refusal_reasons(self) -> list[FailureReason]:
+        """Returns the reasons why surveys were refused, the most frequent first.
+
+        Reasons that differ only in numbers count as one, with the text of the first.
+        """
+        counts = count_similar(self.reason[self.refused])
+        return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Compares the numeric keys of surveys that passed and surveys that did not; best separating key first."""
+        """Returns a comparison of passed and other surveys for each numeric key, the best separating key first."""
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)
@@ -236,11 +300,16 @@ class StudyAnalysis:
     def failure_reasons(self) -> list[FailureReason]:
         """Returns the most frequent reasons why surveys did not pass, in descending order, with numbers masked."""
         counts: dict[tuple[str, str], int] = {}
-        for k in np.flatnonzero(~self.passed):
+        for k in np.flatnonzero(~self.passed & ~self.refused & ~self.duplicate):
             reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))
             counts[self.status[k], reason] = counts.get((self.status[k], reason), 0) + 1
         reasons = [FailureReason(*key, count) for key, count in counts.items()]
         return sorted(reasons, key=lambda r: (-r.surveys, r.reason))[:_MAX_REASONS]
+
+    @cached_property
+    def warning_counts(self) -> dict[str, int]:
+        """Returns the number of surveys with each warning, the most frequent first; see `count_similar`."""
+        return count_similar(self.warning[self.warning != ""])
 
     def _missed_limits(self, row: int) -> list[str]:
         return [name for name in self.limits if self.numbers(f"require.{name}.passed")[row] != 1]
@@ -251,6 +320,16 @@ def mask_numbers(reason: str) -> str:
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", reason)
 
 
+def count_similar(texts: Iterable[str]) -> dict[str, int]:
+    """Counts texts that differ only in numbers as one; returns {first such text: count}, the most frequent first."""
+    first: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    for text in texts:
+        shown = first.setdefault(mask_numbers(text), text)
+        counts[shown] = counts.get(shown, 0) + 1
+    return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
 def _strength(sensitivity: Sensitivity) -> float:
     strengths = [abs(sensitivity.correlation.value), sensitivity.explained**0.5]
     return max([strength for strength in strengths if np.isfinite(strength)], default=0.0)
@@ -259,35 +338,3 @@ def _strength(sensitivity: Sensitivity) -> float:
 def _range_text(values: Array) -> str:
     low, high = float(values.min()), float(values.max())
     return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-
-
-def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the summary that `--json` prints: counts, pass probability and the distribution of each metric.
-
-    Args:
-        identity: entries at the start of the summary, such as the name of the study.
-    """
-    probability = _as_dict(analysis.pass_probability) | {"required": analysis.required_probability}
-    threshold = analysis.threshold
-    metrics = {
-        metric.name: {
-            "surveys": metric.surveys,
-            "median": _as_dict(metric.median),
-            "bound_95_percent": _as_dict(metric.bound),
-        }
-        for metric in analysis.metric_summaries
-    }
-    return dict(identity) | {
-        "surveys": len(analysis.status),
-        **{name: int((analysis.status == name).sum()) for name in ("complete", "aborted", "refused", "failed")},
-        "passed": int(analysis.passed.sum()),
-        "probability": probability,
-        "requirement_missed": analysis.requirement_missed,
-        "threshold": None if threshold is None else {"key": analysis.study.seek, **_as_dict(threshold[0])},
-        "metrics": metrics,
-        "failure_reasons": [reason._asdict() for reason in analysis.failure_reasons],
-    }
-
-
-def _as_dict(interval: Interval) -> dict[str, float | None]:
-    return {name: float(value) if np.isfinite(value) else None for name, value in interval._asdict().items()}

@@ -114,7 +114,7 @@ def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> 
 
 
 class _QueueSize:
-    """Number of tasks to keep submitted, for the present cluster size; cached, because each query is a network call."""
+    """Callable that returns the number of tasks to keep submitted; caches the cluster size, which is a network call."""
 
     def __init__(self, client: Client):
         self.client, self.tasks, self.updated_s = client, 0, -math.inf

@@ -69,7 +69,7 @@ def _saltelli(pairs: Array) -> Array:
         pairs: (n, 2 d), the points of A in the first d columns and those of B in the others.
 
     Returns:
-        (n (d + 2), d), the blocks stacked in the order that `statistics.sobol_indices` expects.
+        (n (d + 2), d), the matrices stacked in the order that `statistics.sobol_indices` expects.
     """
     a, b = np.hsplit(pairs, 2)
     blocks = [np.where(np.arange(a.shape[1]) == k, b, a) for k in range(a.shape[1])]
@@ -94,7 +94,7 @@ def _sampled_axes(study: Study) -> Iterator[Callable[[Array], list[dict[str, Any
 
 
 def _grid_axes(study: Study) -> Iterator[list[list[tuple[str, Any]]]]:
-    """Yields the grid points of each axis of the grid, each a list of (key, value) pairs."""
+    """Yields, for each axis of the grid, the list of its grid points; a point is a list of (key, value) pairs."""
     all_axes = study.sampling.method == "grid"
     for key, distribution in study.vary.items():
         if all_axes or not distribution.is_sampled:

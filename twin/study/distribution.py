@@ -47,7 +47,7 @@ class Distribution(Section):
 
     @property
     def kind(self) -> str:
-        """Returns the kind of distribution, i.e. the name of the given field."""
+        """Returns the kind of distribution: the name of the only field that is not None, e.g. "uniform"."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @property

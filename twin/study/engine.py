@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task: its result with an empty `failure`, or None with the reason why the task failed."""
+    """Outcome of one task: its `result`, or None with the reason of its `failure`; and the number of attempts."""
 
     task: Task
     result: Result | None

@@ -64,13 +64,23 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
         x = _key_axis(axes, analysis.key_numbers(key), analysis.evaluated, groups, names)
         _error_bars(axes, x, proportions, COLOURS["online"])
         axes.axhline(analysis.pass_probability.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
-        if analysis.threshold is not None and key == analysis.study.seek and np.isfinite(analysis.threshold[0]).all():
-            axes.axvline(analysis.threshold[0].value, color=LIMIT, linewidth=1)
-            axes.axvspan(analysis.threshold[0].low, analysis.threshold[0].high, color=LIMIT, alpha=0.12, linewidth=0)
+        _shade_answers(axes, analysis, key)
         axes.set(ylim=(-0.03, 1.03), xlabel=key)
         axes.yaxis.set_major_formatter(lambda value, _: percent(value))
     panels[0].set_ylabel("pass probability")
     return figure
+
+
+def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
+    """Shades where the pass probability reaches the required value (green) or misses it (orange); draws this value."""
+    answers = analysis.answers.get(key, [])
+    if answers:
+        axes.axhline(analysis.required_probability or 0.0, color=LIMIT, linestyle=":", linewidth=1)
+    for k, answer in enumerate(answers):
+        if answer.verdict != "undecided":
+            colour = PASSED if answer.verdict == "passes" else NOT_PASSED
+            low, high = (answer.low, answer.high) if np.isfinite(answer.low) else (float(k), float(k))
+            axes.axvspan(low, high, color=colour, alpha=0.18, linewidth=6 if low == high else 0)
 
 
 def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
@@ -120,7 +130,7 @@ def _error_bars(axes: Axes, x: Array, intervals: list[Interval], colour: str) ->
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
-    """Plots the histogram of each metric with its median, 95 % bound and limit.
+    """Plots the histogram of each metric with its median, its 95th (or 5th) percentile and its limit.
 
     Returns None if no metric has values of two or more surveys.
     """

@@ -11,19 +11,21 @@ from typing import Any
 from uuid import uuid4
 
 from twin.errors import ScenarioError, TwinError
+from twin.study.design import Sample
 from twin.study.surveys import Survey
 
 Row = dict[str, Any]
 #: Files of a run folder that are kept, for each value of the study's `keep`.
 KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
-#: Outputs that a run writes, for each value of the study's `keep`; outputs that would be deleted are not written.
+#: Argument `outputs` of `survey.run` for each value of the study's `keep`: files that would be deleted are not written.
 OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
 
 
 def fly(survey: Survey) -> Row:
-    """Flies a survey into its folder and returns its row of results.
+    """Flies a survey, writes its run folder, and returns its row of results.
 
-    The run writes to a hidden folder, which is renamed at the end: a folder with its final name is complete.
+    A survey that ends with a TwinError or OSError gives a row with status "refused" or "failed". The survey writes to a
+    hidden folder that is renamed at the end, so a folder with the final name is complete.
     """
     import cv2
 
@@ -60,32 +62,47 @@ def _move_kept_files(scratch: Path, survey: Survey) -> None:
 
 
 def _status(metrics: Mapping[str, Any]) -> str:
-    """Returns the status of the run, or "failed" if an I/O error or a signal ended it."""
-    computer_failure = metrics["reason"].startswith(("[Errno", "interrupted"))
+    """Returns the status of the run, or "failed" if an I/O error or a signal ended it or one of its stages."""
+    reason = metrics["reason"]
+    computer_failure = reason.startswith(("[Errno", "interrupted")) or reason.endswith(" skipped")
     return "failed" if computer_failure else metrics["status"]
 
 
 def row_of(survey: Survey, status: str, reason: str) -> Row:
-    """Returns the columns that every row has: sample, seed, scenario hash, status, reason and varied keys.
+    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason and varied keys.
 
     Args:
-        status: "complete"; "aborted" if the survey ended early; "refused" if its scenario cannot be flown; "failed" if
-            the program or the computer failed, which leaves the survey without a result.
+        survey: the survey.
+        status: "complete"; "degraded" if the survey was flown to its end but the estimators distrust their own results;
+            "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
+            computer failed. A refused or failed survey has no result.
+        reason: why the status is not "complete"; else "".
     """
     identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
-    return identity | {"status": status, "reason": reason} | {f"vary.{k}": v for k, v in survey.values.items()}
+    identity["fidelity"] = survey.scenario.imaging.fidelity
+    return identity | {"status": status, "reason": reason} | _varied(survey.values)
+
+
+def refused_row(sample: Sample, seed: int, reason: str) -> Row:
+    """Returns the row of a survey whose scenario is not valid; its scenario hash is empty."""
+    identity = {"sample": sample.number, "seed": seed, "scenario_hash": "", "status": "refused", "reason": reason}
+    return identity | _varied(sample.values)
+
+
+def _varied(values: Mapping[str, Any]) -> Row:
+    return {f"vary.{key}": value for key, value in values.items()}
 
 
 def has_passed(row: Row) -> bool:
-    """Returns whether the survey was completed and met every requirement."""
+    """Returns whether the survey has the status "complete" and met every requirement."""
     verdicts = (value for name, value in row.items() if name.startswith("require.") and name.endswith(".passed"))
     return row["status"] == "complete" and all(verdicts)
 
 
 def flatten(metrics: Mapping[str, Any]) -> Row:
-    """Returns the values in the sections of metrics.json by dotted name, e.g. "map.le90_m".
+    """Returns the values in the sections of metrics.json, keyed by dotted name, e.g. "map.le90_m".
 
-    Names of measured run times begin with "timing.". Values outside the sections, such as the status, are left out.
+    Names of measured run times begin with "timing.". Top-level values, such as the status, are left out.
     """
     row: Row = {}
     for section, value in metrics.items():

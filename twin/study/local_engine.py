@@ -13,7 +13,7 @@ from twin.study.worker import TaskLimits, WorkerPool
 
 
 class LocalEngine:
-    """Engine on worker processes of this machine; one thread of this process waits for each worker.
+    """Engine that runs tasks in worker processes on this machine, with one waiting thread per worker.
 
     Args:
         jobs: number of worker processes.
@@ -39,7 +39,7 @@ class LocalEngine:
                         reply, attempts = future.result()
                         yield Outcome(running.pop(future), reply.value, reply.reason, attempts)
             finally:
-                if running:  # interrupted: a thread can end only after its worker
+                if running:  # interrupted: a thread ends only after its worker has been killed
                     self.pool.close()
 
 

@@ -17,23 +17,36 @@ from twin.study.statistics import wilson_interval
 
 
 class StudyProgress:
-    """Counts of surveys that have ended, passed and failed so far, and the current pass probability."""
+    """Display of a study's progress: numbers of finished, failed and refused surveys, and the current pass probability.
+
+    Args:
+        bar: progress bar on a terminal; None: no bar.
+        print_surveys: whether to print one line per survey.
+    """
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
-        self.total = self.done = self.passed = self.failed = 0
+        self.total = self.done = self.passed = self.failed = self.refused = 0
         self.bar, self.print_surveys = bar, print_surveys
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
 
     def begin(self, total: int) -> None:
-        """Sets the number of surveys to fly."""
+        """Sets the total number of surveys to fly."""
         self.total = total
         self._update_bar()
 
+    def tell(self, text: str) -> None:
+        """Prints a line on stderr."""
+        if self.bar:
+            self.bar.console.print(text, markup=False, highlight=False)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
     def add(self, row: Row) -> None:
-        """Counts a survey that has ended."""
+        """Counts a survey that has ended, and updates the display."""
         self.done += 1
         self.passed += has_passed(row)
         self.failed += row["status"] == "failed"
+        self.refused += row["status"] == "refused"
         if self.print_surveys and self.bar:
             self.bar.console.print(survey_line(row), markup=False, highlight=False)
         elif self.print_surveys:
@@ -45,8 +58,9 @@ class StudyProgress:
             self.bar.update(self._task, total=self.total, completed=self.done, note=str(self))
 
     def __str__(self) -> str:
-        evaluated = self.done - self.failed
-        failures = f"{self.failed} failed" if self.failed else ""
+        evaluated = self.done - self.failed - self.refused
+        counts = {"failed": self.failed, "refused": self.refused}
+        failures = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         if not evaluated:
             return failures
         estimate = wilson_interval(self.passed, evaluated)
@@ -67,7 +81,7 @@ def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
 
 
 def survey_line(row: Row) -> str:
-    """Returns the result of a survey in one line."""
+    """Returns one line with a survey's sample, seed, status, reason and varied values."""
     missed = "" if has_passed(row) else ", requirements not met"
     result = row["status"] + (f" ({row['reason']})" if row["reason"] else missed)
     varied = ", ".join(f"{name[5:]} {plain(value)}" for name, value in row.items() if name.startswith("vary."))

@@ -15,6 +15,8 @@ from twin.study.figures import draw_all
 from twin.study.statistics import RESAMPLES
 from twin.study.study_file import Study
 
+MAX_REFUSED = 50  #: largest number of refused samples that the report lists
+
 
 def write_report(study: Study, analysis: StudyAnalysis, page: Path) -> None:
     """Writes the report of a study to the file `page`."""
@@ -22,7 +24,7 @@ def write_report(study: Study, analysis: StudyAnalysis, page: Path) -> None:
 
 
 def context(study: Study, analysis: StudyAnalysis) -> dict[str, Any]:
-    """Returns the variables of the page template."""
+    """Returns the variables of the page template `study.html.j2`."""
     return {
         "study": study,
         "analysis": analysis,
@@ -30,6 +32,7 @@ def context(study: Study, analysis: StudyAnalysis) -> dict[str, Any]:
         "headline": wording.headline(study, analysis),
         "sensitivities": [s for s in analysis.sensitivities if np.isfinite(s.correlation.value) or s.explained > 0],
         "figures": draw_all(analysis),
+        "refused_samples": analysis.refused_samples[:MAX_REFUSED],
         "resamples": RESAMPLES,
         "text": study.source.path.read_text(encoding="utf-8"),
         "version": version("seabed-twin"),

@@ -20,9 +20,9 @@ _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionari
 
 
 class ResultsLog:
-    """The file rows.jsonl: one row per line; the last row of a survey supersedes its earlier rows.
+    """Log of the results in the file rows.jsonl: one row per line; a survey's last row supersedes its earlier rows.
 
-    Rows that cannot be written, e.g. to a full disk, stay in memory until the next row is added.
+    Rows that cannot be written, e.g. because the disk is full, stay in memory and are written with the next row.
     """
 
     def __init__(self, folder: Path):
@@ -30,7 +30,7 @@ class ResultsLog:
         self._unwritten: list[str] = []
 
     def add(self, row: Row) -> None:
-        """Writes a row, together with earlier rows that could not be written."""
+        """Writes a row, together with earlier rows that could not be written; ignores a failure of the write."""
         self._unwritten.append(json.dumps(row) + "\n")
         with suppress(OSError):
             self.flush()
@@ -52,7 +52,7 @@ class ResultsLog:
         self._unwritten.clear()
 
     def rows(self) -> Iterator[Row]:
-        """Yields all rows in the order of writing; skips partly written rows."""
+        """Yields all rows in the order in which they were written; skips partly written rows."""
         if not self.file.exists():
             return
         with self.file.open("rb") as file:
@@ -65,7 +65,7 @@ class ResultsLog:
                     yield row
 
     def done(self) -> set[tuple[int, int]]:
-        """Returns (sample, seed) of every survey with a result; failed surveys are excluded and flown again."""
+        """Returns (sample, seed) of every survey whose last row does not have the status "failed"."""
         status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
         return {key for key, last in status.items() if last != "failed"}
 
@@ -113,7 +113,7 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
     """Returns the names ordered by section: identity, varied keys, metrics, timing; alphabetical within each."""
-    identity = ("sample", "seed", "status", "reason", "warning", "scenario_hash")
+    identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 
     def sort_key(name: str) -> tuple[int, int, str]:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from twin.errors import TwinError
 from twin.study.analysis import StudyAnalysis
+from twin.study.design import samples, seeds_of_sample
 from twin.study.engine import Engine, Outcome
-from twin.study.flight import Row, fly, row_of
+from twin.study.flight import Row, fly, refused_row, row_of
 from twin.study.progress import StudyProgress
 from twin.study.report import write_report
 from twin.study.results_log import ResultsLog, write_parquet
 from twin.study.study_file import Study
-from twin.study.surveys import Survey, check_samples, survey_keys, surveys
+from twin.study.surveys import Survey, refusals, survey_keys, surveys
 from twin.study.worker import TaskLimits
 
 
@@ -29,7 +30,15 @@ class Throughput(NamedTuple):
 
 
 class StudyResult(NamedTuple):
-    """Results of a study: analysis, report file, messages of write errors, interrupted by Ctrl-C or not, throughput."""
+    """Outcome of `run_study`.
+
+    Args:
+        analysis: statistics of the surveys.
+        page: file of the report.
+        write_errors: messages of errors while the results were written.
+        interrupted: whether Ctrl-C ended the study.
+        throughput: number of surveys flown by this call, and their run times.
+    """
 
     analysis: StudyAnalysis
     page: Path
@@ -51,19 +60,28 @@ def run_study(
     Ctrl-C ends the study early; the results obtained until then are written.
 
     Args:
+        study: the study.
         folder: results folder, new or empty unless `resume` is set.
         resume: continue the study whose results are in the folder.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: the folder is not empty, cannot be written, or belongs to another study.
-        ScenarioError: the scenario of a sample is not valid; nothing was flown.
+        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study.
+        ScenarioError: no sample has a valid scenario; nothing was flown.
     """
-    check_samples(study)
-    log = open_folder(folder, resume, surveys(study, folder))
+    refused = refusals(study)
+    log = open_folder(folder, resume, _identities(study, folder, refused))
     done, planned = log.done(), set(survey_keys(study))
+    for row in _refused_rows(study, refused):
+        if (row["sample"], row["seed"]) not in done:
+            log.add(row)
+    done = log.done() if refused else done
+    if refused:
+        progress.tell(refusal_notice(refused))
     progress.begin(len(planned - done))
-    missing = (survey for survey in surveys(study, folder) if survey.key not in done)
+    missing = (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
     run_times_s: list[float] = []
 
     def add_row(row: Row) -> None:
@@ -74,7 +92,7 @@ def run_study(
     interrupted = not fly_surveys(study, missing, add_row, engine, progress, function)
     throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
 
-    analysis = StudyAnalysis(log.table(planned), study)
+    analysis = StudyAnalysis(log.table(planned), study, len(planned))
     page = folder / "study.html"
     write_errors = _write_errors(
         log.flush,
@@ -84,11 +102,40 @@ def run_study(
     return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
 
-def open_folder(folder: Path, resume: bool, planned: Iterable[Survey]) -> ResultsLog:
+def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
+    """Yields (sample, seed) and the scenario hash of every survey; a refused sample has an empty hash."""
+    yield from ((survey.key, survey.scenario_hash) for survey in surveys(study, folder, without=refused))
+    yield from (((row["sample"], row["seed"]), "") for row in _refused_rows(study, refused))
+
+
+def _refused_rows(study: Study, refused: dict[int, str]) -> Iterator[Row]:
+    for sample in samples(study) if refused else ():
+        if sample.number in refused:
+            yield from (refused_row(sample, seed, refused[sample.number]) for seed in seeds_of_sample(study, sample))
+
+
+def refusal_notice(refused: dict[int, str]) -> str:
+    """Returns a line with the number of refused samples, and the number and reason of the first one.
+
+    Args:
+        refused: reason of each refused sample, by sample number.
+    """
+    number, reason = min(refused.items())
+    return f"{len(refused)} samples cannot be flown and are left out, e.g. sample {number}: {reason}"
+
+
+def open_folder(folder: Path, resume: bool, planned: Iterable[tuple[tuple[int, int], str]]) -> ResultsLog:
     """Returns the results log of a new folder or, with `resume`, of the folder of an earlier run of the study.
 
+    Creates the folder if it does not exist, and deletes unfinished run folders.
+
+    Args:
+        folder: results folder.
+        resume: whether the folder may contain results.
+        planned: (sample, seed) and scenario hash of each survey of the study.
+
     Raises:
-        TwinError: the folder is not empty, cannot be written, or belongs to another study.
+        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study.
     """
     if folder.exists() and not (folder.is_dir() and (resume or not any(folder.iterdir()))):
         raise TwinError("--out", f"{folder} exists and is not empty", "a new or an empty folder, or --resume")
@@ -98,8 +145,8 @@ def open_folder(folder: Path, resume: bool, planned: Iterable[Survey]) -> Result
         raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder") from None
     log = ResultsLog(folder)
     hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
-    for survey in planned if hashes else ():
-        if hashes.get(survey.key, survey.scenario_hash) != survey.scenario_hash:
+    for key, scenario_hash in planned if hashes else ():
+        if hashes.get(key, scenario_hash) != scenario_hash:
             raise TwinError("--resume", f"{folder} contains the results of another study", "the folder of this study")
     for leftover in (folder / "runs").glob(".*"):
         shutil.rmtree(leftover, ignore_errors=True)
@@ -114,7 +161,7 @@ def fly_surveys(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> bool:
-    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C."""
+    """Flies surveys and calls `add_row` with the row of each; returns False if Ctrl-C ended it early, else True."""
     try:
         for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
             row = row_of_outcome(outcome)
@@ -126,13 +173,13 @@ def fly_surveys(
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
-    """Returns the row of a survey from the outcome of its task; a failed task gives a row with status "failed"."""
+    """Returns the row of a survey from the outcome of its task, with status "failed" if the task failed."""
     row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
     return row | {"timing.attempts": outcome.attempts}
 
 
 def _write_errors(*writes: Callable[[], object]) -> list[str]:
-    """Calls every function, even if an earlier one failed, and returns the messages of their OSErrors."""
+    """Calls every function, even if an earlier one raised an OSError, and returns the messages of these errors."""
     errors = []
     for write in writes:
         try:

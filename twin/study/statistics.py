@@ -8,24 +8,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
+from scipy import stats
+from scipy.special import ndtri
 
 Array = NDArray[np.float64]
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
 _MIN_CLUSTERS = 5  # smallest number of clusters for a bootstrap interval
-_MAX_DISCRETE = 12  # largest number of distinct values of a key to be grouped by value; other keys are binned
+_MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value; other keys are binned
 
 
 class Interval(NamedTuple):
-    """An estimate with the bounds of its confidence interval; NaN where there are too few data."""
+    """An estimate with the bounds of its confidence interval; a number is NaN if there are too few data for it."""
 
     value: float
     low: float
     high: float
 
 
-def wilson_interval(successes: float, n: float) -> Interval:
+def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interval:
     """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
     (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n)
@@ -33,13 +34,15 @@ def wilson_interval(successes: float, n: float) -> Interval:
     Args:
         successes: number of successes.
         n: number of trials, or effective number of trials.
+        level: confidence level.
     """
     if n <= 0:
         return Interval(np.nan, 0.0, 1.0)
-    z, p = float(stats.norm.ppf(0.5 + LEVEL / 2)), successes / n
+    z, p = float(ndtri(0.5 + level / 2)), successes / n
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    return Interval(p, max(0.0, float(centre - half)), min(1.0, float(centre + half)))
+    low, high = float(max(0.0, centre - half)), float(min(1.0, centre + half))
+    return Interval(p, low if p > 0 else 0.0, high if p < 1 else 1.0)  # exact bounds at 0 and 1
 
 
 def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
@@ -55,15 +58,49 @@ def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
         clusters: (n,) cluster label of each survey, i.e. its sample or its seed.
     """
     success = np.asarray(passed, dtype=float)
+    if len(success) == 0:
+        return wilson_interval(0, 0)
+    effective = effective_number(success, clusters)
+    return wilson_interval(float(success.mean()) * effective, effective)
+
+
+def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
+    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`."""
+    success = np.asarray(passed, dtype=float)
     labels, index = np.unique(np.asarray(clusters), return_inverse=True)
     n, k = len(success), len(labels)
     if n == 0 or n == k:
-        return wilson_interval(float(success.sum()), n)
+        return float(n)
     p = float(success.mean())
     residual = np.bincount(index, success - p)
     variance = float((residual**2).sum()) / n**2 * k / max(k - 1, 1)
-    effective = min(max(p * (1 - p) / variance, k), n) if variance > 0 else k
-    return wilson_interval(p * effective, effective)
+    return float(min(max(p * (1 - p) / variance, k), n) if variance > 0 else k)
+
+
+def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, level: float = LEVEL) -> float:
+    """Returns the number of further surveys after which Wilson's interval would exclude the required proportion r.
+
+    For n effective surveys and an observed proportion p, the interval contains r if (p - r)^2 <= z^2 r (1 - r) / n,
+    with z the normal quantile of the confidence level. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
+    surveys are therefore needed.
+
+    Args:
+        passed: (n,) whether each survey passed.
+        clusters: (n,) cluster label of each survey.
+        required: required proportion r, 0 to 1.
+        level: confidence level of the interval.
+
+    Returns:
+        The number of surveys; infinite if p equals r, if r is 1, or if no survey is given.
+    """
+    success = np.asarray(passed, dtype=float)
+    difference = float(success.mean()) - required if len(success) else 0.0
+    if difference == 0 or required >= 1:
+        return float("inf")
+    z = float(ndtri(0.5 + level / 2))
+    effective = effective_number(success, clusters)
+    needed = z**2 * required * (1 - required) / difference**2
+    return float(np.ceil(max(needed - effective, 1.0) * len(success) / effective))
 
 
 def bootstrap_interval(
@@ -77,7 +114,8 @@ def bootstrap_interval(
         clusters: (n,) label of the cluster of each value; None if the values are independent.
 
     Returns:
-        The statistic with its interval; the bounds are NaN with fewer than five clusters.
+        The statistic with its interval. The bounds are NaN if there are fewer than five clusters, or if both bounds are
+        equal: data without variation do not show how much further data would vary.
     """
     data = np.asarray(values, dtype=float)
     table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
@@ -94,6 +132,8 @@ def bootstrap_interval(
         (np.arange(len(table)),), of_clusters, n_resamples=RESAMPLES, batch=max(1, 2_000_000 // table.size),
         vectorized=True, confidence_level=LEVEL, method="percentile", rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
+    if bounds.low == bounds.high:
+        return Interval(value, np.nan, np.nan)
     return Interval(value, float(bounds.low), float(bounds.high))
 
 
@@ -138,10 +178,10 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
 def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
     """Returns the fraction of the variance of the ranks of y that the groups explain, corrected for chance.
 
-    It is epsilon squared (Kelley 1935), an estimate of the first-order Sobol index of the ranks:
+    The result is epsilon squared (Kelley 1935), an estimate of the first-order Sobol index of the ranks:
     1 - (within / (n - k)) / (total / (n - 1)) for n values in k groups, where `within` is the sum of squared deviations
     of the ranks from their group means, and `total` the sum of squared deviations from the overall mean.
-    Returns NaN if there are fewer than five values per group on average, only one group, or a constant y.
+    It is at least 0, and NaN if there are fewer than five values per group on average, only one group, or a constant y.
 
     Args:
         groups: (n,) group of each value.
@@ -160,7 +200,7 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
 class SobolIndex(NamedTuple):
     """First-order and total Sobol index of one sampled axis.
 
-    They are the fractions of a metric's variance that the axis explains, without and with its interactions.
+    They are the fractions of a metric's variance that the axis explains alone, and together with its interactions.
     """
 
     first: Interval
@@ -170,7 +210,7 @@ class SobolIndex(NamedTuple):
 def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals.
 
-    The estimator is that of `scipy.stats.sobol_indices`.
+    Uses the estimator of `scipy.stats.sobol_indices`.
 
     Args:
         values: (n (n_axes + 2),) metric at the design points of the blocks A, B, AB_1, AB_2, ...
@@ -190,50 +230,13 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     return [SobolIndex(interval("first_order", k), interval("total_order", k)) for k in range(n_axes)]
 
 
-def threshold(x: ArrayLike, passed: ArrayLike, probability: float, rising: bool, clusters: ArrayLike) -> Interval:
-    """Returns the value of x at which the pass probability crosses `probability`, with its bootstrap interval.
-
-    The pass probability is estimated as a monotone function of x by isotonic regression (Barlow et al. 1972).
-
-    Args:
-        x: (n,) value of the key for each survey.
-        passed: (n,) whether each survey passed.
-        probability: pass probability at the threshold.
-        rising: whether the pass probability increases with x.
-        clusters: (n,) cluster label of each survey.
-
-    Returns:
-        The threshold: infinite if there is no crossing within the range of x, NaN with fewer than five clusters.
-    """
-    sign, success = 1.0 if rising else -1.0, np.asarray(passed, float)
-    _, cluster = np.unique(np.asarray(clusters), return_inverse=True)
-    values, index = np.unique(sign * np.asarray(x, float), return_inverse=True)
-    n_clusters = cluster.max(initial=-1) + 1
-    if n_clusters < _MIN_CLUSTERS:
-        return Interval(np.nan, np.nan, np.nan)
-
-    def crossing(weight: Array) -> float:
-        total = np.bincount(index, weight)
-        used = total > 0
-        fit = optimize.isotonic_regression(
-            np.bincount(index, weight * success)[used] / total[used], weights=total[used]
-        ).x
-        first = int(np.searchsorted(fit, probability - 1e-9))
-        if first in (0, len(fit)):
-            return -np.inf if first == 0 else np.inf
-        return float(values[used][first - 1 : first + 1].mean())
-
-    rng = np.random.default_rng(0)
-    counts = rng.multinomial(n_clusters, np.full(n_clusters, 1 / n_clusters), size=RESAMPLES).astype(float)
-    crossings = [crossing(count[cluster]) for count in counts]
-    low, high = sorted(sign * np.quantile(crossings, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2], method="inverted_cdf"))
-    return Interval(sign * crossing(np.ones(len(success))), float(low), float(high))
-
-
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
-    """Returns the group index of each number: one group per distinct value if there are few, else two to ten bins.
+    """Returns the group index (n,) of each number: one group per distinct value if there are few, else 2 to 10 bins.
 
     All bins have about the same number of elements.
+
+    Args:
+        x: (n,) numbers.
     """
     values = np.asarray(x, dtype=float)
     distinct, index = np.unique(values, return_inverse=True)
@@ -246,7 +249,7 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
 def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
     """Returns the probability that a value of x exceeds a value of y, with ties counting half; NaN if x or y is empty.
 
-    It is U / (n_x n_y), with the statistic U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
+    It is U / (n_x n_y) for n_x and n_y values, with the statistic U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
     """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) == 0 or len(b) == 0:

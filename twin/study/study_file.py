@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
+from twin.core.paths import is_file
 from twin.errors import ScenarioError, TwinError
 from twin.judge.metrics import empty_metrics
 from twin.judge.require import check_metric_names
-from twin.scenario.file import find_scene, load_scenario, read_toml, validated
+from twin.scenario.file import find_scene, load_scenario, read_toml, shown, validated
 from twin.scenario.model import Section, Source
 from twin.study.distribution import KINDS, Distribution
 
 SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
+#: Largest number of surveys of a study; limited because all scenarios are validated before the first survey is flown.
+MAX_SURVEYS = 100_000
 DEFAULT_METRICS = (
-    "trajectory.final.ate_rmse_m", "map.le90_m", "map.completeness", "vision.points_median", "vision.contrast_median",
+    "trajectory.final.ate_rmse_m", "map.le90_area_m", "map.completeness_area", "map.le90_m", "map.completeness",
+    "vision.points_median", "vision.contrast_median",
 )  # fmt: skip
 
 
@@ -58,14 +63,14 @@ class SamplingConfig(Section):
 
 
 class TuningConfig(Section):
-    """Search of `twin tune`: every survey of the study is flown with each candidate plan."""
+    """Search of `twin tune`, which flies every survey of the study with each candidate plan."""
 
     search: Annotated[dict[str, Distribution], Field(min_length=1)] = Field(
-        description="keys of the scenario to optimise: each uniform, log_uniform or choice"
+        description="keys of the scenario to optimise, each with a range (uniform, log_uniform) or values (choice)"
     )
     objectives: Annotated[tuple[str, ...], Field(min_length=1, max_length=4)] = Field(
         description="metrics whose median is optimised, and `risk`, the fraction of surveys that do not pass; the "
-        "first one selects among the Pareto-optimal plans"
+        "first duration among them, else the first one, is the cost: the cheapest Pareto-optimal plan is recommended"
     )
     trials: int = Field(default=64, ge=1, le=100_000, description="number of candidates")
     batch: int = Field(
@@ -73,6 +78,27 @@ class TuningConfig(Section):
     )
     confirm: int = Field(
         default=4, ge=1, le=1000, description="factor on the number of surveys when a finalist is flown with new seeds"
+    )
+    verify: int = Field(
+        default=3,
+        ge=0,
+        le=1000,
+        description="rendered surveys of a plan, all of which must pass before it is recommended, if the search uses "
+        "the surrogate; 0: the recommended plan is not verified",
+    )
+    plans: int = Field(default=3, ge=1, le=100, description="largest number of plans flown rendered in a round")
+    rounds: int = Field(
+        default=2,
+        ge=0,
+        le=10,
+        description="largest number of further rounds of search while no plan passes rendered; in these rounds the "
+        "surrogate's results are corrected by those of the rendered surveys",
+    )
+    keep: KeepLevel | None = Field(
+        default=None, description="files to keep of rendered surveys; default: `keep` of the study"
+    )
+    timeout_s: float = Field(
+        default=7200.0, gt=0, le=1e7, description="run time after which a rendered survey counts as failed [s]"
     )
 
 
@@ -87,10 +113,12 @@ class Study(Section):
         description="a varied numeric key: estimate the value at which the pass probability equals require.probability",
     )
     keep: KeepLevel = Field(default="metrics", description="files to keep of each run")
-    timeout_s: float = Field(default=3600.0, gt=0, le=1e7, description="a survey that takes longer has failed [s]")
+    timeout_s: float = Field(
+        default=3600.0, gt=0, le=1e7, description="run time after which a survey counts as failed [s]"
+    )
     retries: int = Field(default=2, ge=0, le=100, description="retries if the process of a survey was killed")
     show: tuple[str, ...] = Field(
-        default=DEFAULT_METRICS, description="metrics of the report, in addition to those required"
+        default=DEFAULT_METRICS, description="metrics shown in the report, in addition to those with a limit"
     )
     set: dict[str, Any] = Field(default={}, description="keys of the scenario that have a fixed value in this study")
     vary: dict[str, Distribution] = Field(default={}, description="distribution of each varied key of the scenario")
@@ -115,7 +143,7 @@ class Study(Section):
 
     @property
     def probability(self) -> float | None:
-        """Returns the required pass probability, or None."""
+        """Returns the required pass probability; None if the study does not set one."""
         return self.require.get("probability")
 
     @property
@@ -127,11 +155,11 @@ class Study(Section):
     def scenario_file(self) -> Path:
         """Returns the path of the scenario file whose keys the study varies."""
         relative = self.source.path.parent / self.scenario
-        return find_scene(relative if relative.is_file() else self.scenario)
+        return find_scene(relative if is_file(relative) else self.scenario)
 
 
 def load_study(path: str | Path) -> Study:
-    """Reads a study file.
+    """Reads and validates a study file and the scenario file that it names.
 
     Args:
         path: a file, or a name in scenes/studies/.
@@ -163,20 +191,20 @@ def find_study(path: str | Path) -> Path:
         path: a file, or a name in scenes/studies/.
 
     Raises:
-        ScenarioError: neither exists.
+        ScenarioError: there is neither such a file nor such a name.
     """
     import scenes
 
     folder = Path(scenes.__file__).parent / "studies"
     for file in (Path(path), folder / f"{path}.toml"):
-        if file.is_file():
+        if is_file(file):
             return file
     names = ", ".join(sorted(file.stem for file in folder.glob("*.toml")))
-    raise ScenarioError([f"{path}: no such study (allowed: a file, or one of {names})"])
+    raise ScenarioError([f"{shown(str(path))}: no such study (allowed: a file, or one of {names})"])
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the dotted keys of nested tables with their values; a table that defines a distribution is a value."""
+    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")
@@ -185,7 +213,7 @@ def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _errors(study: Study) -> Iterable[TwinError]:
-    """Yields the errors that the validation of single fields does not find."""
+    """Yields the errors that involve several fields, which pydantic's validation of each field does not find."""
     yield from _key_errors(study)
     yield from _table_errors(study)
     yield from _sampling_errors(study)
@@ -242,9 +270,23 @@ def _sampling_errors(study: Study) -> Iterable[TwinError]:
     elif sampling.method in ("sobol", "saltelli") and sampling.samples & (sampling.samples - 1):
         power = 1 << sampling.samples.bit_length()
         yield TwinError("sampling.samples", f"{sampling.samples} is not a power of 2", f"a power of 2, e.g. {power}")
+    if (n_surveys := n_planned_surveys(study)) > MAX_SURVEYS:
+        remedy = "fewer sampling.samples, sampling.seeds or values of grids"
+        yield TwinError("sampling", f"{n_surveys} surveys are too many", f"up to {MAX_SURVEYS}: {remedy}")
     if sampling.method == "saltelli":
         for key in study.vary.keys() - set(sampled):
             yield TwinError(f"vary.{key}", "a grid has no Sobol index", "choice, or another sampling.method")
+
+
+def n_planned_surveys(study: Study) -> int:
+    """Returns the number of surveys of a study, without enumerating them."""
+    sampling = study.sampling
+    is_grid = sampling.method == "grid"
+    cells = math.prod(len(d.values) for d in study.vary.values() if is_grid or not d.is_sampled)
+    tables = math.prod(len(table.rows) for table in study.together) if is_grid else 1
+    n_axes = sum(d.is_sampled for d in study.vary.values()) + len(study.together)
+    points = (sampling.samples or 1) * (n_axes + 2 if sampling.method == "saltelli" else 1)
+    return (1 if is_grid else points) * cells * tables * sampling.seeds
 
 
 def _metric_errors(study: Study) -> Iterable[TwinError]:

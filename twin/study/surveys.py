@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,17 @@ _MAX_ERRORS = 20
 
 
 class Survey(NamedTuple):
-    """One survey of a study: sample, seed, varied values, scenario with its hash, run folder, and files to keep."""
+    """One survey of a study.
+
+    Args:
+        sample: number of the sample.
+        seed: seed of the survey.
+        values: values of the varied keys.
+        scenario: scenario with these values and this seed.
+        scenario_hash: fingerprint of the scenario.
+        folder: run folder.
+        keep: which files of the run folder to keep; see `flight.KEPT_FILES`.
+    """
 
     sample: int
     seed: int
@@ -33,7 +43,7 @@ class Survey(NamedTuple):
 
 
 class SampleSource(Source):
-    """Source of a sampled scenario: reports an error with the line of the study file that sets the key."""
+    """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key."""
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file
@@ -51,17 +61,18 @@ class SampleSource(Source):
         return f"{super().describe(in_study)} in sample {self.sample}"
 
 
-def surveys(study: Study, folder: Path) -> Iterator[Survey]:
+def surveys(study: Study, folder: Path, without: Container[int] = ()) -> Iterator[Survey]:
     """Yields every survey of the study, sample by sample.
 
     Args:
         folder: results folder of the study; the run folders are created in its subfolder `runs`.
+        without: numbers of the samples to leave out.
 
     Raises:
         ScenarioError: the scenario of a sample is not valid.
     """
     base = read_tree(study.scenario_file)
-    for sample in samples(study):
+    for sample in (sample for sample in samples(study) if sample.number not in without):
         yield from surveys_of_sample(study, folder, sample, scenario_of_sample(study, base, sample))
 
 
@@ -79,10 +90,12 @@ def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
 
 
 def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) -> Scenario:
-    """Returns the scenario of a sample.
+    """Returns the validated scenario of a sample.
 
     Args:
-        base: keys and values of the scenario that the study varies.
+        study: the study.
+        base: contents of the study's scenario file.
+        sample: the sample, whose values replace those of `base`.
 
     Raises:
         ScenarioError: lists every error of the scenario, each with a line of the study file.
@@ -93,24 +106,28 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
     return with_values(tree, study.set | sample.values, source)
 
 
-def check_samples(study: Study) -> None:
-    """Validates the scenario of every sample.
+def refusals(study: Study) -> dict[int, str]:
+    """Returns the errors of each sample whose scenario is not valid, as one text per sample number.
 
     Raises:
-        ScenarioError: lists the errors of all samples, each key once.
+        ScenarioError: no sample is valid; lists the errors of all samples, each key once.
     """
-    base, errors = read_tree(study.scenario_file), []
+    base, refused, errors, count = read_tree(study.scenario_file), {}, [], 0
     for sample in samples(study):
+        count += 1
         try:
             scenario_of_sample(study, base, sample)
         except ScenarioError as error:
+            refused[sample.number] = "; ".join(error.lines)
             errors += error.lines
-    if errors:
-        raise ScenarioError(merge_errors(errors))
+    if len(refused) == count:
+        none = f"{study.source.path}: none of the {count} samples can be flown; nothing was flown"
+        raise ScenarioError([*merge_errors(errors), none])
+    return refused
 
 
 def merge_errors(errors: Iterable[str]) -> list[str]:
-    """Returns one error per line and key of the study file, with the number of further errors of the same key.
+    """Returns the first error of each line and key of the study file, with the number of further errors of that key.
 
     The list is limited to 20 keys; its last line states how many were left out.
     """

@@ -1,75 +1,91 @@
-"""Search for a survey plan.
-
-All candidates are flown with the same samples and seeds; finalists are evaluated again with new samples and seeds.
-"""
+"""Search for a survey plan with the surrogate; rendered surveys verify the cheapest plans before one is recommended."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from twin.errors import ScenarioError, TwinError
-from twin.judge.require import more_is_better
-from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
-from twin.study.design import Sample, samples
+from twin.study.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
+from twin.study.correction import PlanCorrection, correction_at
 from twin.study.engine import Engine
-from twin.study.flight import Row, fly, has_passed
+from twin.study.flight import Row, fly
 from twin.study.progress import StudyProgress
-from twin.study.results_log import write_parquet
+from twin.study.results_log import ResultsLog, write_parquet
 from twin.study.runner import fly_surveys, open_folder
 from twin.study.search import Search
-from twin.study.statistics import Interval, wilson_interval
 from twin.study.study_file import Study, TuningConfig
-from twin.study.surveys import Survey, merge_errors, scenario_of_sample, survey_keys, surveys_of_sample
-
-_DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
-_SEED_OFFSET = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
-_PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna does not accept infinity
-
-
-class SurveyScore(NamedTuple):
-    """Part of a survey's result that the search uses: status, whether it passed, and the metrics to optimise."""
-
-    status: str
-    passed: bool
-    metrics: dict[str, float | None]
-
-
-class Candidate(NamedTuple):
-    """An evaluated plan: trial number, value of each searched key, objectives, pass probability and its shortfall."""
-
-    number: int
-    values: dict[str, Any]
-    objectives: tuple[float, ...]
-    pass_probability: Interval
-    shortfall: float  #: required minus achieved pass probability; 0 or negative if the plan is feasible
-
-    @property
-    def has_metrics(self) -> bool:
-        """Returns whether every objective has a value, which requires at least one completed survey."""
-        return max(abs(value) for value in self.objectives) < _PENALTY
+from twin.study.surveys import Survey
+from twin.study.verification import Verification, expected_time, verification_of
 
 
 class TuningResult(NamedTuple):
     """Result of a search.
 
     Args:
-        candidates: all evaluated plans.
-        finalists: plans that were evaluated again with new samples and seeds.
-        recommended: the feasible finalist with the best first objective; None if there is none.
+        candidates: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if
+            any were flown.
+        finalists: plans that were evaluated again with new samples and seeds, without correction.
+        verifications: plans that were verified by rendered surveys, in the order of flight.
+        recommended: the cheapest plan that passed rendered or, if plans are not verified, the cheapest plan confirmed
+            with new samples and seeds; None if there is none or the search was interrupted.
         scenario: scenario of the recommended plan.
         interrupted: whether Ctrl-C ended the search.
+        needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
+        warnings: for each warning, the number of the finalists' surveys that have it.
     """
 
     candidates: list[Candidate]
     finalists: list[Candidate]
+    verifications: list[Verification]
     recommended: Candidate | None
     scenario: Scenario | None
     interrupted: bool
+    needs_rendering: bool
+    warnings: dict[str, int]
+
+    @property
+    def recommended_verification(self) -> Verification | None:
+        """Returns the verification of the recommended plan; None if it was not verified or there is no plan."""
+        chosen = self.recommended
+        return next((v for v in self.verifications if chosen and v.surrogate.number == chosen.number), None)
+
+
+class TuningFlights(NamedTuple):
+    """Runs the surveys of a search and logs their results.
+
+    Args:
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+        function: flies one survey.
+        log: log of the results.
+    """
+
+    engine: Engine
+    progress: StudyProgress
+    function: Callable[[Survey], Row]
+    log: ResultsLog
+
+    def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
+        """Flies the surveys of some plans that have no result yet.
+
+        Args:
+            surveys: the surveys of all plans; the new results are added to it.
+            plans: values of the searched keys, by number of the plan.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
+        """
+
+        def add_row(row: Row) -> None:
+            self.log.add(row)
+            surveys.add(row)
+
+        missing = list(surveys.missing(plans))
+        self.progress.begin(self.progress.total + len(missing))
+        if missing and not fly_surveys(surveys.study, missing, add_row, self.engine, self.progress, self.function):
+            raise KeyboardInterrupt
 
 
 def tune(
@@ -83,176 +99,160 @@ def tune(
     """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
+        study: the study.
         folder: results folder, new or empty unless `resume` is set.
-        resume: continue the search whose results are in the folder; its surveys are not flown again.
+        resume: continue the search whose results are in the folder; surveys with a result are not flown again.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: the study has no [tune]; the folder is not empty, cannot be written, or belongs to another search.
-        ScenarioError: the scenario is invalid at a bound of the search; nothing was flown.
+        TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, cannot be written,
+            or belongs to another search.
+        ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
     """
     config = tuning_config(study)
     check_bounds(study, config)
     log = open_folder(folder, resume, ())
-    trial_surveys = CandidateSurveys(study, config, folder, log.rows())
-
-    def fly_candidates(plan_surveys: CandidateSurveys, candidates: dict[int, dict[str, Any]]) -> bool:
-        def add_row(row: Row) -> None:
-            log.add(row)
-            plan_surveys.add(row)
-
-        return fly_surveys(study, plan_surveys.missing(candidates), add_row, engine, progress, function)
-
-    search, interrupted = Search(study, config, folder), False
-    progress.begin(config.trials * trial_surveys.n_surveys)
-    while not interrupted and (batch := search.next_batch()):
-        interrupted = not fly_candidates(trial_surveys, {p.number: p.values for p in batch})
-        for proposal in batch if not interrupted else ():
-            candidate = trial_surveys.evaluate(proposal.number, proposal.values)
-            search.record(proposal, candidate.objectives, candidate.shortfall)
-    candidates = [trial_surveys.evaluate(number, values) for number, values in search.finished()]
-
-    confirmation, finalists, recommended = trial_surveys.confirmation(log.rows()), [], None
-    front = pareto_front(candidates, config)
-    first, end = 0, len(front)
-    while first < end and not interrupted:  # bisection: a better first objective usually has a lower pass probability
-        middle = (first + end) // 2
-        chosen = front[middle]
-        progress.begin(progress.total + confirmation.n_surveys)
-        if interrupted := not fly_candidates(confirmation, {chosen.number: chosen.values}):
-            break
-        finalists.append(confirmation.evaluate(chosen.number, chosen.values))
-        if finalists[-1].shortfall <= 0:
-            recommended, end = finalists[-1], middle
-        else:
-            first = middle + 1
-    scenario = trial_surveys.scenario(recommended) if recommended else None
+    tuning = Tuning(study, config, folder, TuningFlights(engine, progress, function, log))
+    interrupted = False
+    try:
+        tuning.run()
+    except KeyboardInterrupt:
+        interrupted = True
     log.flush()
     write_parquet(log.table(), folder / "results.parquet")
-    return TuningResult(candidates, finalists, recommended, scenario, interrupted)
+    return tuning.result(interrupted)
 
 
-def tuning_config(study: Study) -> TuningConfig:
-    """Returns the section [tune] of a study.
+class Tuning:
+    """State of a search: evaluated plans, finalists, and verifications with the corrections derived from them."""
 
-    Raises:
-        TwinError: the study has no section [tune].
-    """
-    if study.tune is None:
-        raise TwinError(str(study.source.path), "has no section [tune]", "a study with a section [tune]")
-    return study.tune
+    def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
+        self.study, self.config, self.folder, self.flights = study, config, folder, flights
+        self.trials = CandidateSurveys(study, config, folder, flights.log.rows())
+        self.confirmation = self.trials.confirmation(flights.log.rows())
+        self.rendered = self.trials.rendered(flights.log.rows())
+        self.needs_rendering = self.trials.uses_surrogate
+        self.plans: dict[int, dict[str, Any]] = {}
+        self.finalists: dict[int, Candidate] = {}
+        self.verifications: dict[int, Verification] = {}
+        self.confirmed: Candidate | None = None
 
+    def run(self) -> None:
+        """Runs the rounds of the search until a plan can be recommended, or the rounds are used up.
 
-def required_probability(study: Study) -> float:
-    """Returns the pass probability that a plan must reach."""
-    return _DEFAULT_PROBABILITY if study.probability is None else study.probability
+        Each round evaluates candidates, confirms the cheapest plan with new seeds, and flies it rendered.
 
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed.
+        """
+        for search_round in range(1 + self.config.rounds):
+            self._search(search_round)
+            self._verify_front(search_round)
+            if self.recommended or not self.verifications:
+                return
 
-class CandidateSurveys:
-    """Surveys of the candidates, with the results obtained so far.
+    @property
+    def recommended(self) -> Candidate | None:
+        """Returns the cheapest plan that passed rendered or, if plans are not verified, the cheapest confirmed plan."""
+        if not self.is_verifying:
+            return self.confirmed
+        passed = [v.surrogate._replace(shortfall=0.0) for v in self.verifications.values() if v.passed]
+        return next(iter(pareto_front(passed, self.config)), None)
 
-    All candidates are flown with the same samples and seeds, those of the study.
-    """
+    @property
+    def is_verifying(self) -> bool:
+        """Returns whether rendered surveys verify plans before one is recommended."""
+        return self.needs_rendering and self.config.verify > 0
 
-    def __init__(self, study: Study, config: TuningConfig, folder: Path, rows: Iterable[Row]):
-        self.study, self.config, self.folder = study, config, folder
-        self.base, self.conditions = read_tree(study.scenario_file), list(samples(study))
-        self.n_surveys = len(list(survey_keys(study)))
-        self._scores: dict[tuple[int, int], SurveyScore] = {}
-        for row in rows:
-            self.add(row)
+    def result(self, interrupted: bool) -> TuningResult:
+        """Returns the result of the search; an interrupted search recommends no plan."""
+        recommended = None if interrupted else self.recommended
+        return TuningResult(
+            self._candidates(),
+            list(self.finalists.values()),
+            list(self.verifications.values()),
+            recommended,
+            self.trials.scenario(recommended) if recommended else None,
+            interrupted,
+            self.needs_rendering,
+            self.confirmation.warnings(self.finalists.values()),
+        )
 
-    def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the surveys that confirm a finalist: `confirm` times as many, with new samples and seeds.
+    def _search(self, search_round: int) -> None:
+        """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
+        search = Search(self.study, self.config, self.folder, search_round)
+        if search_round:
+            search.learn((c.values, c.objectives, c.shortfall) for c in self._candidates())
+        while batch := search.next_batch():
+            self.flights.fly(self.trials, {proposal.number: proposal.values for proposal in batch})
+            for proposal in batch:
+                candidate = self._evaluate(self.trials, proposal.number, proposal.values)
+                search.record(proposal, candidate.objectives, candidate.shortfall)
+        self.plans |= dict(search.finished())
+
+    def _verify_front(self, search_round: int) -> None:
+        """Flies the cheapest confirmed plan rendered, corrects the predictions of all plans by the result, and repeats.
+
+        Ends when the cheapest confirmed plan has already passed rendered, when no plan is confirmed, or after
+        `config.plans` plans.
+        """
+        for k in range(self.config.plans):
+            self.confirmed = chosen = self._cheapest_confirmed()
+            if chosen is None or not self.is_verifying or chosen.number in self.verifications:
+                return
+            self._announce(chosen, (self.config.rounds - search_round + 1) * self.config.plans - k)
+            self.flights.fly(self.rendered, {chosen.number: chosen.values})
+            surrogate = self.finalists[chosen.number]
+            verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
+            self.verifications[chosen.number] = verification
+            self.flights.progress.tell(verification.notice())
+
+    def _announce(self, plan: Candidate, most_plans: int) -> None:
+        """Prints how many rendered surveys of a plan are to be flown, and their expected run time.
 
         Args:
-            rows: rows of the surveys flown so far.
+            plan: the plan.
+            most_plans: largest number of plans still to be verified in the search, including this one.
         """
-        sampling = self.study.sampling
-        count = "seeds" if sampling.samples is None else "samples"
-        update = {"seed": sampling.seed + _SEED_OFFSET, count: (getattr(sampling, count) or 1) * self.config.confirm}
-        study = self.study.model_copy(update={"sampling": sampling.model_copy(update=update)})
-        return CandidateSurveys(study, self.config, self.folder, rows)
+        if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
+            times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
+            self.flights.progress.tell(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
 
-    def add(self, row: Row) -> None:
-        """Adds the result of a survey."""
-        metrics = {name: row.get(name) for name in self.config.objectives}
-        self._scores[row["sample"], row["seed"]] = SurveyScore(row["status"], has_passed(row), metrics)
+    def _cheapest_confirmed(self) -> Candidate | None:
+        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
 
-    def surveys(self, number: int, values: dict[str, Any]) -> Iterator[Survey]:
-        """Yields the surveys of a candidate.
-
-        Args:
-            number: trial number of the candidate.
-            values: value of each searched key.
+        Bisects the front, as a more expensive plan usually has a higher pass probability; flies the surveys it needs.
+        Returns None if no plan that it tried reaches the required pass probability.
         """
-        for condition in self.conditions:
-            index = number * len(self.conditions) + condition.number
-            sample = Sample(index, condition.point, values | condition.values)
-            scenario = scenario_of_sample(self.study, self.base, sample)
-            yield from surveys_of_sample(self.study, self.folder, sample, scenario)
+        front, found = pareto_front(self._candidates(), self.config), None
+        first, end = 0, len(front)
+        while first < end:
+            middle = (first + end) // 2
+            number, values = front[middle].number, front[middle].values
+            self.flights.fly(self.confirmation, {number: values})
+            self.finalists[number] = self.confirmation.evaluate(number, values)
+            confirmed = self._evaluate(self.confirmation, number, values)
+            if confirmed.shortfall <= 0:
+                found, end = confirmed, middle
+            else:
+                first = middle + 1
+        return found
 
-    def missing(self, candidates: dict[int, dict[str, Any]]) -> Iterator[Survey]:
-        """Yields the surveys of the candidates (values by trial number) that have not been flown or have failed."""
-        for number, values in candidates.items():
-            for survey in self.surveys(number, values):
-                if survey.key not in self._scores or self._scores[survey.key].status == "failed":
-                    yield survey
+    def _candidates(self) -> list[Candidate]:
+        """Returns all candidates evaluated so far, corrected by the rendered surveys."""
+        return [self._evaluate(self.trials, number, values) for number, values in self.plans.items()]
 
-    def evaluate(self, number: int, values: dict[str, Any]) -> Candidate:
-        """Returns a candidate with its objectives and pass probability; surveys that failed are not counted.
+    def _evaluate(self, surveys: CandidateSurveys, number: int, values: dict[str, Any]) -> Candidate:
+        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans.
 
-        Args:
-            number: trial number of the candidate.
-            values: value of each searched key.
+        If the plan itself was verified by rendered surveys, these alone determine whether it is feasible.
         """
-        flown = [self._scores[survey.key] for survey in self.surveys(number, values)]
-        scores = [score for score in flown if score.status != "failed"]
-        passing = wilson_interval(sum(score.passed for score in scores), len(scores))
-        shortfall = required_probability(self.study) - passing.value if scores else 1.0
-        objectives = tuple(self._objective(name, scores) for name in self.config.objectives)
-        return Candidate(number, values, objectives, passing, shortfall)
+        candidate = surveys.evaluate(number, values, self._correction(values))
+        if (verification := self.verifications.get(number)) is None:
+            return candidate
+        return candidate._replace(shortfall=min(candidate.shortfall, 0.0) if verification.passed else 1.0)
 
-    def _objective(self, name: str, scores: list[SurveyScore]) -> float:
-        """Returns an objective: the risk, or the median of a metric over the completed surveys."""
-        if name == "risk":
-            return 1.0 - sum(score.passed for score in scores) / len(scores) if scores else 1.0
-        complete = [score.metrics[name] for score in scores if score.status == "complete"]
-        known = [value for value in complete if value is not None]
-        return float(np.median(known)) if known else -_PENALTY if more_is_better(name) else _PENALTY
-
-    def scenario(self, candidate: Candidate) -> Scenario:
-        """Returns the scenario of the study with the plan of a candidate; varied keys keep their original values."""
-        return scenario_of_sample(self.study, self.base, Sample(0, 0, candidate.values))
-
-
-def check_bounds(study: Study, config: TuningConfig) -> None:
-    """Validates the scenario at both bounds, or at all listed values, of each searched key.
-
-    Raises:
-        ScenarioError: lists all errors, each key once.
-    """
-    base, errors = read_tree(study.scenario_file), []
-    condition = next(samples(study))
-    for key, distribution in config.search.items():
-        for value in distribution.values:
-            try:
-                scenario_of_sample(study, base, condition._replace(values={key: value} | condition.values))
-            except ScenarioError as error:
-                errors += error.lines
-    if errors:
-        raise ScenarioError(merge_errors(errors))
-
-
-def pareto_front(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
-    """Returns the Pareto-optimal candidates among the feasible ones, sorted by the first objective, best first."""
-    feasible = [candidate for candidate in candidates if candidate.shortfall <= 0]
-    signs = np.array([-1.0 if more_is_better(name) else 1.0 for name in config.objectives])
-    front = [one for one in feasible if not any(_dominates(other, one, signs) for other in feasible)]
-    return sorted(front, key=lambda one: (tuple(signs * one.objectives), one.number))
-
-
-def _dominates(one: Candidate, other: Candidate, signs: Any) -> bool:
-    """Returns whether `one` is better than `other` in some objective and worse in none."""
-    a, b = signs * one.objectives, signs * other.objectives
-    return bool((a <= b).all() and (a < b).any())
+    def _correction(self, values: dict[str, Any]) -> PlanCorrection:
+        return correction_at(self.config.search, [v.ratio for v in self.verifications.values()], values)

@@ -19,10 +19,16 @@ from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
 from twin.study import wording
+from twin.study.candidates import Candidate, pareto_front, required_probability
 from twin.study.figures import axis_label, log_axis, make_panels, spans_decades, unit_axis
 from twin.study.study_file import Study, TuningConfig
-from twin.study.tuning import Candidate, TuningResult, pareto_front, required_probability
+from twin.study.tuning import TuningResult
+from twin.study.verification import Verification
 
+NOT_VERIFIED = (
+    "Not verified: the plan was not flown rendered (verify = 0), and the surrogate's prediction may not hold."
+)
+_LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
 FRONT, FEASIBLE, INFEASIBLE = COLOURS["final"], COLOURS["link"], COLOURS["f2f"]
 
 
@@ -43,6 +49,7 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
         "front": pareto_front(result.candidates, config),
         "wording": wording,
         "headline": headline(study, config, result),
+        "warnings": warnings(result),
         "figures": figures,
         "recommended": recommended_toml(study, config, result),
         "text": study.source.path.read_text(encoding="utf-8"),
@@ -56,47 +63,130 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
 def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
     """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
     count = f"{len(result.candidates)} plans were evaluated"
+    if flown := len(result.verifications):
+        count += f", {flown} of them also flown rendered"
     if (chosen := result.recommended) is None:
-        if result.interrupted:
-            return f"No plan is recommended: {count}, and the search was interrupted before a plan was confirmed."
-        required = f"the required pass probability of {percent(required_probability(study))}"
-        return f"No plan is recommended: {count}, and none reached {required} when flown again with new seeds."
+        return f"No plan is recommended: {_missing_plan(study, result, count)}"
     values = ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
-    objectives = ", ".join(
-        f"{wording.metric_name(name)} {wording.metric_value(name, value)}"
-        for name, value in zip(config.objectives, chosen.objectives, strict=True)
-        if name != "risk"
-    )
     passing = f"pass probability with new seeds {wording.confidence(chosen.pass_probability)}"
-    return f"Recommended plan: {values}. Medians: {objectives}; {passing}. {count}."
+    if (verification := result.recommended_verification) is None:
+        objectives = ", ".join(
+            f"{wording.metric_name(name)} {wording.metric_value(name, value)}"
+            for name, value in (*zip(config.objectives, chosen.objectives, strict=True), *chosen.completeness)
+            if name != "risk"
+        )
+        unverified = f" {NOT_VERIFIED}" if result.needs_rendering else ""
+        return f"Recommended plan: {values}. Medians: {objectives}; {passing}. {count}.{unverified}"
+    medians = ", ".join(
+        f"{wording.metric_name(name)} {_metric(name, rendered)} ({_metric(name, surrogate)})"
+        for name, (surrogate, rendered) in verification.medians.items()
+    )
+    return (
+        f"Recommended plan: {values}. Flown rendered, {verification.n_passed} of {verification.surveys} surveys were "
+        f"completed and met every requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
+        f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
+    )
+
+
+def _metric(name: str, value: float | None) -> str:
+    return wording.metric_value(name, value)
+
+
+def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
+    """Returns the reason why no plan is recommended, as text that follows a colon.
+
+    Args:
+        study: the study.
+        result: result of the search.
+        count: phrase with the number of evaluated plans.
+    """
+    if result.interrupted:
+        return f"{count}, and the search was interrupted before a plan was confirmed."
+    if result.verifications:
+        surveys = sum(v.surveys - v.n_failed for v in result.verifications)
+        passed = sum(v.n_passed for v in result.verifications)
+        unflown = sum(v.n_failed for v in result.verifications)
+        failed = (
+            f"; {unflown} more failed because of the computer or the program, --resume flies them" if unflown else ""
+        )
+        return (
+            f"no plan of the search passed when flown rendered. {count}; {passed} of {surveys} rendered surveys "
+            f"passed{failed}."
+        )
+    required = f"the required pass probability of {percent(required_probability(study))}"
+    return f"{count}, and none reached {required} when flown again with new seeds."
+
+
+def warnings(result: TuningResult) -> list[str]:
+    """Returns the warnings of a search: unverified plan, large errors of the surrogate, warnings of the surveys."""
+    texts = []
+    if result.recommended and result.needs_rendering and result.recommended_verification is None:
+        texts.append(NOT_VERIFIED)
+    flown = [result.recommended_verification] if result.recommended_verification else result.verifications
+    for verification in flown:
+        for name, ratio in verification.ratio.ratios.items():
+            if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
+                surrogate, rendered = (_metric(name, value) for value in verification.medians[name])
+                texts.append(
+                    f"Plan {verification.surrogate.number}: the surrogate is wrong about the "
+                    f"{wording.metric_name(name)}: {surrogate} expected, {rendered} flown rendered."
+                )
+        texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
+    return texts + [f"{text} (in {n} surveys of the finalists by the surrogate)" for text, n in result.warnings.items()]
 
 
 def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[str, Any]:
-    """Returns the summary that `--json` prints: number of candidates and the recommended plan."""
-    chosen = result.recommended
+    """Returns the summary that `--json` prints: candidates, the recommended plan, rendered surveys and warnings."""
+    chosen, verification = result.recommended, result.recommended_verification
     recommended = chosen and {
         "values": chosen.values,
         "objectives": dict(zip(config.objectives, chosen.objectives, strict=True)),
         "probability": chosen.pass_probability._asdict(),
+        "verified": not result.needs_rendering or verification is not None,
+        "rendered": verification and _rendered(verification),
     }
-    return {"name": study.name, "candidates": len(result.candidates), "recommended": recommended}
+    return {
+        "name": study.name,
+        "candidates": len(result.candidates),
+        "interrupted": result.interrupted,
+        "recommended": recommended,
+        "flown_rendered": [_rendered(one) for one in result.verifications],
+        "warnings": warnings(result),
+        "headline": headline(study, config, result),
+    }
+
+
+def _rendered(verification: Verification) -> dict[str, Any]:
+    """Returns the rendered surveys of a plan as JSON values."""
+    medians = {
+        name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
+        for name, (surrogate, rendered) in verification.medians.items()
+    }
+    counts = {"surveys": verification.surveys, "n_passed": verification.n_passed, "n_failed": verification.n_failed}
+    plan = {"plan": verification.surrogate.number, "round": verification.search_round, "passed": verification.passed}
+    return plan | counts | {"values": verification.surrogate.values, "medians": medians}
 
 
 def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -> str:
-    """Returns the recommended plan as a scenario file with the headline as a comment; "" if no plan is recommended.
+    """Returns the recommended plan as the text of a scenario file; "" if no plan is recommended.
 
-    The scenario selects rendered images, even if the search used the surrogate.
+    Comments at the start contain the headline and the warnings. The scenario selects rendered images, even if the
+    search used the surrogate.
     """
     if result.scenario is None:
         return ""
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
     comments = [f"twin tune of {study.name}", headline(study, config, result)]
+    comments += [f"Warning: {text}" for text in warnings(result)]
     scenario = result.scenario.model_copy(update={"imaging": imaging})
-    return "".join(f"# {line}\n" for line in comments) + dump_toml(scenario)
+    return "".join(f"# {' '.join(line.split())}\n" for line in comments) + dump_toml(scenario)
 
 
 def trade_off_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
-    """Plots the candidates for each pair of objectives; a single objective is plotted against the trial number."""
+    """Returns a scatter plot of the candidates for each pair of objectives.
+
+    A single objective is plotted against the trial number.
+    """
     pairs = list(combinations(range(len(config.objectives)), 2)) or [(None, 0)]
     figure, panels = make_panels(len(pairs))
     for (x_index, y_index), axes in zip(pairs, panels, strict=True):
@@ -116,7 +206,7 @@ def trade_off_figure(shown: list[Candidate], result: TuningResult, config: Tunin
 
 
 def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
-    """Plots each objective against each searched key."""
+    """Returns a scatter plot of each objective against each searched key."""
     cells = [(k, key) for k in range(len(config.objectives)) for key in config.search]
     figure, panels = make_panels(len(cells), columns=min(len(config.search), 4))
     for (k, key), axes in zip(cells, panels, strict=True):
@@ -142,7 +232,7 @@ def _groups(
     yield [c for c in shown if c.shortfall <= 0 and c not in front], feasible
     yield front, dot | {"color": FRONT, "markersize": 5, "label": "Pareto-optimal"}
     star = dot | {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
-    yield [c for c in front if c.number in chosen], star
+    yield [c for c in shown if c.number in chosen], star
 
 
 def _format_axis(axis: Any, objective: str) -> None:

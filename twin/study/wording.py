@@ -7,6 +7,7 @@ import numpy as np
 from twin.judge.require import more_is_better
 from twin.report.wording import DASH, length, percent, plain
 from twin.study.analysis import KeyComparison, StudyAnalysis
+from twin.study.answers import Answer
 from twin.study.statistics import LEVEL, Interval
 from twin.study.study_file import Study
 
@@ -14,7 +15,9 @@ _METRIC_NAMES = {
     "trajectory.final.ate_rmse_m": "final trajectory error (ATE, RMSE)",
     "trajectory.online.ate_rmse_m": "online trajectory error (ATE, RMSE)",
     "map.le90_m": "map height error (LE90)",
-    "map.completeness": "map completeness",
+    "map.completeness": "map completeness (observed floor)",
+    "map.le90_area_m": "map height error over the asked area (LE90)",
+    "map.completeness_area": "map completeness (asked area)",
     "map.rmse_m": "map height error (RMSE)",
     "map.nmad_m": "map height error (NMAD)",
     "timing.simulated_s": "survey duration",
@@ -72,24 +75,89 @@ def confidence(interval: Interval) -> str:
 
 
 def headline(study: Study, analysis: StudyAnalysis) -> str:
-    """Returns the main results of a study: threshold of the `seek` key, pass probability, requirement met or not."""
+    """Returns the main results of a study: passing values of the `seek` key, pass probability, requirement met or not.
+
+    Names the surveys that are left out.
+    """
     n = int(analysis.evaluated.sum())
+    left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)
     if n == 0:
-        return "No survey could be evaluated." + _failed(analysis)
+        return "No survey could be evaluated." + left_out
+    sought = [] if study.seek is None else analysis.answers.get(study.seek, [])
+    answer = answer_sentence(study.seek, sought, study.probability) + " " if study.seek and sought else ""
     return (
-        f"{_threshold(study, analysis)}The pass probability is {confidence(analysis.pass_probability)}: "
+        f"{answer}The pass probability is {confidence(analysis.pass_probability)}: "
         f"{int(analysis.passed.sum())} of {n} surveys {_passing(analysis)}."
-        f"{_requirement(analysis)}{_main_reason(analysis)}{_failed(analysis)}{_warnings(analysis)}"
+        f"{_requirement(analysis)}{_main_reason(analysis)}{left_out}{_warnings(analysis)}"
     )
 
 
+def answer_lines(analysis: StudyAnalysis) -> list[str]:
+    """Returns for each varied key a sentence on the values at which the required fraction of surveys passes."""
+    required = analysis.required_probability
+    return [answer_sentence(key, answers, required) for key, answers in analysis.answers.items()]
+
+
+def answer_sentence(key: str, answers: list[Answer], required: float | None) -> str:
+    """Returns a sentence on the values of a key at which enough surveys pass, too few pass, or more must be flown.
+
+    It names only values that were flown.
+
+    Args:
+        key: the varied key.
+        answers: verdict for each range or value of the key.
+        required: required pass probability.
+    """
+    if not answers:
+        return f"{key}: no survey could be evaluated."
+    passes, fails, undecided = (
+        [answer for answer in answers if answer.verdict == verdict] for verdict in ("passes", "fails", "undecided")
+    )
+    constant = f"{key} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
+    fraction = f"at least {percent(required)} of surveys pass"
+    parts = []
+    if passes:
+        parts.append(f"{fraction} at {key} {_labels(passes)}")
+    else:
+        parts.append(f"no value of {key} is known at which {fraction}")
+    if fails:
+        parts.append(f"fewer pass at {_labels(fails)}")
+    if undecided:
+        n = sum(answer.surveys for answer in undecided)
+        verb = "is" if len(undecided) == 1 else "are"
+        parts.append(f"{_labels(undecided)} {verb} not decided with {_count(n)} ({_more(undecided)})")
+    text = "; ".join(parts) + "."
+    return constant + text[:1].upper() + text[1:]
+
+
+def _labels(answers: list[Answer]) -> str:
+    labels = [answer.label for answer in answers]
+    return " and ".join([", ".join(labels[:-1]), labels[-1]]) if len(labels) > 1 else labels[0]
+
+
+def _count(surveys: int) -> str:
+    return f"{surveys} survey" + ("" if surveys == 1 else "s")
+
+
+def _more(undecided: list[Answer]) -> str:
+    """Returns a phrase with the number of further surveys that would decide all undecided answers.
+
+    The number is rounded up to two significant digits.
+    """
+    total = sum(answer.more_surveys for answer in undecided)
+    if np.isinf(total):
+        return "no finite number of surveys is expected to decide it: the observed fraction equals the required one"
+    digit = 10 ** max(0, len(f"{total:.0f}") - 2)
+    return f"about {int(np.ceil(total / digit)) * digit} more needed there"
+
+
 def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
-    """Returns the number of surveys flown, their rate, and their mean run time.
+    """Returns a phrase with the number of surveys flown, their rate, and their mean run time.
 
     Args:
         surveys: number of surveys flown.
         wall_s: wall time [s].
-        worker_s: sum of the run times on the workers [s].
+        worker_s: sum of the surveys' run times on the workers [s].
     """
     return (
         f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} per minute; "
@@ -101,29 +169,14 @@ def _labelled(low: str, high: str) -> str:
     return f"{percent(LEVEL)} confidence interval: {low} to {high}"
 
 
-def _threshold(study: Study, analysis: StudyAnalysis) -> str:
-    """Returns a sentence on the values of the `seek` key at which the required fraction of surveys pass, or ""."""
-    if analysis.threshold is None:
-        return ""
-    limit, rising = analysis.threshold
-    required = f"At least {percent(study.probability or 0)} of surveys pass"
-    if np.isnan(limit.value):
-        return ""
-    if np.isinf(limit.value):
-        return f"{required} at {'every' if (limit.value < 0) == rising else 'no'} value of {study.seek} in this study. "
-    low, high = (plain(float(b)) if np.isfinite(b) else "outside the range of this study" for b in limit[1:])
-    relation = "at least" if rising else "at most"
-    return f"{required} if {study.seek} is {relation} {plain(limit.value)} ({_labelled(low, high)}). "
-
-
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the number of surveys that have a warning and the first warning, or "" if none has."""
-    warned = analysis.warning[analysis.warning != ""]
-    return f" Warning in {len(warned)} of {len(analysis.warning)} surveys: {warned[0]}." if len(warned) else ""
+    """Returns a sentence with the number of surveys that have a warning and the most frequent warning; else ""."""
+    warned, texts = int((analysis.warning != "").sum()), list(analysis.warning_counts)
+    return f" Warning in {warned} of {len(analysis.warning)} surveys: {texts[0].rstrip('.')}." if texts else ""
 
 
 def _main_reason(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the most frequent reason of failure if no survey passed, else ""."""
+    """Returns a sentence with the most frequent reason why surveys did not pass, if none passed; else ""."""
     if analysis.passed.any() or not analysis.failure_reasons:
         return ""
     return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
@@ -140,21 +193,48 @@ def limit_relation(metric: str) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on whether the pass probability reaches the required one, and whether this is certain."""
+    """Returns a sentence on whether the pass probability reaches the required one, and whether more surveys are needed.
+
+    Returns "" if the study requires no pass probability.
+    """
     required, passing = analysis.required_probability, analysis.pass_probability
-    if required is None or analysis.study.seek is not None:
+    if required is None:
         return ""
     verdict = "not met" if analysis.requirement_missed else "met"
     conclusive = passing.high < required or passing.low >= required
     doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
-    return f" The required {percent(required)} is {verdict}{doubt}."
+    where = " over all values of the varied keys" if analysis.study.seek is not None else ""
+    return f" The required {percent(required)} is {verdict}{where}{doubt}."
+
+
+def _refused(analysis: StudyAnalysis) -> str:
+    """Returns a sentence on the samples that cannot be flown and are not counted; "" if there are none."""
+    if not (samples := analysis.refused_samples):
+        return ""
+    surveys = _count(int(analysis.refused.sum()))
+    n = "1 sample" if len(samples) == 1 else f"{len(samples)} samples"
+    verb = "is" if len(samples) == 1 else "are"
+    return f" {n} ({surveys}) cannot be flown and {verb} not counted, e.g.: {analysis.refusal_reasons[0].reason}."
+
+
+def _duplicates(analysis: StudyAnalysis) -> str:
+    n = int(analysis.duplicate.sum())
+    if not n:
+        return ""
+    repeat = "repeats another one" if n == 1 else "repeat others"
+    return f" {_count(n)} {repeat} (same scenario, same seed) and {'is' if n == 1 else 'are'} not counted again."
+
+
+def _not_flown(analysis: StudyAnalysis) -> str:
+    n = analysis.not_flown
+    return f" The study is not finished: {_count(n)} not flown yet; --resume continues it." if n else ""
 
 
 def _failed(analysis: StudyAnalysis) -> str:
-    n = int((~analysis.evaluated).sum())
+    n = int(analysis.failed.sum())
     if not n:
         return ""
-    lowest = percent(float(analysis.passed.sum()) / len(analysis.passed))
+    lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.evaluated.sum())))
     return (
         f" {n} more surveys failed because of the computer or the program and are not counted; if none of them had "
         f"passed, the pass probability would be {lowest}. Use --resume to fly them again."
@@ -162,7 +242,7 @@ def _failed(analysis: StudyAnalysis) -> str:
 
 
 def superiority(comparison: KeyComparison) -> str:
-    """Returns a phrase on how the values of a key differ between surveys that did not pass and surveys that did."""
+    """Returns a phrase that compares the values of a key in surveys that did not pass with those in passing surveys."""
     higher = comparison.superiority >= 0.5
     probability = comparison.superiority if higher else 1 - comparison.superiority
     if probability < 0.6:

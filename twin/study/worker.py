@@ -33,16 +33,20 @@ SINGLE_THREADED = {
 
 
 class TaskLimits(NamedTuple):
-    """Maximum run time of a task [s], and the number of retries after its process was killed."""
+    """Maximum run time of a task [s], and largest number of retries if its process ends or is killed."""
 
     timeout_s: float = 3600.0
     retries: int = 2
 
 
 class Reply(NamedTuple):
-    """Reply of a worker: the value that the task returned, or the reason why it returned none.
+    """Reply of a worker to one task.
 
-    `kind`: "done"; "raised" for an exception; "timeout"; "killed" if the process ended or was killed.
+    Args:
+        kind: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
+            "killed" if the process ended or was killed.
+        value: the returned value, for the kind "done".
+        reason: why there is no value; "" for the kind "done".
     """
 
     kind: Literal["done", "raised", "timeout", "killed"]
@@ -69,7 +73,7 @@ class Worker:
         child_end.close()
 
     def run(self, request: bytes, timeout_s: float) -> Reply:
-        """Sends a pickled (function, task) and returns the reply; kills the process after a timeout."""
+        """Sends a pickled (function, task) to the process and returns its reply; kills the process after a timeout."""
         try:
             self._pipe.send_bytes(request)
             if self._pipe.poll(timeout_s):
@@ -120,7 +124,11 @@ class WorkerPool:
             worker.kill()  # its own thread closes the pipe: closing it twice could close a file of another thread
 
     def run(self, function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
-        """Runs a task and returns its reply and the number of attempts; only a task whose process died is retried."""
+        """Runs a task on an idle or a new worker and returns its reply and the number of attempts.
+
+        Retries the task, at most `limits.retries` times, if its process ends or is killed; an exception or a timeout is
+        not retried.
+        """
         request = pickle.dumps((function, task))
         attempts = 0
         while True:
@@ -149,7 +157,7 @@ class WorkerPool:
 
 
 def describe_exception(error: BaseException) -> str:
-    """Returns an exception in one line: its type, its message, and the file and line that raised it."""
+    """Returns one line of text on an exception: its type, its message, and the file and line that raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     source = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     message = " ".join(str(error).split())
@@ -157,7 +165,12 @@ def describe_exception(error: BaseException) -> str:
 
 
 def main(pipe: int, core: int | None) -> None:
-    """Runs the worker process: sends a pickled `Reply` to each pickled (function, task) until the pipe closes."""
+    """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes.
+
+    Args:
+        pipe: file descriptor of the worker's end of the pipe.
+        core: CPU core to which the process is pinned; None: not pinned.
+    """
     if core is not None:
         os.sched_setaffinity(0, {core})
     threading.Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
@@ -179,7 +192,11 @@ def _run_request(request: bytes) -> bytes:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """Ends this process within a second after its parent process has ended."""
+    """Ends this process within about a second after its parent process has ended.
+
+    Args:
+        parent: process identifier of the parent.
+    """
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)

@@ -20,10 +20,10 @@ from twin.world.world import FastForward, World
 def compiled_loop(
     world: World, vehicle: CompiledVehicle, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
 ) -> FastForward:
-    """Returns a compiled function that runs the closed loop of `survey.fly` from a given frame to the next keyframe.
+    """Returns a function that runs the compiled closed loop from a given frame to the next keyframe.
 
-    Each frame is computed with the same operations and random numbers as in `survey.fly`, so the results are the same.
-    If F2F has no points to track, the function simulates no frames.
+    It performs the same operations with the same random numbers as the loop in `survey.fly`, so the results are equal.
+    It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no frames.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
@@ -58,8 +58,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     """Runs the closed loop over n frames.
 
     Returns:
-        Number of frames simulated (fewer than n if the physics diverged), dead-reckoning state after the last frame,
-        and three arrays of poses (n, 4, 4): true poses, poses integrated from F2F alone, and online estimates.
+        Number of simulated frames (fewer than n if the vehicle's state diverged), dead-reckoning state after the last
+        frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated from F2F alone, and online estimates.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals

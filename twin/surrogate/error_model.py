@@ -1,7 +1,7 @@
-"""Error model of the surrogate: error statistics and success rates of the image measurements of a survey.
+"""Error model of the surrogate: standard deviations and success rates of the image measurements of a survey.
 
-Most are functions of one number, the Cramer-Rao lower bound on the standard deviation of a matched patch's position
-(see `matchability`). The parameters are fitted to rendered surveys.
+Most of them are functions of the Cramer-Rao lower bound on the standard deviation of a matched patch's position (see
+`matchability`). The parameters are fitted to rendered surveys.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class SigmaLaw(NamedTuple):
 
     Args:
         floor_px: standard deviation in noise-free images [px].
-        slope: ratio of the standard deviation to the bound where the bound is large.
+        slope: ratio of the standard deviation to the bound for large bounds.
     """
 
     floor_px: float
@@ -54,7 +54,8 @@ class ErrorModel(NamedTuple):
 
     Args:
         bound_range_px: smallest and largest Cramer-Rao bound of the surveys to which the model was fitted.
-        point_fraction: number of matched stereo points of a keyframe, as a fraction of `estimate.points`.
+        point_fraction: number of matched stereo points of a keyframe, as a fraction of the number that the scenario
+            asks for (`estimate.points`).
         match_sigma_px: reported standard deviation of a patch's position in one image.
         match_error_ratio: ratio of the true to the reported standard deviation of a patch's position in one image.
         lamp_error_growth: growth of the match error due to the lamps on the vehicle: the square of `match_error_ratio`
@@ -63,28 +64,29 @@ class ErrorModel(NamedTuple):
         match_fraction: fraction of a keyframe's points in the field of view of another keyframe that are matched there.
         match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
             correlated; see `matching.variance_inflation`.
-        match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link: with unit
-            variance, the error is r b + sqrt(1 - r^2) e, where b is common to all links to that pair and e is
-            independent from link to link.
+        match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
+            of its standard deviation, the error is r b + sqrt(1 - r^2) e, where b and e have unit variance, b is common
+            to all links to that pair, and e is independent from link to link.
         distance_growth: growth of the reported match variance with the distance between two keyframes: the variance
             is multiplied by 1 + (distance_growth * distance / depth)^2.
         relief_gain: standard deviation of the match error due to relief within the patch, per pixel of unevenness (see
             `matchability`) and per unit of distance / depth. The error is the same for all matches of one patch of
-            floor, so it accumulates along a path. Let g = (g_x, g_y) be the image gradient along rows and columns, t
-            the translation between the images, and d the parallax of a pixel relative to the patch's plane per unit
-            of t. Least-squares matching then displaces the patch by (sum g g')^-1 (sum g g' d) t. Stereo matching,
-            with its baseline along x, averages d with the weights g_x^2, which predicts the displacement in x due to
-            t_x. Three terms remain: the displacement in x due to t_y and the one in y due to t_x, both with the gain
-            `relief_gain`, and the displacement in y due to t_y, with twice this gain for isotropic texture.
-        common_bias_px: true standard deviation of the bias that all points of a link share [px].
+            floor, so it accumulates along a path. Let g = (g_x, g_y) be the image gradient in x (along rows) and y,
+            t = (t_x, t_y) the translation between the images, and d the parallax of a pixel relative to the patch's
+            plane, per unit of t. Least-squares matching displaces the patch by (sum g g')^-1 (sum g g' d) t, summed
+            over its pixels. The displacement in x due to t_x is no error: stereo matching, with its baseline along x,
+            averages d with the same weights g_x^2, so the depth of the patch already contains it. Three terms remain
+            as errors: the displacement in x due to t_y and the one in y due to t_x, both with the gain `relief_gain`,
+            and the displacement in y due to t_y, with twice this gain for isotropic texture.
+        common_bias_px: true standard deviation of the bias of image positions that all points of a link share [px].
         f2f_sigma_px: reported standard deviation of a flow vector of frame-to-frame tracking.
         f2f_error_ratio: ratio of the true to the reported standard deviation of a frame-to-frame motion.
         f2f_anticorrelation: fraction of the independent error of a frame-to-frame motion that the next motion cancels
             (a first-order moving average), because both motions are measured relative to the same points.
-        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as that of a flow
-            vector if the registration used as many flow vectors as F2F.
+        mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
+            deviation of one flow vector if the registration were estimated from as many flow vectors as F2F.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_sigma_px: reported standard deviation of a pixel's depth after the Kalman depth filter [px of disparity].
+        depth_sigma_px: reported standard deviation of a pixel's depth from the Kalman depth filter [px of disparity].
         depth_error_ratio: ratio of the true to the reported standard deviation of a pixel's filtered depth.
         lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
         map_completeness: fraction of the map cells in view for which the Kalman depth filter provides a depth.

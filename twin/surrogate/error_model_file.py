@@ -1,18 +1,19 @@
-"""TOML file of an error model: parameters, number of surveys to which they were fitted, and misfit of the fit."""
+"""TOML file of an error model: fitted parameters, number of surveys used for the fit, and residuals of the fit."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from twin.core.paths import is_file
 from twin.errors import TwinError
+from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
 from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_RANGE_FACTOR = 1.5  # factor by which a Cramer-Rao bound may exceed the fitted range without a warning
+_RANGE_FACTOR = 1.5  # factor by which a Cramer-Rao bound may lie outside the fitted range without a warning
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
@@ -50,7 +51,8 @@ class FittedErrorModel:
     Args:
         model: fitted parameters.
         n_surveys: number of rendered surveys to which the model was fitted.
-        misfit: root mean square over the surveys of ln(reported / modelled standard deviation), by model parameter.
+        misfit: root mean square over the surveys of ln(reported / modelled standard deviation), for each fitted
+            parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
     """
 
     model: ErrorModel
@@ -58,7 +60,11 @@ class FittedErrorModel:
     misfit: Mapping[str, float]
 
     def coverage_warning(self, smallest_px: float, largest_px: float) -> str:
-        """Returns a warning if the Cramer-Rao bounds of a survey lie outside the fitted range, "" if not."""
+        """Returns a warning if the Cramer-Rao bounds of a survey lie outside the fitted range, else "".
+
+        Args:
+            smallest_px, largest_px: smallest and largest Cramer-Rao bound of the survey.
+        """
         fitted_smallest, fitted_largest = self.model.bound_range_px
         if fitted_smallest / _RANGE_FACTOR <= smallest_px and largest_px <= fitted_largest * _RANGE_FACTOR:
             return ""
@@ -79,11 +85,16 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
     """
     path = DEFAULT_FILE if path is None else Path(path)
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        if path.exists() and not is_file(path):
+            raise _invalid(path, "it is not a regular file")
+        with path.open(encoding="utf-8") as stream:
+            tree = parse_toml(stream.read(MAX_CHARACTERS + 1))
+        for error in value_errors(tree):
+            raise _invalid(path, str(error))
         _check_names(path, tree)
         model = ErrorModel(**{name: _value(name, tree["model"][name]) for name in ErrorModel._fields})
         return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]))
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise _invalid(path, repr(error)) from None
 
 

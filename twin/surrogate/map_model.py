@@ -1,7 +1,7 @@
-"""Model of the elevation map: the grid cells that a keyframe sees, and the heights that its depth filter estimates.
+"""Model of the elevation map: samples the grid cells that a keyframe sees and the heights that it contributes.
 
-One sample per grid cell stands for all pixels that show the cell. A cell is visible if its centre projects into both
-images; occlusion by relief is not modelled.
+The heights stand for those from the Kalman depth filter, with one sample per grid cell for all pixels that show the
+cell. A cell is visible if its centre projects into both images; occlusion by relief is not modelled.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class CellErrors(NamedTuple):
 
 
 class MapModel:
-    """Samples the height patches of keyframes from the true heights of the floor.
+    """Samples the height patch of each keyframe: true heights of the floor plus errors.
 
     Args:
         grid: grid of the map.
@@ -92,8 +92,8 @@ class MapModel:
             next_true: (4, 4) true pose of the next keyframe; None for the last one.
             estimated: (4, 4) estimated pose of the keyframe.
             cov: (6, 6) covariance of the estimated pose, in camera axes.
-            errors: errors of the filtered depth.
-            rng: random generator of the errors that are independent between keyframes.
+            errors: distribution of the depth errors, and their part that is common to all keyframes.
+            rng: random generator of the depth errors that are independent between keyframes.
 
         Returns:
             The patch, or None if the field of view does not overlap the grid.
@@ -117,7 +117,10 @@ class MapModel:
         return HeightPatch(row, col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral)
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the footprint at the lowest height of the floor."""
+        """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
+
+        They cover the footprint of the image on a plane at the lowest height of the floor.
+        """
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -147,7 +150,7 @@ def _window(pose, camera, geotransform, lowest, size):
 
 @njit(cache=True, nogil=True, inline="always")
 def _depth_in(camera_from_world, camera, x, y, z):
-    """Returns the depth of a world point in the left camera; -1 if it is behind it or outside either image."""
+    """Returns the depth of a world point in the left camera; -1 if the point is behind it or outside either image."""
     focal, cx, cy, right, bottom, baseline = camera
     m = camera_from_world
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
@@ -177,7 +180,11 @@ def _sample_patch(
     out, variance, systematic, height, slope, geotransform, camera, camera_from_world, is_last, estimated_from_true,
     position, cov, depth_noise, errors, row, col,
 ):  # fmt: skip
-    """Writes heights to `out` and variances to `variance` and `systematic`; returns the mean depth [m]."""
+    """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
+
+    Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose
+    and the lateral error to `systematic`.
+    """
     (west, north, cell), m = geotransform, estimated_from_true
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
@@ -213,7 +220,7 @@ def _sample_patch(
 
 @njit(cache=True, nogil=True, inline="always")
 def _interval(ascending, value):
-    """Returns the index of the interval that contains a value, and the relative position (0 to 1) within it."""
+    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it."""
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1

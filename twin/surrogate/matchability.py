@@ -1,14 +1,16 @@
 """Matchability of the floor: the Cramer-Rao bound of image matching, and the unevenness of the floor under a patch.
 
-The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. With g the
-gradient of the grey image along a row and s the standard deviation of its noise, the standard deviation of the measured
-shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao lower bound).
+The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. Let g be
+the gradient of the grey image along a row, and s the standard deviation of the image noise. The standard deviation of
+the measured shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao bound).
 
-Matching models the floor under a patch as a plane. Relief relative to that plane causes parallax and thus a matching
+Matching models the floor under a patch as a plane. Relief above or below that plane causes parallax and thus a matching
 error. The unevenness is the RMS of this parallax, in pixels per unit of baseline / depth.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -23,26 +25,41 @@ from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 
-_DEPTHS = 6
+_DEPTHS = 6  # number of tabulated depths
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
 _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
 
 
 class Matchability:
-    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated by depth of the floor.
+    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated over the camera's depth range.
+
+    Args:
+        scenario: description of the survey.
+        illumination: optical properties of the water, and daylight in the water.
+        terrain: true floor.
+        locate: see `unevenness_px`.
 
     Attributes:
-        depths_m: (m,) ascending depths of the floor in the camera [m].
+        depths_m: (m,) ascending depths of the floor along the optical axis [m].
         bounds_px: (m,) Cramer-Rao bound c at these depths [px].
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
     """
 
-    def __init__(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain):
+    def __init__(
+        self,
+        scenario: Scenario,
+        illumination: Illumination,
+        terrain: terrains.Terrain,
+        locate: Callable[[Array], Array] | None = None,
+    ):
         nearest = max(scenario.plan.altitude_m - terrain.highest_m, 0.3)
-        self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (scenario.plan.altitude_m - terrain.lowest_m), _DEPTHS)
+        highest_m = scenario.plan.altitude_m  # of the cameras
+        if scenario.plan.height == "floor":
+            highest_m += terrain.highest_m
+        self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
         self.bounds_px = bounds_px(scenario, illumination, terrain, self.depths_m)
-        self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m)
+        self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate)
         self.lamp_share = lamp_share(scenario, illumination, terrain)
 
     def bound_at(self, depth_m: float) -> float:
@@ -73,9 +90,10 @@ def lamp_share(scenario: Scenario, illumination: Illumination, terrain: terrains
 
 
 def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
-    """Returns the light that a white floor at the planned altitude reflects to the camera, mean over bands [cd/m2].
+    """Returns the image signal due to light reflected by a white floor at the planned altitude [cd/m2].
 
-    It is the mean difference between the images of a white and a black floor, which removes the veil.
+    It is the difference between the images of a white and a black floor, which removes the veil, averaged over pixels
+    and colour channels.
     """
     scenario = _without_unmodelled_effects(scenario)
     formation = ImageFormation(scenario, illumination, terrain, np.random.default_rng(0))
@@ -86,7 +104,10 @@ def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain:
 
 
 def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose]:
-    """Returns the image of a constant depth [m], as of a level floor, and a camera pose at the planned altitude."""
+    """Returns a depth image (height_px, width_px) of constant depth [m], and a camera pose at the planned altitude.
+
+    The depth image is that of a level floor seen vertically from above.
+    """
     rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
     world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
     return np.full((rig.height_px, rig.width_px), depth_m, np.float32), StampedPose(world_from_left, 0.0)
@@ -99,11 +120,23 @@ def _without_unmodelled_effects(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update={"imaging": imaging, "snow": snow})
 
 
-def unevenness_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array) -> Array:
+def unevenness_px(
+    scenario: Scenario,
+    terrain: terrains.Terrain,
+    depths_m: Array,
+    locate: Callable[[Array], Array] | None = None,
+) -> Array:
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], RMS over the planned area.
 
     It is the parallax relative to the best-fit plane, in pixels per unit of baseline / depth: f rms(z) / depth, with z
     the height above that plane [m] and f the focal length [px].
+
+    Args:
+        scenario: description of the survey.
+        terrain: true floor.
+        depths_m: depths of the floor along the optical axis.
+        locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
+            centre, to scene points (..., 2) [m]; None: the area is centred at the origin, with legs along x.
     """
     focal_px, patch_px = scenario.believed_rig().focal_px, scenario.estimate.patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
@@ -111,7 +144,8 @@ def unevenness_px(scenario: Scenario, terrain: terrains.Terrain, depths_m: Array
     plane = np.column_stack([np.ones_like(x), x, y])
     residual_of = np.eye(len(x)) - plane @ np.linalg.pinv(plane)
     rng = np.random.default_rng(0)
-    centres = (rng.random((_PATCHES, 1, 2)) - 0.5) * scenario.plan.area_m
+    fractions = rng.random((_PATCHES, 1, 2)) - 0.5
+    centres = fractions * scenario.plan.area_m if locate is None else locate(fractions)
     unevenness = []
     for depth_m in depths_m:
         points = centres + np.column_stack([x, y]) * (patch_px * depth_m / focal_px)
@@ -146,7 +180,13 @@ def _gray(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns a texture and its texel size [m]: that of the terrain file, or one generated for a square floor."""
+    """Returns a floor texture and its texel size [m]: from the terrain file, or generated by the scenario's generator.
+
+    Args:
+        scenario: description of the survey.
+        terrain: true floor.
+        extent_m: side length of the generated texture, limited by the size of the terrain.
+    """
     t = scenario.terrain
     if t.kind == "file":
         return terrain.texture, terrain.texture_px_m
@@ -158,7 +198,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
 
 
 def _albedo(texture: Image, texel_m: float, rig: StereoRig, depth_m: float) -> Image:
-    """Returns the centre of the texture as the camera images it at a depth, (height_px, width_px, 3)."""
+    """Returns the albedo image (height_px, width_px, 3) of the texture's centre for a camera at the given distance."""
     texels_per_px = depth_m / rig.focal_px / texel_m
     height, width = texture.shape[:2]
     rows, cols = (min(round(n * texels_per_px), most) for n, most in ((rig.height_px, height), (rig.width_px, width)))

@@ -1,4 +1,4 @@
-"""Model of the mosaic: the first keyframe that shows each floor cell, because the mosaic keeps the oldest view."""
+"""Model of the mosaic: stores for each floor cell the first keyframe that shows it, as the mosaic keeps the oldest."""
 
 from __future__ import annotations
 
@@ -11,15 +11,21 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 
-_CELL_M = 0.1
-_MIN_COVERAGE = 0.1  # smallest fraction of a view that the mosaic must cover for a registration
+_CELL_M = 0.1  # side of a floor cell [m]
+_MIN_COVERAGE = 0.1  # smallest fraction of a keyframe's field of view that the mosaic must cover for a registration
 
 Cells = NDArray[np.int64]  #: floor cells, each with column and row packed into one integer
 
 
 @njit(cache=True, nogil=True)
 def floor_cells(pose, points, baseline):
-    """Returns the floor cells (n,) of points (n, 3), normalised (x, y, disparity) in a camera at pose (4, 4)."""
+    """Returns the floor cell (n,) of each point (n, 3), given as normalised (x, y, disparity) in a camera.
+
+    Args:
+        pose: (4, 4) world_from_camera.
+        points: (n, 3) points.
+        baseline: stereo baseline [m].
+    """
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -31,12 +37,12 @@ def floor_cells(pose, points, baseline):
 
 
 class MosaicView(NamedTuple):
-    """Keyframes that the mosaic shows within a view.
+    """Keyframes that make up the part of the mosaic in a camera's field of view.
 
     Args:
         numbers: (n,) numbers of the keyframes, ascending.
-        estimated: (n, 4, 4) estimated poses at which they were added to the mosaic.
-        fractions: (n,) fraction of the mosaic in view that each of them covers; sums to 1.
+        estimated: (n, 4, 4) estimated poses at which the keyframes were added to the mosaic.
+        fractions: (n,) fraction of the mosaic in view that comes from each keyframe; sums to 1.
     """
 
     numbers: list[int]
@@ -63,7 +69,7 @@ class MosaicModel:
             self._first_keyframe.setdefault(cell, number)
 
     def view(self, cells: Cells) -> MosaicView | None:
-        """Returns the keyframes that the mosaic shows in these cells, or None if it covers too few cells."""
+        """Returns the keyframes that the mosaic shows in these cells; None if the mosaic covers too few of them."""
         counts = Counter(map(self._first_keyframe.get, cells.tolist()))
         counts.pop(None, None)
         if counts.total() < _MIN_COVERAGE * len(cells):

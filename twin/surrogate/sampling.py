@@ -19,7 +19,7 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     Args:
         errors: distribution of the errors, a `vision.FrameErrors`.
         previous_pose, pose: true poses of the left camera at the two frames.
-        normals, previous_normals: (6,) standard normal numbers of this motion and of the motion before it.
+        normals, previous_normals: (6,) standard normal random numbers for this motion and for the motion before it.
     """
     error = np.zeros(6)
     for i in range(6):
@@ -33,22 +33,22 @@ def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
     bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation,
 ):  # fmt: skip
-    """Samples the motion between two keyframes from noisy points, with the equations used for matched points.
+    """Samples the motion between two keyframes: estimates it from points with sampled noise.
 
-    Standard deviations and covariances are in normalised coordinates. Parameters not explained here are those of
-    `ErrorModel`.
+    The equations are the same as for matched points. Standard deviations and covariances are in normalised coordinates.
 
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
         later_noise: (n, 3) standard normal numbers of the later stereo pair's errors at these points.
-        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier stereo pair's biases, over its image.
-        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief, with a period of f floor cells.
+        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier stereo pair's biases, on a raster over its
+            image.
+        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief; they repeat every f floor cells.
         normals: (n + 1, 3) standard normal numbers of this link alone: n for its points, one for their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
         cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
         error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
-        bias_fraction: `match_bias_fraction`.
+        bias_fraction: `match_bias_fraction` of the `ErrorModel`.
         relief_sigma: standard deviation of the error due to relief, per unit of distance / depth.
         common_bias: true standard deviation of the common bias.
         distance_growth: growth of the reported variance with distance / depth.
@@ -56,8 +56,8 @@ def sample_link(
         inflation: factor on the reported covariance, because matches are correlated.
 
     Returns:
-        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6),
-        which are valid only with at least `MIN_POINTS` points.
+        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6).
+        Motion and covariance are valid only if at least `MIN_POINTS` points are seen.
     """
     focal, cx, cy, width, height, margin, baseline = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
@@ -109,9 +109,13 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple[Array, Array]:
     """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its lower Cholesky factor.
 
-    The motion is that of Negahdaripour & Madjidi (2003), eq. (2), by least squares from `n_effective` flow vectors of
-    unit standard deviation. These are distributed over the image and in depth like `points` (n, 3), normalised
-    (x, y, disparity).
+    The motion is estimated by least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors
+    of unit standard deviation. The vectors have the same distribution over image and depth as `points`.
+
+    Args:
+        points: (n, 3) normalised (x, y, disparity).
+        baseline: stereo baseline [m].
+        n_effective: number of flow vectors.
     """
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
@@ -122,14 +126,14 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
 
 @njit(cache=True, nogil=True)
 def mosaic_correction(estimated, true, fractions, true_pose, predicted_pose):
-    """Returns the correction (6,) of a predicted pose that a registration without matching errors would give.
+    """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
 
-    In the mosaic, each keyframe is displaced by the error of the pose at which it was added. The correction is the
-    mean over the keyframes in view, weighted by `fractions`.
+    Each keyframe in the mosaic is displaced by the error of the pose at which it was added. The correction is the mean
+    over the keyframes in view, weighted by `fractions`.
 
     Args:
         estimated, true: (n, 4, 4) estimated and true poses of the keyframes in view.
-        fractions: (n,) fraction of the mosaic in view that each of them covers.
+        fractions: (n,) fraction of the mosaic in view that comes from each keyframe.
         true_pose, predicted_pose: (4, 4) true and predicted pose of the frame to register.
     """
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)

@@ -1,4 +1,4 @@
-"""Simulated world without images; vehicle, sensors and floor are modelled as in `RenderedWorld`."""
+"""Simulated world without images; vehicle, navigation sensors and floor are modelled as in `RenderedWorld`."""
 
 from __future__ import annotations
 
@@ -33,6 +33,11 @@ _BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # placeholder: an ima
 class SurrogateWorld(World):
     """World whose visual measurements are sampled from an error model.
 
+    Args:
+        mission: the survey to fly.
+        stopwatch: timer of the stages.
+        fitted: error model of the measurements.
+
     Attributes:
         vision: source of the sampled visual measurements.
     """
@@ -54,7 +59,7 @@ class SurrogateWorld(World):
         true_pose = partial(left_camera, vehicle, rig)
         self.vision = surrogate_vision(mission, fitted.model, true_pose, stopwatch)
         warning = fitted.coverage_warning(*self.vision.bounds_px)
-        self.warnings = (f"surrogate: {warning}",) if warning else ()
+        self.warnings = (f"The surrogate extrapolates: {warning}.",) if warning else ()
 
     def close(self) -> None:
         """Does nothing, as there are no resources to release."""
@@ -82,12 +87,14 @@ def surrogate_vision(
     """Returns the `SurrogateVision` of a mission.
 
     Args:
-        true_pose: function that returns the true world_from_camera (4, 4) of the left camera.
+        mission: the survey to fly.
+        model: error model of the measurements.
+        true_pose: function that returns the current true world_from_camera (4, 4) of the left camera.
+        stopwatch: timer of the stages.
     """
     scenario, terrain = mission.scenario, mission.terrain
     map_model = MapModel(mission.grid, true_heights(mission.grid, terrain.height_at), mission.rig)
-    scene = TrueScene(
-        true_pose, FloorRayCaster(terrain), Matchability(scenario, mission.illumination, terrain), map_model
-    )
+    matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)
+    scene = TrueScene(true_pose, FloorRayCaster(terrain), matchability, map_model)
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(mission.rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

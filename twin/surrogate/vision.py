@@ -1,10 +1,11 @@
 """Visual measurements of a surrogate survey: true values with errors sampled from an error model.
 
 The surrogate is part of the simulated world: it uses the truth and returns only measurements, each with the covariance
-that the image-based estimators would report. A raster of points represents all matched points of a keyframe; its noise
-is reduced because the matched points outnumber the raster points. Links are computed from the raster points by the same
-equations as from matched points. The noise of a stereo pair is sampled once and enters all links of the keyframe: in
-full if the keyframe is the later one of the link, otherwise with the fraction `ErrorModel.match_bias_fraction`.
+that the image-based estimators would report. A raster of points represents all matched points of a keyframe. As one
+raster point stands for several matched points, its noise is that of their mean. Links are computed from the raster
+points by the same equations as from matched points. The noise of a stereo pair is sampled once and enters all links of
+the keyframe: in full if the keyframe is the later one of the link, otherwise with the fraction
+`ErrorModel.match_bias_fraction`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from twin.surrogate.matchability import Matchability
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _RASTER = (6, 8)  # rows and columns of the raster of points
-_RELIEF_CELLS = 128  # period of the errors due to relief, in floor cells
+_RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
 
@@ -47,13 +48,13 @@ class _KeyframeTruth(NamedTuple):
 
     Args:
         pose: (4, 4) true pose.
-        points: (n, 3) points of the raster on the floor, normalised (x, y, disparity).
+        points: (n, 3) raster points that show the floor in both images, normalised (x, y, disparity).
         raster_indices: (n,) index of each point in the raster.
         noise: (rows, cols, 3) standard normal numbers of the stereo errors of the raster points.
         bound_px: Cramer-Rao bound of a patch's position [px].
         unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
         n_points: number of matched points that the raster points represent.
-        unit_cov: (6, 6) covariance of a motion estimated from flow of unit standard deviation and known depth.
+        unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
         unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
         cells: (n,) floor cells of the points.
     """
@@ -71,7 +72,7 @@ class _KeyframeTruth(NamedTuple):
 
 
 class FrameErrors(NamedTuple):
-    """Distribution of the errors of frame-to-frame motions since the last keyframe.
+    """Distribution of the errors of frame-to-frame motions until the next keyframe.
 
     Args:
         root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
@@ -178,7 +179,11 @@ class SurrogateVision:
         return len(self._latest.points) / self._latest.n_points
 
     def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the translation length of a motion (4, 4) times the mean inverse depth of the last keyframe."""
+        """Returns the length of a motion's translation in units of depth: times the last keyframe's mean inverse depth.
+
+        Args:
+            a_from_b: (4, 4) motion.
+        """
         assert self._latest is not None
         return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._latest.points[:, 2]) / self.rig.baseline_m)
 
@@ -196,7 +201,7 @@ class SurrogateVision:
 
     @property
     def frame_errors(self) -> FrameErrors | None:
-        """Returns the error distribution of F2F motions since the last keyframe; None without points to track."""
+        """Returns the error distribution of the current F2F motions; None if there are no points to track."""
         return self._f2f
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
@@ -229,12 +234,14 @@ class SurrogateVision:
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * sigma_px**2, (n, 3, 3))
             pixels, around_px = self._pixels[hits].astype(np.float32), self.rig.focal_px * measured[:, 2]
-            return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz)
+            return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns which of the raster points with these indices (n,) lie well inside both images.
+        """Returns the mask (n,) of the raster points whose patches lie inside both images, with a margin.
 
-        `depth_m` contains the depth of every raster point [m].
+        Args:
+            indices: (n,) indices of the points in the raster.
+            depth_m: depth of every point of the raster [m].
         """
         shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[indices]
         left_px, right_px = self._pixels[indices], self._pixels[indices]
@@ -251,7 +258,11 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns the Cholesky factor and covariance (6, 6) of a motion for a standard deviation of flow [px]."""
+        """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow.
+
+        Args:
+            sigma_px: standard deviation of a flow vector.
+        """
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2
@@ -282,12 +293,21 @@ class SurrogateVision:
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
         return self.sample_links(node, others, self.model)
 
+    def epipolar_error(self) -> None:
+        return None
+
     def discard(self, numbers: range) -> None:
         for number in numbers:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        """Samples the motions that `measure_motions` returns, for the given error model."""
+        """Returns links as `measure_motions` does, sampled from the given error model.
+
+        Args:
+            node: the later keyframe of all links.
+            others: the earlier keyframes.
+            model: error model of the measurements.
+        """
         with self.stopwatch("network"):
             assert self._latest is not None
             later = self._keyframes.get(node.number, self._latest)
@@ -296,9 +316,15 @@ class SurrogateVision:
     def _sample_link(
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes: one least-squares step from the true motion with noisy points.
+        """Samples the motion between two keyframes; None if too few points would be matched.
 
-        The random numbers depend on the two keyframe numbers only, not on the order in which links are measured.
+        The motion is estimated from noisy points, in one least-squares iteration that starts at the true motion. The
+        random numbers depend only on the two keyframe numbers, not on the order in which links are measured.
+
+        Args:
+            later, earlier: the two keyframes.
+            number, other: their numbers, in the same order.
+            model: error model of the measurements.
         """
         bound_px = max(later.bound_px, earlier.bound_px)
         n = len(later.points)
@@ -324,7 +350,7 @@ class SurrogateVision:
         return Motion(motion, cov, n_matched, 1.0)
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
-        """Returns the standard normal numbers (n, 3) of a link between two keyframes."""
+        """Returns the standard normal numbers (n, 3) of a link, which depend only on its two keyframe numbers."""
         state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
         with self._link_lock:  # links may be measured in several threads at once
             self._link_rng.bit_generator.state = state
@@ -353,7 +379,7 @@ class SurrogateVision:
         return mapper.result()
 
     def draw_normals(self, n: int) -> Array:
-        """Returns the next standard normal numbers (n, 6) of the stream, which is generated in blocks."""
+        """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""
         while self._n_used + n > len(self._normals):
             fresh = self._rng.standard_normal((_BLOCK, 6))
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0

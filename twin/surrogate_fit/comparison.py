@@ -1,9 +1,9 @@
 """Statistics that compare image measurements with surrogate measurements and with the truth, for the fit.
 
 During a rendered survey, every measurement is made in the images and is also sampled by the surrogate at the same true
-poses. The statistics are standard deviations reported for the image measurements, relative to those that the surrogate
-reports, and errors relative to the truth. Image and surrogate measurements have the same geometry, so the ratios depend
-on the error model alone.
+poses. The statistics are ratios of the reported standard deviations (image measurement / surrogate), and errors
+relative to the truth, normalised by reported covariances. Image and surrogate measurements have the same geometry, so
+the ratios depend on the error model alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, MapGrid, SurveyResult
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision.keyframes import Keyframe
@@ -24,8 +25,8 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate.error_model import ErrorModel, SigmaLaw
 from twin.surrogate.vision import SurrogateVision
 
-_MIN_CELLS = 300
-_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # rise over run; level cells are below the first, steep cells above the second
+_MIN_CELLS = 300  # a map statistic needs more cells than this
+_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # rise over run: level cells have less than the first, steep more than the second
 _NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
 #: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
@@ -42,7 +43,7 @@ class ComparisonVision:
     Attributes:
         statistics: samples by name. `..._sigma_ratio` is the ratio of the standard deviation reported for the image
             measurement to the one that the surrogate reports. `..._nees...` is a squared error normalised by a reported
-            covariance, per degree of freedom.
+            covariance, divided by the number of degrees of freedom.
     """
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
@@ -107,12 +108,15 @@ class ComparisonVision:
         self.images.rebuild_mosaic(keyframes)
         self.surrogate.rebuild_mosaic(keyframes)
 
+    def epipolar_error(self) -> EpipolarError | None:
+        return self.images.epipolar_error()
+
     def discard(self, numbers: range) -> None:
         self.images.discard(numbers)
         self.surrogate.discard(numbers)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns the links measured in images; compares them with sampled links.
+        """Returns the links measured in images, and adds statistics of their comparison with sampled links.
 
         Links are sampled with all errors and with one error source at a time (`single_error_models`).
         """
@@ -158,9 +162,10 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images; compares it with sampled maps along the same path.
+        """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
-        The sampled maps contain the pose errors alone, pose and depth errors, and pose and lateral errors.
+        There are three sampled maps: with pose errors alone, with pose and depth errors, and with pose and lateral
+        errors.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         models = {
@@ -178,7 +183,9 @@ class ComparisonVision:
         return elevation
 
     def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds robust variance of height errors and median reported variance [m^2], for level and for steep cells.
+        """Adds the robust variance (NMAD squared) of a map's height errors and its median reported variance [m^2].
+
+        Both are computed for level and for steep cells separately.
 
         Args:
             source: name of the map in the statistics.
@@ -196,7 +203,10 @@ class ComparisonVision:
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
-    """Returns two error models by name, each with one source of link errors: patch matching ("patches"), "relief"."""
+    """Returns two error models by name, for links: "patches" without errors due to relief, "relief" without any others.
+
+    The other parameters are those of `model`.
+    """
     return {
         "patches": model._replace(
             match_error_ratio=1.0, lamp_error_growth=0.0, match_bias_fraction=BIAS_FRACTION, relief_gain=0.0
@@ -211,5 +221,5 @@ def _chi2(error: Array, cov: Array) -> float:
 
 
 def _sigma_ratio(cov: Array, other: Array) -> float:
-    """Returns the ratio of the standard deviations of two covariances, as the geometric mean over all directions."""
+    """Returns the ratio of the standard deviations of two covariances (n, n), the geometric mean over n directions."""
     return float(np.exp((np.linalg.slogdet(cov)[1] - np.linalg.slogdet(other)[1]) / (2 * len(cov))))

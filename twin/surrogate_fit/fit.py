@@ -1,8 +1,9 @@
 """Fit of the error model to the statistics of rendered surveys.
 
-The laws of the reported standard deviations are fitted to ratios between image measurements and surrogate. The error
-ratios are fitted to squared errors normalised by the reported covariance. Medians and trimmed means make the fit robust
-against a few failed measurements. Every survey has the same weight.
+The functions that model reported standard deviations (`SigmaLaw`) are fitted to the ratios of the standard deviations
+reported for image measurements and by the surrogate. The error ratios are fitted to squared errors normalised by the
+reported covariance. Medians and trimmed means make the fit robust against a few failed measurements. Every survey has
+the same weight.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ def _rms_log_ratio(surveys: Sequence[SurveyStatistics], ratio: str, compared: Si
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Fits a law to standard deviations (n,) [px] at Cramer-Rao bounds (n,) [px] by least squares of log ratios."""
+    """Fits a `SigmaLaw` to standard deviations (n,) [px] at Cramer-Rao bounds (n,) [px]; residuals are log ratios."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
@@ -112,7 +113,7 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
 
 
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
-    """Fits `maximum` and `half_px` of a law with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px]."""
+    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px] by least squares."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
@@ -126,8 +127,8 @@ def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
     """Fits the anticorrelation u of consecutive frame-to-frame motions to the error accumulated over n frames.
 
-    If each frame cancels the fraction u of the previous frame's error, the variance over n frames is
-    (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) times the variance over n independent frames.
+    If each motion cancels the fraction u of the independent error of the previous motion, the variance of the sum of n
+    motions is (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) times that of n uncorrelated motions of equal variance.
     """
     n = float(np.median(statistics["f2f_interval_frames"]))
     ratio = np.median(statistics["f2f_interval_nees"]) / np.median(statistics["f2f_nees"])
@@ -141,10 +142,11 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
     Errors due to relief grow with the distance between the keyframes; errors of patch matching do not. The links of
     each survey are therefore sorted by distance and divided into thirds, and one relief gain is fitted to the mean
     squared errors of all thirds of all surveys. Over a smooth floor the errors do not determine the relief gain, so
-    the gain of the compared model is added as an observation.
+    the gain of the compared model, or a larger minimum value, is added as an observation.
 
-    A keyframe's bias makes the errors of two consecutive links cancel, because the keyframe ends the first link and
-    starts the second. Relief makes the two errors equal. The bias fraction is fitted to the products of such errors.
+    A keyframe's bias makes the errors of two consecutive links cancel partly, because the keyframe ends the first link
+    and starts the second. Relief makes the two errors equal. The bias fraction is fitted to the scalar products of the
+    errors of consecutive links.
     (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated errors.)
 
     Args:
@@ -152,8 +154,8 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
         compared_gain: relief gain of the compared model.
 
     Returns:
-        For each survey, the ratio (n,) of the errors of patch matching to those of the "patches" model of
-        `single_error_models`; the relief gain; the bias fraction.
+        Ratio (n,) of each survey's patch-matching errors to those of the "patches" model of `single_error_models`;
+        relief gain; bias fraction.
     """
     thirds = np.array([_squared_errors_by_distance(s) for s in surveys])
     images, by_patches, by_relief = thirds.transpose(2, 0, 1)
@@ -186,9 +188,10 @@ def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
-    """Returns mean squared link errors (3, 3): one row per third of the links by distance, one column per source.
+    """Returns mean normalised squared link errors (3, 3), with a row per third of the links and a column per source.
 
-    The sources are those of `_SOURCES`. The largest 5 % of the squared errors in each third are excluded.
+    The links are divided into thirds by distance. The sources are those of `_SOURCES`. The largest 5 % of the squared
+    errors in each third are excluded.
     """
     errors = np.column_stack([statistics[f"link_nees_{name}"] for name in _SOURCES])
     order = np.argsort(statistics["link_distance"])
@@ -204,8 +207,8 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     1 + (growth * distance)^2 / 2. The distance is in units of the mean depth.
 
     Returns:
-        Growth, and for each of n surveys the ratio of the standard deviation reported for links from images to the one
-        that the surrogate reports, at distance zero (n,).
+        Growth; and the ratio (n,) of the standard deviation reported for a survey's links from images to the one that
+        the surrogate reports, extrapolated to distance zero.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -225,11 +228,12 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
 
 def _fit_map_variances(statistics: SurveyStatistics, quantity: str) -> np.ndarray:
-    """Returns factors (2,) on the surrogate's depth and lateral variances that reproduce the variances of the map.
+    """Returns factors (2,) on the surrogate's depth and lateral variances that reproduce the map from images.
 
-    The factors are fitted to the variances of level and of steep cells in the map from images.
+    The factors are fitted to the variances of level and of steep cells of that map.
 
     Args:
+        statistics: statistics of one survey.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
     """
     names = [name for name in ("level", "steep") if f"map_{quantity}_{name}_images" in statistics]

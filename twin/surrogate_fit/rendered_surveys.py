@@ -27,11 +27,11 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     """Returns the error model fitted to rendered surveys.
 
     Args:
-        surveys: statistics of each survey; aborted surveys are ignored.
+        surveys: statistics of each survey; surveys without link or map statistics, e.g. aborted ones, are ignored.
         compared: error model of the surrogate with which the surveys were compared.
 
     Raises:
-        TwinError: too few surveys are complete.
+        TwinError: fewer than two surveys have complete statistics.
     """
     complete = [s for s in surveys if "consecutive_product_images" in s and "map_error_level_images" in s]
     if len(complete) < _MIN_SURVEYS:
@@ -41,9 +41,9 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Returns the comparison statistics of a rendered survey.
+    """Returns the statistics of a rendered survey's comparison with the surrogate.
 
-    If the statistics for the same scenario and error model are in the folder, reads them; otherwise flies the survey.
+    Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey.
 
     Args:
         scenario: description of the survey.
@@ -64,7 +64,7 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
 
 
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Flies a rendered survey and saves its statistics, which are incomplete if the survey was aborted."""
+    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted."""
     mission, stopwatch = prepare(scenario), Stopwatch()
     folder.mkdir(parents=True, exist_ok=True)
     with RenderedWorld(mission, stopwatch) as world:

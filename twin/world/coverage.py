@@ -1,4 +1,4 @@
-"""Map cells that both cameras observed in at least one keyframe, computed from true depth images."""
+"""Coverage: the map cells that both cameras saw in at least one keyframe, computed from true depth images."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid, StereoRig
 
-#: Four neighbouring pixels whose depths differ by more than this fraction span an occluding edge. With pixels of
-#: 0.2 deg, a surface reaches this limit at 86 deg to the image plane.
+#: Four neighbouring pixels whose depths differ by more than this fraction are taken to span an occluding edge. If
+#: pixels are 0.2 deg apart, a continuous surface inclined at 86 deg to the image plane reaches this limit.
 EDGE_SHARE = 0.05
 #: Tolerance of the left-right depth comparison, as a fraction of the depth.
 DEPTH_TOLERANCE = 0.005
@@ -26,7 +26,7 @@ class Coverage:
 
     Args:
         grid: grid of the map.
-        rig: calibration that applies to the depth images.
+        rig: calibration of the cameras of the depth images.
 
     Attributes:
         seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
@@ -52,10 +52,11 @@ class Coverage:
 
 
 def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
-    """Returns the true height at the cell centres (rows, cols) [m].
+    """Returns the true height of the floor at the cell centres (rows, cols) [m].
 
     Args:
-        height_at: returns the heights at arrays x and y of equal shape [m].
+        grid: grid of the map.
+        height_at: returns the heights [m] at arrays x and y [m] of equal shape.
     """
     x, y = grid.centres()
     height = np.empty((grid.rows, grid.cols), np.float32)
@@ -68,8 +69,8 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> N
 def _mark_seen(seen, raster, pose, camera, left, right):
     """Compiled kernel of `Coverage.add`.
 
-    Projects the pixels of two neighbouring image rows at a time onto the grid. Marks the cells in the quads between
-    four neighbouring pixels that both cameras see.
+    Projects the floor points of two neighbouring image rows at a time onto the grid. Marks the cells whose centres lie
+    in the quad between four neighbouring pixels, if both cameras see their floor points and no edge lies between them.
     """
     height, width = left.shape
     col, row = np.zeros((2, width)), np.zeros((2, width))

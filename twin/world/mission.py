@@ -1,4 +1,4 @@
-"""Missions: scenario, floor, plan and map grid of a survey, checked before the flight."""
+"""Mission: the scenario of a survey with its floor, plan and map grid, checked before the flight."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import terrains
-from controllers import lawnmower, loops, segments
-from controllers.forecast import least_clearance
-from controllers.survey_plan import SurveyPlan, SurveyRequest
+from controllers import segments
+from controllers.survey_plan import SurveyPlan
+from controllers.tracking import rotate_lever_arm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
@@ -22,9 +22,14 @@ from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
 from twin.scenario.model import BeaconConfig, CalibrationErrorConfig, Scenario, SensorConfig, Source
 from twin.simulate.autopilot import top_speed_mps
+from twin.world.clearance import planned_clearance
+from twin.world.limits import check_map_size
+from twin.world.planning import plan_survey
+from twin.world.thrust_authority import check_thrust
 
-#: Distance between the points of the path at which the height of a lamp above the floor is checked.
-LAMP_STEP_M = 0.02
+#: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
+#: number of these points; on longer paths they are farther apart.
+LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
 
 
 class Step(NamedTuple):
@@ -86,8 +91,9 @@ class Mission:
 
     @property
     def start(self) -> Array:
-        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow to the east."""
-        return geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, self.plan.reference(1, 0.0).position)
+        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow along the first leg."""
+        start = self.plan.reference(1, 0.0)
+        return geometry.pose(geometry.rotations_of_down_camera(np.asarray(start.yaw)), start.position)
 
     @property
     def start_of_body(self) -> Array:
@@ -95,14 +101,14 @@ class Mission:
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
     def fly(self, track: int) -> Course:
-        """Returns the course along a track (numbered from 1); every N-th frame and the last one are keyframes."""
+        """Returns the planned frames of a track (numbered from 1), without the station keeping after it."""
         times_s, keyframes = self.plan.frames_of_track(track)
         return Course(self.plan.references(track, times_s), keyframes, holding=False)
 
     def hold(self, track: int) -> Course:
-        """Returns the course of half the station keeping after a track (numbered from 1).
+        """Returns the planned frames of half the station keeping after a track (numbered from 1).
 
-        It is flown twice, before and after the global alignment.
+        The survey flies them twice: before and after the global alignment.
         """
         n = self._n_holding
         end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
@@ -114,7 +120,7 @@ class Mission:
 
     @property
     def n_frames(self) -> int:
-        """Returns the number of frames of the whole survey, with station keeping."""
+        """Returns the number of frames of the whole survey, including station keeping."""
         return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
     @property
@@ -132,7 +138,7 @@ def prepare(scenario: Scenario) -> Mission:
     errors: list[str] = []
     source = scenario.source
     terrain = _attempt(lambda: load_terrain(scenario), source, errors)
-    plan = _attempt(lambda: make_plan(scenario), source, errors)
+    plan = _attempt(lambda: plan_survey(scenario, terrain), source, errors)
     _attempt(lambda: _check_speed(scenario), source, errors)
     _attempt(lambda: _check_current(scenario), source, errors)
     if (sensor := scenario.sensor) is not None:
@@ -149,11 +155,14 @@ def prepare(scenario: Scenario) -> Mission:
             _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, errors)
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_clearance(scenario, terrain, plan), source, errors)
+        _attempt(lambda: check_thrust(scenario, plan), source, errors)
         for k in range(len(scenario.lamps)):
             _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, errors)
-    if errors or terrain is None or plan is None or true_cameras is None or illumination is None:
+    grid = None
+    if terrain is not None and plan is not None:
+        grid = _attempt(lambda: _grid(scenario, plan, terrain), source, errors)
+    if errors or terrain is None or plan is None or grid is None or true_cameras is None or illumination is None:
         raise ScenarioError(errors)
-    grid = _grid(scenario, plan)
     return Mission(scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination)
 
 
@@ -174,8 +183,9 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     """
     t = scenario.terrain
     if t.kind != "file":
-        if t.height_file or t.texture_file:
-            key = "height_file" if t.height_file else "texture_file"
+        given = [key for key in ("height_file", "texture_file", "z") if getattr(t, key)]
+        if given:
+            key = given[0]
             raise TwinError(
                 f"terrain.{key}",
                 f"has no effect on a generated floor (terrain.kind = {t.kind!r})",
@@ -186,29 +196,12 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
     return terrains.load(
-        t.height_file, t.texture_file, t.texture_px_m, t.height_spacing_m, t.height_range_m, scenario.seed
+        t.height_file, t.texture_file, t.texture_px_m, t.height_spacing_m, t.height_range_m, scenario.seed, t.z
     )
 
 
-_PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
-
-
-def make_plan(scenario: Scenario) -> SurveyPlan:
-    """Plans the survey of a scenario.
-
-    Raises:
-        TwinError: no plan satisfies the scenario.
-    """
-    p, rig = scenario.plan, scenario.believed_rig()
-    request = SurveyRequest(
-        p.area_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across, p.tracks,
-        rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz,
-    )  # fmt: skip
-    return _PATTERNS[p.pattern](request)
-
-
 def _check_speed(scenario: Scenario) -> None:
-    """Checks that the thrusters reach the planned speed: ahead, and for loops in every horizontal direction."""
+    """Raises TwinError if `plan.speed_mps` exceeds the top speed ahead or, for loops, the least over all directions."""
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
@@ -221,7 +214,7 @@ def _check_speed(scenario: Scenario) -> None:
 
 
 def _check_surrogate(scenario: Scenario) -> None:
-    """Rejects effects that the surrogate does not model."""
+    """Raises TwinError if a surrogate survey has a port, calibration errors or marine snow, which are not modelled."""
     if scenario.imaging.fidelity == "rendered":
         return
     plain = scenario.port.kind == "none" and scenario.calibration_error == CalibrationErrorConfig()
@@ -252,7 +245,7 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
 
 
 def _check_current(scenario: Scenario) -> None:
-    """Raises TwinError if a kinematic vehicle has a current: a current has no effect on kinematic motion."""
+    """Raises TwinError if the scenario combines a current with a kinematic vehicle, on which it has no effect."""
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
         raise TwinError(
             "current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
@@ -271,12 +264,15 @@ def _illumination(scenario: Scenario) -> Illumination:
 
 
 def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Checks that a lamp stays above the floor along the whole path, with the bow to the east."""
+    """Raises TwinError if a lamp is below the floor anywhere on the path, for any heading of the bow on the legs."""
     corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
     offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    along = np.append(np.arange(0.0, lengths[-1], LAMP_STEP_M), lengths[-1])
-    x, y, z = (np.interp(along, lengths, corners[:, k]) + offset[k] for k in range(3))
+    along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
+    x, y = (np.interp(along, lengths, corners[:, k]) for k in range(2))
+    camera = np.column_stack([x, y, plan.camera_height_at(x, y)])
+    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + plan.turns_on_the_spot]
+    x, y, z = np.concatenate([camera + rotate_lever_arm(heading, offset) for heading in headings]).T
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
     if (least := above.min()) < 0:
         raise TwinError(
@@ -295,7 +291,7 @@ def _check_exposure(sensor: SensorConfig) -> None:
 
 
 def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
-    """Checks that the sensor time `sensor.<key>` is at most one frame interval."""
+    """Raises TwinError if the time `sensor.<key>` is longer than the interval between frames."""
     if time_ms > 1000 / frame_rate_hz:
         raise TwinError(
             f"sensor.{key}", f"{time_ms:g}: longer than a frame",
@@ -304,16 +300,18 @@ def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
 
 
 def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Checks that the path stays over the terrain, with at least the required clearance."""
-    size = terrain.size_m
-    if any(a > s for a, s in zip(scenario.plan.area_m, size, strict=True)):
+    """Raises TwinError if the area is larger than the terrain, or the path leaves it or has too little clearance."""
+    size, outline = terrain.size_m, plan.area.outline()
+    extent = f"{size[0]:.2f} x {size[1]:.2f} m"
+    # a tolerance: rotation rounds the corners of an area as large as the terrain
+    if (np.ptp(outline, axis=0) > np.array(size) + 1e-9).any():
         shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
-        raise TwinError(
-            "plan.area_m", f"{shown} m is larger than the terrain", f"up to {size[0]:.2f} x {size[1]:.2f} m"
-        )
-    clearance = least_clearance(plan, terrain.height_at)
+        turned = f" at a heading of {scenario.plan.heading_deg:g} deg" if scenario.plan.heading_deg else ""
+        raise TwinError("plan.area_m", f"{shown} m{turned} is larger than the terrain", f"up to {extent}")
+    clearance = planned_clearance(plan, terrain)
     if not clearance.inside:
-        raise TwinError("plan.area_m", "the path leaves the terrain", f"a path inside {size[0]:.2f} x {size[1]:.2f} m")
+        field = "plan.area_m" if scenario.plan.polygon is None else "plan.polygon"
+        raise TwinError(field, "the path leaves the terrain", f"a path inside {extent}")
     if clearance.least_m < scenario.plan.clearance_m:
         needed = scenario.plan.altitude_m - clearance.least_m + scenario.plan.clearance_m
         raise TwinError(
@@ -324,12 +322,37 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
         )
 
 
-def _grid(scenario: Scenario, plan: SurveyPlan) -> MapGrid:
-    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
+def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
+    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m.
+
+    Raises:
+        TwinError: the grid has more cells than `limits.MAX_MAP_CELLS`.
+    """
     corners = plan.outline()[:, :2]
-    across_m, along_m = plan.footprint_m
-    margin = np.array([along_m, across_m]) / 2 + 0.5
+    margin = np.array(_half_extent_m(plan)) * _widest(plan, terrain) + 0.5
     cell = scenario.map.cell_m
     west, south = np.floor((corners.min(axis=0) - margin) / cell) * cell
     east, north = np.ceil((corners.max(axis=0) + margin) / cell) * cell
-    return MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))
+    grid = MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))
+    check_map_size(grid)
+    return grid
+
+
+def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
+    """Returns half the extent of a footprint along x and y [m], the largest for any heading of the bow on the path."""
+    across_m, along_m = plan.footprint_m
+    if plan.turns_on_the_spot:
+        diagonal_m = float(np.hypot(along_m, across_m))
+        return diagonal_m / 2, diagonal_m / 2
+    c, s = abs(np.cos(plan.area.heading)), abs(np.sin(plan.area.heading))
+    return float(c * along_m + s * across_m) / 2, float(s * along_m + c * across_m) / 2
+
+
+def _widest(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
+    """Returns an upper bound of the size of the footprints, as a multiple of the footprint at `plan.altitude_m`."""
+    if plan.surface is None:
+        return 1.0
+    highest_m = max(
+        plan.references(t, plan.frames_of_track(t)[0]).position[:, 2].max() for t in range(1, plan.n_tracks + 1)
+    )
+    return max(1.0, float(highest_m - terrain.lowest_m) / plan.altitude_m)

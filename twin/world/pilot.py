@@ -16,14 +16,14 @@ from twin.core.records import Estimate
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
 
-_VELOCITY_SMOOTHING_S = 0.1  # time constant: velocity from F2F is noisy, the true velocity changes more slowly
+_VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is noisy, the true velocity varies slowly
 
 
 PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot, which maps the estimate and the reference of the left camera to the vehicle command."""
+    """Returns the pilot: a function from the estimate and the reference of the left camera to the vehicle command."""
     return RovPilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
 
 

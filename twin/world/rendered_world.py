@@ -1,4 +1,4 @@
-"""The simulated world with rendered images."""
+"""Simulated world with rendered images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
-    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water. Owns a GL context."""
+    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water.
+
+    It holds an OpenGL context, which `close` releases.
+    """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer):
         scenario, cameras = mission.scenario, mission.true_cameras

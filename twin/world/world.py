@@ -26,11 +26,12 @@ if TYPE_CHECKING:
 
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
-#: Names of the random streams, in the order in which their seeds are spawned: a stream added at the end leaves the
-#: others unchanged.
+#: Names of the random streams, in the order in which their seeds are spawned. Add a new stream at the end, to keep the
+#: random numbers of the others.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
 
-#: Simulates frames of a course from index k, at most up to the next keyframe; returns the index of the next frame.
+#: Simulates the frames of a course from index k, at most up to the next keyframe; returns the index of the first frame
+#: that it did not simulate.
 FastForward = Callable[[Course, int], int]
 
 
@@ -48,7 +49,7 @@ class CameraImages(NamedTuple):
 
 
 class World(ABC):
-    """The simulated world of a mission. Use as a context manager.
+    """Simulated world of a mission. Use as a context manager.
 
     Attributes:
         warnings: limitations of this world that the user should know about.
@@ -65,7 +66,7 @@ class World(ABC):
     ):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         self._true_poses = GrowingArray(4, 4)
-        self._courses: list[tuple[Array, bool, int]] = []  # planned positions (n, 3), station keeping, track
+        self._courses: list[tuple[Course, int]] = []  # each with the number of its track
 
     def __enter__(self) -> Self:
         return self
@@ -95,7 +96,7 @@ class World(ABC):
 
         The caller must simulate all frames of a course before it starts another one, unless the survey is aborted.
         """
-        self._courses.append((course.reference.position, course.holding, track))
+        self._courses.append((course, track))
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""
@@ -132,15 +133,19 @@ class World(ABC):
 
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far."""
-        n, courses = len(self), [(np.empty((0, 3)), False, 0), *self._courses]
-        lengths = [len(positions) for positions, _, _ in courses]
+        n, courses = len(self), self._courses
+        lengths = np.array([len(course) for course, _ in courses], np.int64)
+        positions = [np.empty((0, 3)), *(course.reference.position for course, _ in courses)]
+        yaws = [np.empty(0), *(np.asarray(course.reference.yaw) for course, _ in courses)]
         return Truth(
             trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
-            reference=np.concatenate([positions for positions, _, _ in courses])[:n],
-            holding=np.repeat([holding for _, holding, _ in courses], lengths)[:n],
-            track=np.repeat([track for _, _, track in courses], lengths)[:n],
+            reference=np.concatenate(positions)[:n],
+            holding=np.repeat(np.array([course.holding for course, _ in courses], np.bool_), lengths)[:n],
+            track=np.repeat(np.array([track for _, track in courses], np.int64), lengths)[:n],
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
+            asked=self.mission.plan.inside_area(*np.meshgrid(*self.mission.grid.centres())),
+            reference_yaw=np.concatenate(yaws)[:n],
         )
 
 
@@ -150,6 +155,6 @@ def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
-    """Returns the random streams of a survey by name."""
+    """Returns the random generators of a survey by the name of their stream."""
     seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}

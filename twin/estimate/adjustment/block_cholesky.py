@@ -7,8 +7,8 @@ rows below them.
 
 Blocks of the inverse are computed from the last panel to the first (Takahashi et al. 1973). Let cov be the inverse,
 "own" the rows of the panel, "below" the rows of L2, and W = L2 L1^-1. Then cov(below, own) = -cov(below) W and
-cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold cov(below), which has replaced their part of the
-factor.
+cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold blocks of the inverse, among them
+cov(below), in place of the factor.
 
 In the kernels, s is the `SymbolicFactor`, p a panel and `_D` the size of a block.
 """
@@ -25,7 +25,7 @@ from twin.core.geometry import Array
 from twin.estimate.adjustment.elimination import BLOCK as _D
 from twin.estimate.adjustment.elimination import SymbolicFactor
 
-_MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; below it, the matrix is singular
+_MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smaller pivot counts as singular
 
 
 class CholeskyFactor(NamedTuple):
@@ -50,8 +50,8 @@ class CholeskyFactor(NamedTuple):
     def inverse_block(self, node: int) -> Array:
         """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node.
 
-        The block is y'y with y = L^-1 e, where e is the node's columns of the identity matrix. Only the node's panel
-        and its ancestors in the elimination tree contribute.
+        The block is y'y with y = L^-1 e, where e consists of the node's six columns of the identity matrix. Only the
+        node's panel and its ancestors in the elimination tree contribute.
         """
         s = self.symbolic
         right, block = np.zeros((len(s.permutation), _D, _D)), np.zeros((_D, _D))
@@ -100,7 +100,7 @@ class BlockMatrix(NamedTuple):
         self.panels[:] = 0.0
 
     def add(self, first: int, blocks: Array) -> None:
-        """Adds blocks (k, 6, 6) to the off-diagonal blocks `first` to `first` + k - 1, numbered as in `analyse`."""
+        """Adds blocks (k, 6, 6) to the k off-diagonal blocks from index `first`, in the order given to `analyse`."""
         _add(self.symbolic, first, blocks, self.panels)
 
     def factorise(self, diagonal: Array) -> CholeskyFactor:
@@ -155,7 +155,7 @@ def _factorise(s, original, panels):
     """Replaces each panel by L1^-1 above L2. Returns False if the matrix is singular.
 
     Args:
-        original: (6 n,) diagonal entries of the matrix before elimination, by position.
+        original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.
     """
     for p in range(len(s.panel_start) - 1):
         n, panel = _D * (s.panel_start[p + 1] - s.panel_start[p]), _panel_matrix(s, panels, p)
@@ -181,7 +181,7 @@ def _invert_root(matrix, original, inverse):
 
     Args:
         matrix: (n, n), only the lower triangle is read.
-        original: (n,) diagonal of the matrix before elimination; a pivot much smaller than its entry is rounding error.
+        original: (n,) diagonal before elimination; a pivot that is tiny relative to its entry is only rounding error.
         inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
     root = np.zeros_like(matrix)
@@ -264,7 +264,7 @@ def _invert(s, panels, diagonal):
     """Replaces the factor by the blocks of the inverse with the same sparsity pattern.
 
     Args:
-        diagonal: (n, 6, 6), filled with the diagonal blocks by position.
+        diagonal: (n, 6, 6), filled with the diagonal blocks of the inverse, in elimination order.
     """
     for p in range(len(s.panel_start) - 2, -1, -1):
         panel, width = _panel_matrix(s, panels, p), s.panel_start[p + 1] - s.panel_start[p]
@@ -290,7 +290,7 @@ def _invert(s, panels, diagonal):
 
 @njit(cache=True, nogil=True)
 def _solve_in_place(s, panels, x):
-    """Solves for a right-hand side x (6 n,) ordered by position, and overwrites x with the solution."""
+    """Solves for a right-hand side x (6 n,) in elimination order, and overwrites x with the solution."""
     for p in range(len(s.panel_start) - 1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)

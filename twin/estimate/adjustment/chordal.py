@@ -1,8 +1,9 @@
 """Solution of a pose graph without initial poses, by chordal initialisation (Carlone et al. 2015).
 
 Integrated odometry gives poor initial poses for a graph with large rotation errors. Chordal initialisation uses the
-rotation R_ij and the translation t_ij of each link. It first solves R_j = R_i R_ij for unconstrained 3 x 3 matrices by
-linear least squares, replaces them by the nearest rotations, and then solves p_j = p_i + R_i t_ij for the positions.
+rotation R_ij and the translation t_ij of each link. It first solves R_j = R_i R_ij by linear least squares for
+unconstrained 3 x 3 matrices R_i, replaces each by the nearest rotation, and then solves p_j = p_i + R_i t_ij for the
+positions p_i.
 """
 
 from __future__ import annotations
@@ -40,11 +41,12 @@ class PoseGraphSolution(NamedTuple):
 def solve_pose_graph(
     links: Sequence[Link], start: dict[int, Array] | None = None, huber: float | None = None
 ) -> PoseGraphSolution:
-    """Solves a pose graph with the node of the lowest number fixed at its initial pose.
+    """Returns the optimal poses of a pose graph; the node with the lowest number is fixed at its initial pose.
 
     Args:
         links: measured motions; they have to connect all nodes.
-        start: initial pose (4, 4) of every node; None: chordal initialisation with the first pose at the identity.
+        start: initial pose (4, 4) of every node; None: chordal initialisation with the pose of the first node at the
+            identity.
         huber: residual [standard deviations] above which the cost of a link grows linearly; None: least squares.
     """
     start = chordal_start(links) if start is None else start
@@ -60,8 +62,8 @@ def solve_pose_graph(
 def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
     """Returns initial poses (4, 4) by node number, computed from the links alone.
 
-    The pose of the node with the lowest number is the identity. A link is weighted by the inverse of its mean rotation
-    variance in the equations of the rotations, and of its mean translation variance in those of the positions.
+    The pose of the node with the lowest number is the identity. The weight of a link is the inverse of its mean
+    rotation variance when solving for the rotations, and of its mean translation variance for the positions.
     """
     columns = Links.from_sequence(links)
     numbers = np.unique(np.concatenate([columns.i, columns.j])).tolist()

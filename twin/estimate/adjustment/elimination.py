@@ -1,7 +1,7 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
 The elimination order is SuperLU's multiple minimum degree order of A' + A. Consecutive nodes whose columns have nearly
-the same sparsity pattern below the diagonal form a supernode. Its columns are stored as one dense matrix, a panel.
+the same sparsity pattern below the diagonal form a supernode, whose columns are stored as one dense matrix, a panel.
 """
 
 from __future__ import annotations

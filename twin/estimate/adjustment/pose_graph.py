@@ -1,13 +1,13 @@
 """Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
-The cost of the poses X is F(X) = sum over motions of rho(|log(Z_ij^-1 X_i^-1 X_j)|), where the residual is whitened by
-the covariance of the measured motion Z_ij, plus r^2 / 2 for each factor of a single pose with whitened residual norm r.
-rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt damping after a step that
-increased the cost. The increment d of a pose is a motion in the camera's own axes, X exp(d).
+The cost F of the poses X is the sum of rho(r) over the binary factors and of r^2 / 2 over the unary factors, where r is
+the norm of a factor's residual, whitened by its covariance. The residual of a measured motion Z_ij is
+log(Z_ij^-1 X_i^-1 X_j). rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt
+damping after a step that increased the cost. The increment d of a pose is a motion in the camera's own axes, X exp(d).
 
-One scalar parameter may be shared by all binary factors (the scale error of the DVL). It adds one row and one column,
-the border, to the normal equations of the poses. The bordered system is solved by the Schur complement of the block of
-the poses.
+One scalar parameter may be shared by all binary factors (the scale error of the DVL); F then includes its zero-mean
+Gaussian prior. The parameter adds one row and one column, the border, to the normal equations of the poses. The
+bordered system is solved by the Schur complement of the block of the poses.
 """
 
 from __future__ import annotations
@@ -134,11 +134,11 @@ class Solution(NamedTuple):
     Args:
         state: poses and shared parameter at the minimum.
         cost: F at the minimum.
-        chi2: (m,) squared norms of the whitened residuals of each kind of binary factors, without robust weights.
+        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
         converged: false if the iterations ended before the minimum was reached.
         cholesky: factor of the normal matrix of the poses, undamped.
-        border: (n, 6) derivative of the optimal poses with respect to the shared parameter, and the marginal
-            information of the shared parameter; None if there is no shared parameter.
+        border: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal
+            information of this parameter; None if there is no shared parameter.
     """
 
     state: GraphState
@@ -160,7 +160,7 @@ class Solution(NamedTuple):
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
     def _add_shared(self, covs: Array, rows: slice) -> Array:
-        """Returns the covariances of the poses `rows` plus the part due to the uncertainty of the shared parameter."""
+        """Returns the covariances of the poses `rows`, plus the part due to the uncertainty of the shared parameter."""
         if self.border is None:
             return covs
         by_shared, information = self.border
@@ -168,7 +168,7 @@ class Solution(NamedTuple):
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
-    """Returns the local minimum of the cost that is reached from `start`.
+    """Returns the local minimum of the cost reached by iteration from `start`.
 
     Args:
         max_iterations: largest number of linear solves, at least one.
@@ -253,7 +253,7 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns losses (m,) and weights (m,), given the squared norms (m,) of the whitened residuals."""
+    """Returns the losses rho (m,) and robust weights (m,), given the squared norms (m,) of the whitened residuals."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Gate of the innovation z - h of a depth z (variance R) measured where the filter has depth h (variance P):
-#: (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square with one degree of freedom.
+#: A measured depth z of variance R is accepted at a pixel where the filter has depth h of variance P if its innovation
+#: z - h satisfies (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square, one degree of freedom.
 GATE = 10.83
 #: Neighbouring pixels whose disparities differ by more than this [px] are on different surfaces; depth is not
 #: interpolated between them.
@@ -58,7 +58,10 @@ class PropagatedDepth(NamedTuple):
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
-    """Returns the depth map of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d."""
+    """Returns the depth map of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d.
+
+    f is the focal length [px], b the baseline [m] and d the disparity [px]; disparities below 0.5 px are set to 0.5 px.
+    """
     focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
     depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
     variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2
@@ -79,11 +82,11 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth.
 
-    Each pixel is linearised at the point given by its new stereo depth. This point is projected into the old image,
-    where the old map is interpolated bilinearly, except across depth discontinuities (backward warping leaves no holes
-    and needs no rounding). The difference between the old depth and the depth of the point in the old camera is
-    converted to a difference in depth along the ray of the new pixel, with the surface normal at the point. Pixels
-    without new stereo depth are linearised at the old depth that projects to them.
+    Each pixel of the new image is linearised at the point given by its new stereo depth. This point is projected into
+    the old image, where the old map is interpolated bilinearly, except across depth discontinuities (backward warping
+    leaves no holes and needs no rounding). The difference between the old depth and the depth of the point in the old
+    camera is converted, with the surface normal at the point, to a difference in depth along the ray of the new pixel.
+    A pixel without new stereo depth is linearised at the depth of the nearest old point that projects to it.
 
     Args:
         old: filtered depth of the old keyframe.
@@ -108,16 +111,17 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
 def motion_depth(
     gray: Map, old_gray: Map, current: DepthMap, old_from_new: Array, step_cov: Array, rig: StereoRig
 ) -> DepthMap:
-    """Computes depth from the flow between two keyframes (exact two-view form of Negahdaripour & Madjidi 2003, eq. 1).
+    """Computes depth from the optical flow between two keyframes.
 
-    The relative pose and the current depth predict the flow. The residual of the flow along the epipolar line is
-    measured with the same window as stereo disparity, and is linear in inverse depth. The covariance of the relative
+    This is the exact two-view form of eq. 1 of Negahdaripour & Madjidi (2003). The relative pose and the current depth
+    predict the flow. The difference between the actual and the predicted flow along the epipolar line is measured with
+    the same window as stereo disparity; it is linear in the error of the inverse depth. The covariance of the relative
     pose contributes to the variance of the depth.
 
     In rendered sequences (noise of 2 grey levels, true poses), the error of depth from motion, expressed as stereo
-    disparity, was 0.044 px over a reef and 0.063 px over a fractal floor. Both values are 0.9 times the computed
-    standard deviation; the bias was 0.001 px. Fusing depth from motion reduced the error of the filter from 0.045 to
-    0.035 px (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is not used: its bias of
+    disparity, was 0.044 px over a reef and 0.063 px over a fractal floor, in both cases 0.9 times the computed standard
+    deviation; the bias was 0.001 px. Fusing depth from motion reduced the error of the filter from 0.045 to 0.035 px
+    (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is not used: its bias of
     about 0.1 px is common to the whole image and would remain in the map.
 
     Args:
@@ -164,7 +168,7 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 @njit(cache=True, nogil=True)
 def _forward_project(old, rotation, translation, guess, camera):
-    """Fills unknown pixels of `guess` (H, W), in place, with the smallest depth of the old points projected to them."""
+    """Fills unknown pixels of `guess` (H, W), in place, with the depth of the nearest old point projected to them."""
     height, width = old.shape
     focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
@@ -240,7 +244,7 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 @njit(cache=True, nogil=True)
 def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map at the new image's pixels, linearised at the depth `guess`."""
+    """Returns depth and variance (H, W) of the old map, transferred to the new image by linearisation at `guess`."""
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))

@@ -28,20 +28,21 @@ class ElevationMapper:
     at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
     variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes the second hypothesis,
     or replaces the hypothesis with the larger variance if the variance of z is smaller. The lower hypothesis is the
-    result unless the variance of the higher one is at least ten times smaller, because matching windows extend near
-    surfaces over the floor behind them. In the cells of the horseshoe reef with two hypotheses, the lower one was right
-    in 82 %, the one with the smaller variance in 67 %, and the one chosen by this rule in 84 %.
+    result unless the variance of the higher one is more than ten times smaller, because a matching window at an edge
+    often assigns the height of the nearer surface to the floor behind it. In the cells of the horseshoe reef with two
+    hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %, and the one chosen by this
+    rule in 84 %.
 
     The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their part
     decreases with each fusion. Errors due to the pose and to the smoothing of slopes are common to all cells of a leg
-    and mostly to all legs; the weighted mean of their variances over the patches is kept, which does not decrease with
-    the number of patches.
+    and mostly to all legs, so their part is the weighted mean of the variances of the patches, which does not decrease
+    with the number of patches.
 
-    The variance of the result has three further terms. With f the lateral error divided by two cell sizes, these are
-    f^2 times the squared range of heights around the cell, f times the squared height step across the cell (only for
-    steps larger than a cell, where the cell may be on the wrong side of an edge), and the variance due to the choice
-    between two hypotheses. Without the term for steps, the standard deviation was 1.9 times too small over the whole
-    map of a reef, because 1 % of the cells, all at edges, have the height of the wrong side.
+    The variance of the result has three further terms. With f the standard deviation of the lateral error divided by
+    two cell sizes, these are f^2 times the squared range of heights around the cell, f times the squared height step
+    across the cell (only for steps larger than a cell, where the cell may be on the wrong side of an edge), and the
+    variance due to the choice between two hypotheses. Without the term for steps, the standard deviation was 1.9 times
+    too small over the whole map of a reef, because 1 % of the cells, all at edges, have the height of the wrong side.
 
     Args:
         grid: grid of the map.
@@ -59,8 +60,8 @@ class ElevationMapper:
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
-        A cell was propagated if the successor covers it with a pixel that inherited information, and the two heights
-        agree. The information on each cell therefore enters the map exactly once.
+        A cell was propagated if the successor covers it with a pixel that inherited information from this keyframe, and
+        the two heights agree. The information on each cell therefore enters the map exactly once.
 
         Args:
             patch: heights of a keyframe.

@@ -1,4 +1,4 @@
-"""Grid of the map over the area that the keyframe images of a survey cover."""
+"""Grid of a map that covers the keyframe images of a survey."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ _CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that seve
 
 
 def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = None) -> MapGrid:
-    """Returns the grid that covers the footprints of all keyframe images at the median depth of their matched points.
+    """Returns the grid that covers all keyframe images, each projected to the median depth of its matched points.
 
     Args:
         result: result of a survey with at least one keyframe.
-        cell_m: side of a cell [m]; by default three pixels at the median depth of the survey.
+        cell_m: side of a cell [m]; by default the size of three pixels at the median depth of all keyframes.
     """
     depth_m = result.keyframe_depth_m
     cell = cell_m or _CELL_PX * float(np.median(depth_m)) / rig.focal_px

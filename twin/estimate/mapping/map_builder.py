@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 #: Largest standard deviation of a stereo disparity that enters the map [px]. Beyond this limit, texture is as weak as
-#: noise, and half of the pixels are mismatches. Twice as many cells have errors above 0.1 m with a limit of 1 px, and a
-#: third as many with a limit of 0.35 px.
+#: noise, and half of the pixels are mismatches. A limit of 1 px doubles the number of cells with errors above 0.1 m; a
+#: limit of 0.35 px reduces it to a third.
 MAX_STEREO_SIGMA_PX = 0.5
 
 
@@ -43,8 +43,8 @@ class KeyframePath(NamedTuple):
 
     Args:
         world_from_camera: (n, 4, 4) poses of the left camera.
-        pose_cov: (n, 6, 6) covariance of each pose [rotation, translation], in the camera (rad, m).
-        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in the camera (the first is not
+        pose_cov: (n, 6, 6) covariance of each pose [rotation, translation], in camera axes (rad, m).
+        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in camera axes (the first is not
             used); None if the relative poses are exact.
     """
 
@@ -54,12 +54,12 @@ class KeyframePath(NamedTuple):
 
 
 class _StereoDepth(NamedTuple):
-    """Stereo pair and its depth from stereo alone, before it enters the filter.
+    """Stereo pair with its stereo depth, before the depth is fused in the filter.
 
     Args:
         pair: colour images.
         gray: (H, W) float32 grey levels of the left image.
-        depth: depth map of the left image, from stereo.
+        depth: depth map of the left image, from this stereo pair alone.
     """
 
     pair: KeyframeImages
@@ -98,8 +98,8 @@ def build_map(
         path: poses of the keyframes and their covariances.
         rig: calibration.
         grid: grid of the map.
-        progress: called with the number of keyframes that are done.
-        max_disparity_px: largest disparity searched; if None, it is adapted to the previous pair.
+        progress: called with the number of keyframes processed so far.
+        max_disparity_px: largest disparity searched; if None, it is adapted to the disparities of the previous pair.
     """
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     search_range = disparity.SearchRange(rig, max_disparity_px)
@@ -149,7 +149,7 @@ def _advance(
     """Advances the filter to the next keyframe: propagation, fusion with stereo depth, fusion with depth from motion.
 
     Returns:
-        The filtered depth map, and a mask (H, W) of the pixels that contain information from the old depth map.
+        The filtered depth map, and a mask (H, W) of its pixels whose depth contains information from the old depth map.
     """
     old_from_new = geometry.inverse(old.pose) @ pose
     propagated = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)

@@ -29,8 +29,8 @@ class HeightPatch(NamedTuple):
     Args:
         row, col: grid position of the first (north-west) cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
-        variance_m2: (rows, cols) variance due to the error of depth, which is independent between the parts of the
-            depth maps that leave the filter.
+        variance_m2: (rows, cols) variance due to errors of depth. These are independent between the heights that
+            different keyframes add to the map, because each depth leaves the filter only once.
         systematic_m2: (rows, cols) variance due to the pose and to the smoothing of slopes, errors common to all views.
         pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
         lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
@@ -93,7 +93,7 @@ def rasterise(
 
 
 class _ViewGeometry(NamedTuple):
-    """Camera of a depth map, relative to the grid.
+    """Pose of the camera relative to the grid, and constants of the rasterisation.
 
     Args:
         position: (3,) position of the camera relative to the north-west corner of the grid [m].
@@ -119,7 +119,12 @@ def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row, first column, number of rows and of columns of the cells within `bounds` (4,), if any."""
+    """Returns first row and column, and number of rows and columns, of the cells within `bounds`; None without cells.
+
+    Args:
+        bounds: (4,) lowest row and column, highest row and column, from `_grid_points`.
+        grid: grid of the map.
+    """
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -182,7 +187,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside the triangle of pixels a, b, c; where triangles overlap, the highest is kept."""
+    """Writes the cells inside the triangle of pixels a, b, c; where triangles overlap, the greatest height is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)

@@ -1,9 +1,9 @@
 """Factors of the navigation sensors in the graph of the global alignment.
 
 A reading of pressure, position (USBL) or attitude constrains the pose of one node. Beacons have surveyed positions, so
-their image coordinates also constrain the pose of one node. The DVL constrains the displacement between two nodes. Its
-scale error is estimated as one parameter shared by all displacements: modelled as independent noise, it would average
-out along the path, but the real error accumulates.
+their image coordinates also constrain the pose of one node. The DVL constrains the displacement between two nodes. The
+scale error of the DVL is estimated as one parameter shared by all displacements: modelled as independent noise of each
+displacement, it would average out along the path, but the real error accumulates.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
     Args:
         nodes: keyframes, in the order of the poses in the graph.
-        rig: nominal calibration.
-        noise: nominal noise of the navigation sensors.
+        rig: believed calibration.
+        noise: believed noise of the navigation sensors.
     """
     return [
         _height_factors(nodes, noise),
@@ -120,14 +120,14 @@ def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNois
 
 
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:
-    """Returns the factors of the displacements between nodes measured by the DVL, (1 + s) d = measured.
+    """Returns the factors of the displacements between nodes measured by the DVL: measured = (1 + s) d + noise.
 
     d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
     one parameter shared by all factors.
 
     Args:
         nodes: keyframes, in the order of the poses in the graph.
-        rig: nominal calibration.
+        rig: believed calibration.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]

@@ -34,15 +34,15 @@ class PoseFilter:
         """Fuses a pose measured relative to an earlier pose, such as a registration with the mosaic.
 
         The mosaic contains the error of the pose at which it was recorded, so the measurement constrains only the
-        motion since that pose. With S the covariance of this motion and R that of the measurement, the gain is
-        S (S + R)^-1, and the covariance of the pose decreases by the gain times S, less than for a measurement of an
-        absolute pose (Schmidt's consider filter, with the earlier pose as consider parameter).
+        motion since that pose. With the covariances S of this motion and R of the measurement, the gain is
+        S (S + R)^-1. The covariance of the pose decreases by the gain times S, which is less than for a measurement of
+        an absolute pose (Schmidt's consider filter, with the earlier pose as consider parameter).
 
         Args:
             measured: (4, 4) measured world_from_camera.
             cov: (6, 6) covariance R of the measurement.
-            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to the
-                covariance of the pose.
+            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to at
+                most the covariance of the pose (`clip_covariance`).
 
         Returns:
             (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.

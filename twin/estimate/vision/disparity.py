@@ -14,14 +14,14 @@ from twin.estimate.vision import epipolar
 Gray = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
-#: Block size of semi-global matching [px]. In turbid water, 5 px matches more pixels than 3 px; the refinement restores
-#: the sharpness of edges.
+#: Block size of semi-global matching [px]. In turbid water, a block of 5 px matches more pixels than one of 3 px; the
+#: refinement restores the sharpness of edges.
 BLOCK_PX = 5
 #: Connected regions with fewer pixels than this are removed as mismatches.
 SPECKLE_PX = 60
 #: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
-#: because illumination and backscatter vary slowly over the image. In a small window (25 px), a near object beside a
-#: pixel changes the local mean, and differently in the two images.
+#: because illumination and backscatter vary slowly over the image. In a small window (25 px), the local mean near an
+#: object depends on the background, which differs between the two images.
 NORMALISATION_WINDOW = 1 / 7
 #: Largest difference between the left-to-right and the right-to-left disparity of a valid pixel [px]; a larger
 #: difference indicates an occlusion or a mismatch.
@@ -60,8 +60,8 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
     Semi-global matching (Hirschmueller 2008, three-way) of images with locally normalised contrast gives an initial
     disparity; a left-right consistency check removes occlusions and mismatches. The sub-pixel interpolation of
     semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef),
-    so `epipolar.refine` improves it (bias 0.002 px, standard deviation 0.06 px). The returned standard deviation is
-    that of the refinement without its prior, so it increases where texture is weak compared with noise.
+    so `epipolar.refine` refines the disparity (bias 0.002 px, standard deviation 0.06 px). The returned standard
+    deviation excludes the prior of the refinement, so it increases where texture is weak compared with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.

@@ -1,8 +1,8 @@
-"""Sub-pixel disparity from two views: dense Lucas-Kanade along the epipolar lines, for stereo and for motion.
+"""Sub-pixel disparity from two views, a stereo pair or two keyframes: dense Lucas-Kanade along the epipolar lines.
 
 Depth Z is expressed as disparity of the stereo pair, d = f b / Z [px], with focal length f and baseline b. In
-homogeneous coordinates, the projection into the other image is linear in d, and a plane in space is a plane in
-disparity, linear in the pixel coordinates u and v.
+homogeneous coordinates, the projection into the other image is linear in d; the disparity of a plane in space is linear
+in the pixel coordinates u and v.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class Refinement(NamedTuple):
 
     Args:
         disparity_px: (H, W) refined disparity [px]; NaN where the refinement failed.
-        sigma_px: (H, W) standard deviation of the refined disparity if that of the initial one is `PRIOR_PX` [px].
+        sigma_px: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard
+            deviation `PRIOR_PX` [px].
         gain: (H, W) fraction of an error of the initial disparity that the refinement removes: 1 on texture, 0 without
             texture.
         noise: standard deviation of the image noise in the difference of both images [grey levels].
@@ -100,15 +101,16 @@ def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> T
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
     """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
-    With the other image O warped by the current disparities d, each pixel measures e = d_true - d = (I - O) / (dO/dd).
-    A plane is fitted to the values d + e in a window, weighted by (dO/dd)^2 and the taper of the window; its value at
-    the centre is the refined disparity. This value is unbiased on inclined surfaces and not biased towards whole
-    pixels; neighbours on another surface are excluded. Brightness and contrast of O are first equalised locally,
-    because backscatter and illumination change with the viewpoint.
+    I is the reference image, and O the other image warped to it by the current disparities d. Each pixel measures the
+    error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
+    weighted by (dO/dd)^2 and the taper of the window; its value at the centre is the refined disparity. This value is
+    unbiased on inclined surfaces and not biased towards whole pixels; neighbours on another surface are excluded.
+    Brightness and contrast of O are first matched locally to I, because backscatter and illumination change with the
+    viewpoint.
 
     The variance is the least-squares variance for a noise variance estimated from nearby residuals, or from the
-    residuals of the window itself if that estimate is larger. With strong noise, the window of the last iteration is
-    larger. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
+    residuals of the window itself if that estimate is larger. With strong noise, the iterations after the first use a
+    larger window. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
     agrees with the standard deviation of the error to 15 % in clear water; the error (mismatches included) is 1.3
     times this value if the noise is one fifth of the image contrast, and 1.7 times if it is half of the contrast.
 
@@ -142,7 +144,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of the disparity without the prior, from that with the prior."""
+    """Returns the standard deviation (H, W) of the disparity without the prior, given `sigma`, with the prior."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
@@ -229,7 +231,7 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
     """Warps the other image O to the reference image, and returns which pixels are visible in O (H, W).
 
     Writes the warped image to `warped` and its gradient dO/dd to `slope`, both (H, W). The gradient is the mean of the
-    gradients of both images, because that of a single image is biased by its noise and by interpolation.
+    gradients of both images, because the gradient of a single image is biased by its noise and by interpolation.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)
@@ -259,9 +261,9 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support):
-    """Adds the neighbours at offset (i, j) of a row of pixels to their normal equations `sums` (12, n), in place.
+    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the pixel's normal equations `sums` (12, n).
 
-    The loop is written so that the compiler can vectorise it.
+    `sums` is modified in place. The loop is written so that the compiler can vectorise it.
     """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]

@@ -14,12 +14,12 @@ from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.stereo import StereoPoints
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
-_MIN_TRACKED = 0.7  # smallest tracked fraction of the reference points; below it, the frame becomes the reference
+_MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
 _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
 
 class _Reference(NamedTuple):
-    """Reference image with which frames are matched, and its points.
+    """Image with which frames are matched, and its points.
 
     Args:
         image: (height, width) normalised image.
@@ -45,9 +45,9 @@ class FrameToFrame:
     Every frame is matched with the last keyframe, and structure is estimated together with motion
     (`two_view_motion.pair_motion`); the motion between two frames follows from their poses relative to the keyframe.
     The alternative is to match each frame with the previous one and to take depth as exact, as in eq. (2) of
-    Negahdaripour & Madjidi (2003). Its matching errors accumulate over the 15 frames between two keyframes: the bias of
-    pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is noisy
-    (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
+    Negahdaripour & Madjidi (2003). There, matching errors accumulate over the 15 frames between two keyframes: the bias
+    of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is
+    noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
 
     If a step fails, the last motion is returned again, with a large covariance and the reason for the failure.
 
@@ -70,11 +70,10 @@ class FrameToFrame:
         self.last_motion = np.eye(4)
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Makes a new keyframe the reference, with the strongest of its points, which are sorted by strength."""
+        """Makes a new keyframe the reference, with the strongest of its points; `points` are sorted by strength."""
         strongest = slice(MAX_POINTS)
-        self._set_reference(
-            _Reference(image, points.pixels[strongest], points.measured[strongest], points.cov[strongest])
-        )
+        measured, cov = _at_left_pixels(points, self.rig)
+        self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
     def step(self, image: matching.Image, interval_ratio: float = 1.0) -> tuple[two_view_motion.Motion, str]:
         """Estimates the motion from the last frame to this one.
@@ -107,7 +106,7 @@ class FrameToFrame:
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> two_view_motion.Motion | None:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
-        If many points are lost, the image becomes the new reference, with the points that were tracked to it.
+        If fewer than 70 % of the points are tracked, the image becomes the new reference, with the tracked points.
 
         Returns:
             The motion from the reference to the image, or None if there are too few inliers.
@@ -136,6 +135,22 @@ class FrameToFrame:
             current[:, 2] = transferred[:, 2]
             self._set_reference(_Reference(image, pixels, current, cov))
         return located
+
+
+def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
+    """Returns normalised (x, y, disparity) (n, 3) of stereo points at their left pixels, and its covariance (n, 3, 3).
+
+    `stereo.fuse` moves a point by half its row difference between the two images. Frames are matched with the left
+    image alone, however, and a systematic row difference (a pitch of one camera) must not appear as motion. The
+    covariance of (x, y) is that before the fusion, which halves the variance of the row.
+    """
+    measured, cov = points.measured.copy(), points.cov.copy()
+    measured[:, :2] = rig.normalised(points.pixels)
+    cov[:, 0, 0] += cov[:, 0, 1] ** 2 / cov[:, 1, 1]
+    cov[:, 0, 1] *= 2
+    cov[:, 1, 0] *= 2
+    cov[:, 1, 1] *= 2
+    return measured, cov
 
 
 def constant_velocity_motion(last_motion: Array) -> tuple[two_view_motion.Motion, str]:

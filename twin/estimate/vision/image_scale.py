@@ -1,4 +1,4 @@
-"""Choice of the image scale: pixels are binned if the texture is so coarse that many detected corners are noise.
+"""Choice of the image scale: pixels are binned if texture is so coarse that many corners are detected in noise.
 
 Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
 corners of the full left image are matched in the right image: the other corners are noise, and F2F tracking fails

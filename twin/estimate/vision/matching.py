@@ -20,6 +20,7 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
+_FULL_SCALE = 255  # grey level of a saturated pixel
 _BANDS = np.full((1, 3), 1 / 3, np.float32)
 _SMOOTH_PX = 0.5  # removes aliased detail, which biases matches towards whole pixels
 _FLAT_GRAY = 2.0  # standard deviation of sensor noise [grey levels]; keeps uniform areas from being amplified
@@ -56,6 +57,11 @@ def normalise(levels: Gray) -> Image:
     normalised = np.empty(levels.shape, np.uint8)
     _normalise(levels.ravel(), mean.ravel(), square.ravel(), normalised.ravel())
     return normalised
+
+
+def saturated_fraction(image: Image) -> float:
+    """Returns the fraction of the pixel values of an image (H, W, 3) that are at full scale, 0 to 1."""
+    return float(np.count_nonzero(image == _FULL_SCALE)) / image.size
 
 
 def contrast(levels: Gray) -> float:

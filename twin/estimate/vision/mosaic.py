@@ -49,7 +49,7 @@ class Registration(NamedTuple):
 
 
 class Mosaic:
-    """Raster of brightness, elevation and keyframe number, stored in tiles so that memory does not grow with the area.
+    """Raster of brightness, elevation and keyframe number, in tiles on disk, so memory does not grow with the area.
 
     Args:
         cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
@@ -103,7 +103,7 @@ class Mosaic:
             image: (height, width) normalised frame.
             depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
-            footprint_m: half the side of the square around the camera whose cells are used.
+            footprint_m: half the side of the square of cells that is used, centred below the camera.
             rig: calibration at the scale of the image.
 
         Returns:
@@ -143,7 +143,7 @@ class Mosaic:
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
         """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
 
-        If more than about `_MAX_CELLS` cells are textured, every n-th of them is returned; None if there are too few.
+        If many more than `_MAX_CELLS` cells are textured, a regular subset is returned; if too few are, None.
         """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
@@ -174,7 +174,8 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
     """Fills empty cells with the mean height of their pixels and the image brightness at the projected cell centre.
 
-    The brightness of the pixels in the cell would bias the position by 5 mm, because they are not at the cell's centre.
+    With the brightness of the pixels inside the cell instead, registered positions would have a bias of 5 mm, because
+    these pixels are not at the centre of the cell.
     """
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)

@@ -39,7 +39,8 @@ class LinearisedObservations(NamedTuple):
     Args:
         residual: (n, 3) measurements in a, minus their prediction from the measurements in b.
         jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
-        jacobian_motion: (n, 3, 6) derivative of the prediction with respect to the twist of the motion a_from_b.
+        jacobian_motion: (n, 3, p) derivative of the prediction with respect to the p unknowns: the twist of the motion
+            a_from_b (p = 6) and, after it, the amplitude of pixel locking if that is estimated (p = 7).
         information: (n, 3, 3) inverse covariance of the residual.
         normalised_residual: (n,) Mahalanobis distance of the residual, divided by sqrt(3).
     """
@@ -190,16 +191,17 @@ def motion_normal_equations(observations, weight):
         weight: (n,) robust weights; points of weight 0 are skipped.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), and derivative (6, 3) of the right-hand side with respect to
-        a bias in (x, y, disparity) that all points share.
+        For the p unknowns of `observations`: normal matrix (p, p), right-hand side (p,), and derivative (p, 3) of the
+        right-hand side with respect to a bias in (x, y, disparity) that all points share.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
-    normal, right, bias_jacobian = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 3))
-    projected = np.empty((6, 3))
+    count = jacobian.shape[2]
+    normal, right, bias_jacobian = np.zeros((count, count)), np.zeros(count), np.zeros((count, 3))
+    projected = np.empty((count, 3))
     for i in range(len(residual)):
         if weight[i] == 0:
             continue
-        for p in range(6):
+        for p in range(count):
             for c in range(3):
                 projected[p, c] = 0.0
                 for r in range(3):
@@ -210,20 +212,20 @@ def motion_normal_equations(observations, weight):
             for q in range(p + 1):
                 for c in range(3):
                     normal[p, q] += projected[p, c] * jacobian[i, c, q]
-    for p in range(6):
+    for p in range(count):
         for q in range(p):
             normal[q, p] = normal[p, q]
     return normal, right, bias_jacobian
 
 
 @njit(cache=True, nogil=True)
-def adjust_structure(observations, measured, twist):
-    """Returns the adjusted points (n, 3) in b, normalised (x, y, disparity), after the motion is updated by a twist.
+def adjust_structure(observations, measured, update):
+    """Returns the adjusted points (n, 3) in b, normalised (x, y, disparity), after an update of the unknowns.
 
     Args:
         observations: `LinearisedObservations`.
         measured: `PairMeasurements` from which `observations` were computed.
-        twist: (6,) solution of the motion's normal equations.
+        update: (p,) solution of the motion's normal equations.
     """
     b, cov_b = measured.b, measured.cov_b
     structure = b.copy()
@@ -231,8 +233,8 @@ def adjust_structure(observations, measured, twist):
     for i in range(len(b)):
         for r in range(3):
             remaining[r] = observations.residual[i, r]
-            for p in range(6):
-                remaining[r] -= observations.jacobian_motion[i, r, p] * twist[p]
+            for p in range(len(update)):
+                remaining[r] -= observations.jacobian_motion[i, r, p] * update[p]
         for r in range(3):
             weighted[r] = 0.0
             for c in range(3):

@@ -1,9 +1,10 @@
-"""Measurement of a link: matches points of a keyframe in an earlier keyframe and estimates the motion between them."""
+"""Measurement of a link: matches points of a keyframe in an earlier keyframe and estimates their relative pose."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +13,25 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
-from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
+from twin.estimate.vision import matching, observation_equations, patches, pixel_locking, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.observation_equations import PairMeasurements
+from twin.estimate.vision.pixel_locking import PixelLocking
 
 _LEVELS = 2  # pyramid levels above the full image; predicted positions may be wrong by 8 px
+
+
+class MatchedPair(NamedTuple):
+    """Points that were matched in the stereo pairs of two nodes.
+
+    Args:
+        measured: measurements of the points in the earlier pair a and in the later pair b.
+        locking: derivatives of the measurements with respect to the amplitude of pixel locking.
+    """
+
+    measured: PairMeasurements
+    locking: PixelLocking
 
 
 class PairMatcher:
@@ -37,8 +51,8 @@ class PairMatcher:
         """Ends the threads that match points."""
         self._workers.shutdown()
 
-    def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[PairMeasurements | None]:
-        """Matches the points of a node in both images of each of the other nodes; two nodes are matched in parallel.
+    def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[MatchedPair | None]:
+        """Matches the points of a node in both images of each of the other nodes, two nodes at a time.
 
         Returns:
             For each of the other nodes, the points measured in its stereo pair (a) and in that of `node` (b); None for
@@ -57,7 +71,7 @@ class PairMatcher:
         points: stereo.StereoPoints,
         templates: Sequence[patches.PatchTemplates],
         other: Keyframe,
-    ) -> PairMeasurements:
+    ) -> MatchedPair:
         """Returns the points that were matched in both images of another node.
 
         Matching starts at positions predicted from the poses and the depth. Each patch is warped according to a plane
@@ -78,8 +92,28 @@ class PairMatcher:
         ok &= self._in_view(points, other_from_node)
         source_cov = (in_left.cov[ok] + in_right.cov[ok]) / 2
         cov = left_warp[ok] @ source_cov @ left_warp[ok].transpose(0, 2, 1)
-        measured, measured_cov = stereo.fuse(in_left.points[ok], in_right.points[ok], cov, rig)
-        return PairMeasurements(measured, points.measured[ok], measured_cov, points.cov[ok])
+        left_px, right_px, node_points = in_left.points[ok], in_right.points[ok], points.subset(ok)
+        cov *= stereo.row_noise_ratio(left_px, right_px, cov) ** 2
+        measured, measured_cov = stereo.fuse(left_px, right_px, cov, rig)
+        left_shift = pixel_locking.shifts(left_px, left_warp[ok], self.patch_px)
+        right_shift = pixel_locking.shifts(right_px, right_warp[ok], self.patch_px)
+        locking = stereo.fused_shift(left_shift, right_shift, measured_cov, rig)
+        return MatchedPair(
+            PairMeasurements(measured, node_points.measured, measured_cov, node_points.cov),
+            PixelLocking(locking, self._locking_in_node(node_points)),
+        )
+
+    def _locking_in_node(self, points: stereo.StereoPoints) -> Array:
+        """Returns the derivative (n, 3) of the normalised (x, y, disparity) by the amplitude of pixel locking [1/px].
+
+        The patches are centred at whole pixels of the left image, so only their positions in the right image are
+        biased.
+        """
+        left_px, shift_px = self._project(points.measured)
+        warp = np.tile(np.eye(2), (len(left_px), 1, 1))
+        warp[:, 0] -= points.disparity_slope
+        right_shift = pixel_locking.shifts(left_px - shift_px, warp, self.patch_px)
+        return stereo.fused_shift(np.zeros_like(right_shift), right_shift, points.cov, self.rig)
 
     def _in_view(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
         """Returns a mask (n,) of the points whose patches are predicted well inside both images of the other node."""
@@ -90,14 +124,14 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns the positions (n, 2) of normalised points (n, 3) in the left image, and (disparity, 0) (n, 2) [px].
+        """Returns left-image positions (n, 2) of normalised points (n, 3), and offsets (disparity, 0) (n, 2) [px].
 
-        The position in the right image is the first minus the second.
+        The position in the right image is the position in the left image minus the offset.
         """
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
-    def motion(self, node: Keyframe, other: Keyframe, measured: PairMeasurements) -> two_view_motion.Motion | None:
+    def motion(self, node: Keyframe, other: Keyframe, matched: MatchedPair) -> two_view_motion.Motion | None:
         """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure.
 
         The estimate starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the predicted poses if
@@ -106,11 +140,14 @@ class PairMatcher:
         Returns:
             The motion, or None if too few of the matched points are inliers.
         """
+        measured = matched.measured
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         closed_form = two_view_motion.exact_depth_motion(measured.a, measured.b, self.rig.baseline_m, predicted)
         settings = two_view_motion.PairMotionSettings(
             common_sigma=COMMON_BIAS_PX / self.rig.focal_px,
             variance_inflation=matching.variance_inflation(measured.b[:, :2] * self.rig.focal_px, self.patch_px),
+            locking=matched.locking,
+            measured_scatter=True,
         )
         guess = predicted if closed_form is None else closed_form
         motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)

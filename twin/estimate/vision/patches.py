@@ -2,19 +2,19 @@
 
 Systematic errors of patch matching, measured against the simulated truth, and their remedies here:
 
-- A patch on a slanted surface appears sheared in another camera. A square window in that image covers a different part
-  of the floor with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
+- A patch on a slanted surface appears sheared in the other image. A square window there covers a different part of
+  the floor, with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
   is therefore warped by the plane that stereo measures around its point, so that it covers the same part of the floor
   in all images.
 - The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
   the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
   change (0.01 px on a lamp-lit reef, always backwards). Linear gradients of brightness and of contrast over the patch
-  are therefore nuisance parameters too.
+  are therefore estimated as nuisance parameters.
 - Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. Cubic B-splines
   leave 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images (`matching.gray`).
 - Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
   cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
-  Grey levels are therefore matched without normalisation; brightness and contrast are nuisance parameters anyway.
+  Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
 
 Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
 fine, with cubic B-spline interpolation (Unser 1999).
@@ -38,10 +38,10 @@ Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _CONVERGED_PX = 0.002
-_COARSE_CONVERGED_PX = 0.1  # convergence limit at the coarse levels, as a finer level follows
+_COARSE_CONVERGED_PX = 0.1  # convergence limit at the coarse levels, whose result a finer level refines
 _MAX_SHIFT_PX = 3.0
 _MIN_CORRELATION = 0.7  # patches of different floor rarely correlate by more than 0.5
-_NOISE_LOSS = 1.2  # 2 / (1 + 2/3): interpolation hides a third of the target's noise variance in the residual
+_NOISE_LOSS = 1.2  # 2 / (1 + 2/3): interpolation removes a third of the target's noise variance from the residual
 _REASSOCIATE = {"reassoc", "contract", "nsz"}  # fastmath flags that let sums be vectorised
 _NUISANCES = 6  # brightness, contrast, and the linear gradients of both along columns and rows
 
@@ -72,8 +72,8 @@ class PatchMatches(NamedTuple):
     Args:
         points: (n, 2) positions in the target [px].
         ok: (n,) bool, true if the match converged and its correlation with the template is high enough.
-        cov: (n, 2, 2) covariance of the position due to the noise of one of the two images, half that due to both, in
-            the axes of the source image [px^2]; estimated from the texture of the patch and the residual.
+        cov: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the
+            noise of both, in the axes of the source image [px^2]; estimated from the texture and the residuals.
     """
 
     points: Array
@@ -103,7 +103,7 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
     levels = []
     for level, image in enumerate(images):
         centres = np.round(points / 2.0**level).astype(np.int64)
-        offset = centres * 2.0**level - points  # the nearest coarse pixel is not the point itself
+        offset = centres * 2.0**level - points  # the patch is centred on a whole pixel of its level
         energy, gradient, nuisance = _extract(image, centres, patch_px // 2)
         levels.append(PatchTemplates(patch_px // 2, offset, energy, gradient, nuisance))
     return levels
@@ -112,7 +112,7 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
 def spline_coefficients(images: Sequence[Image]) -> list[Spline]:
     """Returns the coefficients of the cubic B-spline that interpolates each image (height, width).
 
-    The impulse response of the prefilter decays by a factor of 0.27 per pixel, so it is cut off at 7 px.
+    The impulse response of the prefilter decays by a factor of 0.27 per pixel, so it is truncated at 7 px.
     """
     kernel = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(np.arange(-7, 8))
     kernel /= kernel.sum()
@@ -148,7 +148,7 @@ def match_templates(
 
 
 def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floating], patch_px: int) -> Array:
-    """Returns the disparity gradient over each patch: the slope of a plane fitted to the disparities.
+    """Returns the disparity gradient over each patch, from a plane fitted to the disparities.
 
     Args:
         disparity_px: (height, width) disparity map [px], NaN where unknown.
@@ -170,7 +170,7 @@ def _slope(disparity, points, half):
         centre = disparity[v0, u0]
         if np.isnan(centre):
             continue
-        limit = 1.0 + 0.4 * half  # a pixel with a larger difference belongs to another surface
+        limit = 1.0 + 0.4 * half  # a pixel whose disparity differs by more belongs to another surface
         n = su = sv = sd = suu = suv = svv = sud = svd = 0.0
         for v in range(max(v0 - half, 0), min(v0 + half + 1, disparity.shape[0])):
             for u in range(max(u0 - half, 0), min(u0 + half + 1, disparity.shape[1])):
@@ -355,7 +355,7 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
         if converged and abs(u - guess[k, 0]) + abs(v - guess[k, 1]) < _MAX_SHIFT_PX:
             points[k, 0], points[k, 1] = u, v
             correlation[k] = similarity
-            variance = _NOISE_LOSS * noise / (n - _NUISANCES - 2) / 2 / det  # due to one image: half that due to both
+            variance = _NOISE_LOSS * noise / (n - _NUISANCES - 2) / 2 / det  # noise of one image: half the total
             cov[k, 0, 0], cov[k, 1, 1] = variance * hvv, variance * huu
             cov[k, 0, 1] = cov[k, 1, 0] = -variance * huv
     return points, correlation, cov

@@ -13,8 +13,9 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, patches
 
 _EPIPOLAR_PX = 1.0
-_BORDER_PX = 4  # two pixels for interpolation and two for matching errors, which are smaller
+_BORDER_PX = 4  # margin: two pixels for interpolation, two for matching errors, which are smaller than that
 _MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
+_MIN_ROW_DIFFERENCES = 30  # with fewer points, the scatter of their row differences is not evaluated
 
 
 class StereoPoints(NamedTuple):
@@ -28,6 +29,9 @@ class StereoPoints(NamedTuple):
         measured: (n, 3) normalised (x, y, disparity).
         cov: (n, 3, 3) covariance of each point in `measured`.
         xyz: (n, 3) positions in the left camera [m].
+        row_difference_px: (n,) row in the right image minus row in the left image [px].
+        noise_ratio: ratio of the measured to the expected standard deviation of the row differences
+            (`row_noise_ratio`); the standard deviations in `cov` include this factor.
     """
 
     pixels: NDArray[np.float32]
@@ -36,12 +40,15 @@ class StereoPoints(NamedTuple):
     measured: Array
     cov: Array
     xyz: Array
+    row_difference_px: Array
+    noise_ratio: float = 1.0
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
         """Returns the points where `keep` (n,) is true."""
         return StereoPoints(
             self.pixels[keep], self.disparity_slope[keep], self.mean_disparity_px[keep],
-            self.measured[keep], self.cov[keep], self.xyz[keep],
+            self.measured[keep], self.cov[keep], self.xyz[keep], self.row_difference_px[keep],
+            self.noise_ratio,
         )  # fmt: skip
 
 
@@ -49,8 +56,8 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
     """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
 
     The left column determines x and is also part of the disparity, so x and disparity are correlated. The rows of both
-    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if their
-    errors are correlated with those of the rows.
+    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if column
+    and row errors are correlated.
 
     Args:
         left, right: (n, 2) positions [px].
@@ -70,8 +77,45 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
     return measured, joint / rig.focal_px**2
 
 
+def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> Array:
+    """Returns the shift (n, 3) of the normalised (x, y, disparity) from `fuse` caused by shifts of its input positions.
+
+    The constraint of equal rows moves each row by half their difference. It also corrects the columns by regression on
+    the rows; the regression coefficient is the ratio of two elements of the fused covariance.
+
+    Args:
+        left, right: (n, 2) shifts of the positions [px].
+        fused_cov: (n, 3, 3) covariance returned by `fuse`.
+        rig: calibration.
+    """
+    slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
+    x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
+    return np.column_stack([x, left[:, 1] - half, disparity]) / rig.focal_px
+
+
+def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
+    """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
+
+    A point has the same row in both images of a rectified pair, so the row differences of a stereo pair measure the
+    matching noise. Their median, which calibration errors cause, is subtracted first; their standard deviation is the
+    normalised median absolute deviation. Returns 1 for fewer than 30 points, and for a ratio that does not exceed 1
+    significantly, i.e. by two standard errors of 1.17 / sqrt(n).
+
+    Args:
+        left, right: (n, 2) positions of the patches [px].
+        cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
+    """
+    n = len(left)
+    if n < _MIN_ROW_DIFFERENCES:
+        return 1.0
+    difference = left[:, 1] - right[:, 1]
+    size = np.abs(difference - np.median(difference)) / np.sqrt(2 * (cov[:, 1, 1] + _MIN_SIGMA_PX**2))
+    ratio = 1.4826 * float(np.median(size))
+    return ratio if ratio > 1 + 2 * 1.17 / n**0.5 else 1.0
+
+
 def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the matches (n, 2) [px] with equal rows, to within 1 px, and positive disparity."""
+    """Returns a mask (n,) of the matches (n, 2) with a row difference below 1 px and a disparity above 0.5 px."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
@@ -81,10 +125,10 @@ def margin_px(patch_px: int) -> int:
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the patches so far inside the image that matching errors cannot move them out of it.
+    """Returns a mask (n,) of the patches that are far enough inside the image to stay there despite matching errors.
 
-    The test needs predicted positions that are independent of the matching errors. A test of the measured positions
-    prefers matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
+    The predicted positions must be independent of the matching errors. A test of the measured positions would prefer
+    matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
     this biased disparities near the border by -0.02 px and links over two keyframes by 0.16 mrad.
 
     Args:
@@ -98,7 +142,7 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns corners of the left image (n, 2), at whole pixels, and their disparities (n,) in a dense map [px]."""
+    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and the disparities (n,) [px]."""
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
@@ -132,9 +176,12 @@ def match_stereo_points(
     mean_px = _local_mean(dense_px, 3 * patch_px)[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
     in_view = well_inside(pixels - np.column_stack([mean_px, np.zeros(len(pixels))]), rig, patch_px)
     ok = match.ok & satisfies_epipolar(pixels, match.points) & in_view
-    measured, cov = fuse(pixels[ok].astype(np.float64), match.points[ok], match.cov[ok], rig)
+    source = pixels[ok].astype(np.float64)
+    noise_ratio = row_noise_ratio(source, match.points[ok], match.cov[ok])
+    measured, cov = fuse(source, match.points[ok], match.cov[ok] * noise_ratio**2, rig)
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
-    return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz)
+    rows = match.points[ok, 1] - pixels[ok, 1]
+    return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz, rows, noise_ratio)
 
 
 def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:

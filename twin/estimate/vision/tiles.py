@@ -16,11 +16,11 @@ _MAX_TILES = 64  # 50 MB with three layers; an image covers about 20 tiles
 
 
 class TiledRaster:
-    """Layers of float32 cells at any row and column, including negative ones; unwritten cells are NaN.
+    """Raster of float32 layers, with cells at any row and column, including negative ones; unwritten cells are NaN.
 
     Args:
         n_layers: number of values per cell.
-        folder: folder of the tiles on disk; created when needed.
+        folder: folder for the tiles that are moved to disk; created when needed.
         max_tiles: maximum number of tiles in memory.
     """
 
@@ -44,14 +44,14 @@ class TiledRaster:
                 self._tile(key)[in_tile] = window[in_window]
 
     def clear(self) -> None:
-        """Removes all cells and their files."""
+        """Removes all tiles from memory and from disk."""
         self._tiles.clear()
         for key in self._spooled:
             self._path(key).unlink(missing_ok=True)
         self._spooled.clear()
 
     def _tile(self, key: tuple[int, int]) -> Layers:
-        """Returns a tile for reading and writing; loads or creates it if needed."""
+        """Returns a tile (n_layers, TILE_SIDE, TILE_SIDE), not a copy; loads or creates it if it is not in memory."""
         if key not in self._tiles:
             if key in self._spooled:
                 self._tiles[key] = np.load(self._path(key))

@@ -12,7 +12,9 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.estimate.vision import pixel_locking
 from twin.estimate.vision.observation_equations import (
+    LinearisedObservations,
     PairMeasurements,
     adjust_structure,
     image_jacobian,
@@ -20,9 +22,13 @@ from twin.estimate.vision.observation_equations import (
     motion_normal_equations,
     normal_equations,
 )
+from twin.estimate.vision.pixel_locking import PixelLocking
 
 _HUBER = 1.5
 _MIN_POINTS = 12
+_CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
+_PRIOR_POINTS = 50  # weight of the expected covariance of the scores in `_scatter_cov`, as a number of points
+_MIN_SCALE = 0.3  # smallest factor on reported standard deviations, for noise-free data
 _MEDIAN_NORMALISED = {2: 0.680, 3: 0.888}  # sqrt(median of chi2 / 3) by degrees of freedom
 
 
@@ -33,7 +39,7 @@ class Motion(NamedTuple):
         a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
         cov: (6, 6) covariance of the motion [rotation, translation], in the axes of b (rad, m).
         n_points: number of inliers.
-        residual: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), or divided by
+        residual: robust standard deviation of the residuals, in normalised coordinates (`frame_motion`) or divided by
             its expected value (`pair_motion`).
         closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
             None if it started from another motion.
@@ -56,12 +62,18 @@ class PairMotionSettings(NamedTuple):
         n_measured: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has
             a large variance in `cov_a`.
         iterations: number of Gauss-Newton iterations.
+        locking: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated
+            with the motion; None if there is no such bias.
+        measured_scatter: whether the covariance of the motion is computed from the residuals of the individual points
+            (`_scatter_cov`), instead of from the covariances of the measurements and a common scale.
     """
 
     common_sigma: float = 0.0
     variance_inflation: float = 1.0
     n_measured: int = 3
     iterations: int = 6
+    locking: PixelLocking | None = None
+    measured_scatter: bool = False
 
 
 _DEFAULT_SETTINGS = PairMotionSettings()
@@ -117,10 +129,10 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
 
 
 def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
-    """Estimates the motion between two stereo pairs with the depth from the later pair b taken as exact.
+    """Estimates the motion between two stereo pairs, taking the depth from the later pair b as exact.
 
-    This is the closed form of Negahdaripour & Madjidi 2003 (eq. 2), iterated with Huber weights. It is fast, but
-    depth errors bias the estimate; the disparity in the earlier pair a is not used.
+    Iterates the closed form of Negahdaripour & Madjidi 2003 (eq. 2) with Huber weights. This is fast, but depth errors
+    bias the estimate. The disparity in the earlier pair a is not used.
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
@@ -136,7 +148,7 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
 
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
-    """Returns Huber weights (n,) of residuals of these magnitudes (n,); zero beyond `cutoff` standard deviations."""
+    """Returns the Huber weights (n,) for residuals of magnitude `size` (n,); 0 beyond `cutoff` times `sigma`."""
     return np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
 
 
@@ -160,22 +172,107 @@ def pair_motion(
         The motion, with its residual relative to the expected standard deviation (1 = as expected), or None if there
         are too few inliers.
     """
-    n = len(measured.a)
-    if n < _MIN_POINTS:
+    if len(measured.a) < _MIN_POINTS:
         return None
-    a_from_b, structure = guess, measured.b.copy()
-    weight, normal, bias_root, scale = np.zeros(n), np.eye(6), np.zeros((6, 3)), 1.0
+    a_from_b, amplitude_px, structure = guess, 0.0, measured.b.copy()
+    normals = None
     for _ in range(settings.iterations):
         observations = linearise(measured, structure, a_from_b, baseline_m)
-        size = observations.normalised_residual
-        scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
-        weight = _huber_weights(size, scale, cutoff=4.0)
-        normal, right, bias_jacobian = motion_normal_equations(observations, weight)
-        twist = np.asarray(np.linalg.solve(normal, right), np.float64)
-        bias_root = np.linalg.solve(normal, bias_jacobian) * settings.common_sigma
-        structure = adjust_structure(observations, measured, twist)
-        a_from_b = a_from_b @ geometry.exp(twist)
-    n_points = int(np.count_nonzero(weight))
-    noise_cov = np.linalg.inv(normal) * max(scale, 0.3) ** 2 * settings.variance_inflation
-    cov = np.asarray(noise_cov + bias_root @ bias_root.T, np.float64)
-    return None if n_points < _MIN_POINTS else Motion(a_from_b, cov, n_points, scale)
+        if settings.locking is not None:
+            observations = _with_locking(observations, settings.locking, amplitude_px)
+        normals = _weighted_normals(observations, amplitude_px, settings)
+        update = np.asarray(np.linalg.solve(normals.normal, normals.right), np.float64)
+        structure = adjust_structure(observations, measured, update)
+        a_from_b = a_from_b @ geometry.exp(update[:6])
+        amplitude_px += float(update[6:].sum())
+    if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
+        return None
+    return Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
+
+
+class _WeightedNormals(NamedTuple):
+    """Normal equations of `pair_motion` at one iteration, for p unknowns.
+
+    Args:
+        observations: linearised observations of n points.
+        weight: (n,) robust weights.
+        scale: robust standard deviation of the residuals, divided by the expected one.
+        normal: (p, p) normal matrix, `prior` included.
+        prior: (p, p) prior information.
+        right: (p,) right-hand side.
+        bias_jacobian: (p, 3) derivative of `right` with respect to a bias of all points.
+    """
+
+    observations: LinearisedObservations
+    weight: Array
+    scale: float
+    normal: Array
+    prior: Array
+    right: Array
+    bias_jacobian: Array
+
+
+def _with_locking(
+    observations: LinearisedObservations, locking: PixelLocking, amplitude_px: float
+) -> LinearisedObservations:
+    """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`."""
+    moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
+    derivative = locking.a - moved  # of the residual with respect to the amplitude
+    residual = observations.residual - derivative * amplitude_px
+    chi2 = np.einsum("ni,nij,nj->n", residual, observations.information, residual)
+    return observations._replace(
+        residual=residual,
+        jacobian_motion=np.concatenate([observations.jacobian_motion, derivative[:, :, None]], axis=2),
+        normalised_residual=np.sqrt(chi2 / 3),
+    )
+
+
+def _weighted_normals(
+    observations: LinearisedObservations, amplitude_px: float, settings: PairMotionSettings
+) -> _WeightedNormals:
+    """Returns the normal equations with Huber weights, and with the prior of the pixel-locking amplitude."""
+    size = observations.normalised_residual
+    scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
+    weight = _huber_weights(size, scale, _CUTOFF)
+    normal, right, bias_jacobian = motion_normal_equations(observations, weight)
+    prior = np.zeros_like(normal)
+    if settings.locking is not None:
+        prior[6, 6] = (scale / pixel_locking.SIGMA_PX) ** 2  # weights are relative to residuals of variance scale^2
+        right[6] -= prior[6, 6] * amplitude_px
+    return _WeightedNormals(observations, weight, scale, normal + prior, prior, right, bias_jacobian)
+
+
+def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
+    """Returns the covariance (6, 6) of the motion due to the noise of the points and the bias that they share."""
+    bias_root = np.linalg.solve(normals.normal, normals.bias_jacobian) * settings.common_sigma
+    if settings.measured_scatter:
+        noise_cov = _scatter_cov(normals)
+    else:
+        noise_cov = np.linalg.inv(normals.normal) * max(normals.scale, _MIN_SCALE) ** 2
+    cov = noise_cov * settings.variance_inflation + bias_root @ bias_root.T
+    return np.asarray(cov[:6, :6], np.float64)
+
+
+def _scatter_cov(normals: _WeightedNormals) -> Array:
+    """Returns the covariance (p, p) of the unknowns from the residuals of the individual points.
+
+    It is the sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, Robust Statistics, section
+    7.6; White 1980). S is the sum of the outer products of the points' scores w J' C^-1 e, with w the weight of a
+    point, J its Jacobian, C the covariance of its residual e. S therefore includes errors that C does not account for,
+    such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function: a
+    point in its linear part contributes its weight times 2/3, the mean over the three coordinates of its residual. S is
+    scaled by 3 n / (3 n - p) for n points and p unknowns. Because few points determine S poorly, it is averaged with
+    its expectation for covariances C times a common factor; the expectation counts as 50 points.
+    """
+    observations, weight, scale = normals.observations, normals.weight, normals.scale
+    size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)
+    information = normals.normal - normals.prior
+    score = np.einsum("nrp,nrc,nc->np", observations.jacobian_motion, observations.information, observations.residual)
+    score *= weight[:, None]
+    freedom = 3 * n / max(3 * n - p, 1)
+    variance = max(float(np.sum((weight * size) ** 2) / np.sum(weight)), _MIN_SCALE**2)
+    scatter = freedom * (n * (score.T @ score) + _PRIOR_POINTS * variance * information) / (n + _PRIOR_POINTS)
+    core = size < _HUBER * scale
+    efficiency = float(np.sum(weight * np.where(core, 1.0, 2 / 3)) / np.sum(weight))
+    bread = np.linalg.inv(information * efficiency + normals.prior)
+    return np.asarray(bread @ (scatter + normals.prior * scale**2) @ bread, np.float64)

@@ -1,0 +1,39 @@
+"""Limits on the size of raster files, checked with the size in the header before the contents are read."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from terrains.terrain import MAX_NODES, MAX_TEXELS
+from twin.errors import TwinError
+
+HEIGHT_FIELD = "terrain.height_file"
+HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"
+TEXTURE_FIELD = "terrain.texture_file"
+
+
+def check_height_count(cols: int, rows: int, file: Path) -> None:
+    """Raises TwinError if a file has more than MAX_NODES heights."""
+    if cols * rows > MAX_NODES:
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} has {cols} x {rows} heights", f"at most {MAX_NODES} heights")
+
+
+def check_texel_count(cols: int, rows: int, file: Path) -> None:
+    """Raises TwinError if a texture image has more than MAX_TEXELS pixels."""
+    if cols * rows > MAX_TEXELS:
+        raise TwinError(TEXTURE_FIELD, f"{file.name!r} has {cols} x {rows} pixels", f"at most {MAX_TEXELS} pixels")
+
+
+def image_size(file: Path) -> tuple[int, int] | None:
+    """Returns the number of columns and rows of an image file from its header; None if it is not a readable image."""
+    import rasterio  # imported here: it takes 20 MB of memory, and most terrains do not need it
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(file) as source:
+                return source.width, source.height
+    except (RasterioError, OSError):
+        return None

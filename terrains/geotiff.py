@@ -1,0 +1,146 @@
+"""Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF."""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.crs import CRS
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
+from terrains.vertical import VerticalAxis, cf_direction, unit_length_m
+from twin.core.georeference import Georeference
+from twin.errors import TwinError
+
+#: Tags of a raster band that may name the quantity of its values, e.g. depth.
+_BAND_TAGS = ("long_name", "standard_name")
+#: Tags of a file that may name the quantity of its values.
+_FILE_TAGS = ("TIFFTAG_IMAGEDESCRIPTION", "TIFFTAG_DOCUMENTNAME", "title")
+
+
+def read_geotiff(
+    file: Path, height_spacing_m: float
+) -> tuple[NDArray[np.float64], float, VerticalAxis, Georeference | None]:
+    """Reads a GeoTIFF with one band of heights.
+
+    Args:
+        file: the GeoTIFF.
+        height_spacing_m: grid spacing if the file has no coordinates.
+    Returns:
+        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m]; vertical axis; position of
+        the centre of the raster in its CRS, None if the file has no coordinates.
+    Raises:
+        TwinError: the file cannot be read, is an image or too large, or its grid or one of its units is not supported.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(file) as source:
+                return _read(source, height_spacing_m, file)
+    except (RasterioError, OSError) as error:
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read: {error}", HEIGHT_FORMATS) from error
+
+
+def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
+    """Reads an open file; returns the same as `read_geotiff`."""
+    if source.count != 1 or source.dtypes[0] in ("uint8", "int8"):
+        bands = f"{source.count} band(s) of {source.dtypes[0]}"
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {bands}", HEIGHT_FORMATS)
+    check_height_count(source.width, source.height, file)
+    horizontal, vertical = crs_parts(source.crs)
+    axis = _vertical_axis(source, vertical, file)
+    georeference, spacing_m = None, height_spacing_m
+    if not source.transform.is_identity:
+        _check_grid(source, file)
+        factor = _axis_unit_m(horizontal)
+        spacing_m = float(source.transform.a * factor)
+        east, north = _centre(source)
+        wkt = _output_crs(source.crs, horizontal, vertical)
+        georeference = Georeference(east, north, 0.0, wkt, factor, axis.datum)
+    band = source.read(1, masked=True)
+    return np.ma.filled(band.astype(np.float64), np.nan), spacing_m, axis, georeference
+
+
+def crs_parts(crs: CRS | None) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """Returns the horizontal and the vertical part of a CRS as PROJJSON; None for a missing part."""
+    if crs is None:
+        return None, None
+    tree = crs.to_dict(projjson=True)
+    tree = tree.get("source_crs", tree)  # a BoundCRS: a CRS with a transformation to another
+    parts = tree.get("components", [tree])
+    vertical = next((part for part in parts if part["type"] == "VerticalCRS"), None)
+    return next((part for part in parts if part["type"] != "VerticalCRS"), None), vertical
+
+
+def _axis_unit_m(crs: dict[str, Any] | None) -> float:
+    """Returns the length of the unit of the first axis of a CRS [m]; 1 without a CRS."""
+    unit = crs["coordinate_system"]["axis"][0].get("unit", "metre") if crs is not None else "metre"
+    return float(unit["conversion_factor"]) if isinstance(unit, dict) else 1.0
+
+
+def _vertical_axis(source: rasterio.DatasetReader, vertical: dict[str, Any] | None, file: Path) -> VerticalAxis:
+    """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
+
+    The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
+    """
+    tags, file_tags = source.tags(1), source.tags()
+    names = [source.descriptions[0] or "", *(tags.get(key, "") for key in _BAND_TAGS)]
+    direction = vertical["coordinate_system"]["axis"][0]["direction"] if vertical is not None else None
+    unit = source.units[0] or tags.get("units", "")
+    return VerticalAxis(
+        direction if direction in ("up", "down") else cf_direction(tags),
+        unit_length_m(unit, file) if unit else _axis_unit_m(vertical),
+        next(filter(None, names), ""),
+        (file.stem, *names, *(file_tags.get(key, "") for key in _FILE_TAGS)),
+        "" if vertical is None else str(vertical["name"]),
+    )
+
+
+def _output_crs(crs: CRS | None, horizontal: dict[str, Any] | None, vertical: dict[str, Any] | None) -> str | None:
+    """Returns the CRS of the output rasters as WKT; None if the file has no horizontal CRS.
+
+    Output elevations are in metres, positive upwards. The CRS is that of the file; its vertical part is dropped if it
+    has another unit or is positive downwards.
+    """
+    if crs is None or horizontal is None:
+        return None
+    if vertical is None:
+        return crs.to_wkt()
+    upward = vertical["coordinate_system"]["axis"][0]["direction"] == "up"
+    if upward and _axis_unit_m(vertical) == 1.0:
+        return crs.to_wkt()
+    return CRS.from_user_input(json.dumps(horizontal)).to_wkt()
+
+
+def _check_grid(source: rasterio.DatasetReader, file: Path) -> None:
+    """Raises TwinError if the grid is in degrees, is not north up, or its cells are not square."""
+    t = source.transform
+    if source.crs is not None and source.crs.is_geographic:
+        raise TwinError(
+            HEIGHT_FIELD, f"{file.name!r} is in degrees", "a projected or local grid in metres, e.g. by "
+            f"gdalwarp -t_srs EPSG:{_utm_epsg(*_centre(source))} -tr CELL_M CELL_M {file.name} projected.tif",
+        )  # fmt: skip
+    if t.b != 0 or t.d != 0 or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > 1e-3 * t.a:
+        raise TwinError(
+            HEIGHT_FIELD, f"{file.name!r} is rotated, or its cells are not square",
+            f"north up, square cells, e.g. by gdalwarp -tr CELL_M CELL_M {file.name} square.tif",
+        )  # fmt: skip
+
+
+def _centre(source: rasterio.DatasetReader) -> tuple[float, float]:
+    """Returns the coordinates of the centre of a raster that is north up, in its CRS."""
+    t = source.transform
+    return float(t.c + t.a * source.width / 2), float(t.f + t.e * source.height / 2)
+
+
+def _utm_epsg(longitude_deg: float, latitude_deg: float) -> int:
+    """Returns the EPSG code of the UTM zone (WGS 84) of a position."""
+    zone = min(max(math.floor((longitude_deg + 180) / 6) + 1, 1), 60)
+    return (32600 if latitude_deg >= 0 else 32700) + zone

@@ -1,0 +1,98 @@
+"""Vertical axis of a height file: direction and unit of its values, read from the file or given by `terrain.z`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.errors import TwinError
+
+Direction = Literal["up", "down"]
+
+#: Lengths [m] of the units that a raster band may have, by their names in lower case.
+UNITS_M = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us survey feet", "ftus", "us-ft", "us ft", "foot_us"), 1200 / 3937),
+    **dict.fromkeys(("fathom", "fathoms"), 1.8288),
+}
+#: Words in names and tags that indicate depths. They leave open whether depths are positive or negative numbers.
+_DEPTH_WORD = re.compile(r"depth|sounding", re.IGNORECASE)
+#: Band names that state depths. If the band has no negative value, its values increase downwards.
+_DEPTH_BAND = re.compile(r"^\s*(water |sea ?floor |bottom )?depths?\b", re.IGNORECASE)
+#: Standard names that the CF conventions define as positive downwards.
+_CF_DEPTHS = ("depth", "sea_floor_depth")
+
+
+class VerticalAxis(NamedTuple):
+    """Vertical axis of the values of a file, as the file describes it.
+
+    Args:
+        direction: direction of the axis of the vertical CRS or of the CF attributes; None if the file states none.
+        metres_per_unit: length of the unit; 1 if the file does not name one.
+        band_name: description or long name of the band.
+        texts: file name, names and tags that may name the quantity of the values.
+        datum: name of the vertical CRS; "" if there is none.
+    """
+
+    direction: Direction | None = None
+    metres_per_unit: float = 1.0
+    band_name: str = ""
+    texts: tuple[str, ...] = ()
+    datum: str = ""
+
+
+def unit_length_m(name: str, file: Path) -> float:
+    """Returns the length [m] of a unit by its name. Raises TwinError if the unit is unknown."""
+    length_m = UNITS_M.get(name.strip().lower().replace("_", " "), UNITS_M.get(name.strip().lower()))
+    if length_m is None:
+        raise TwinError(
+            "terrain.height_file", f"{file.name!r} has heights in the unknown unit {name!r}", "metres, feet or fathoms"
+        )
+    return length_m
+
+
+def cf_direction(tags: dict[str, str]) -> Direction | None:
+    """Returns the direction that the CF attributes `positive` and `standard_name` of a band state, if any."""
+    positive = tags.get("positive", "").lower()
+    if positive == "up" or positive == "down":
+        return positive
+    return "down" if tags.get("standard_name", "").lower().startswith(_CF_DEPTHS) else None
+
+
+def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Direction | None, file: Path) -> float:
+    """Returns +1 if the values increase upwards, -1 if they are depths, which increase downwards.
+
+    Args:
+        values: (rows, cols) values of the file, NaN in holes.
+        axis: vertical axis as the file describes it.
+        asked: `terrain.z` of the scenario, which takes precedence; None: recognised from the file.
+        file: the file, for the error message.
+    Raises:
+        TwinError: the file does not make clear which way its values increase.
+    """
+    if asked is not None:
+        return 1.0 if asked == "up" else -1.0
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    shown = f"{file.name!r} with values from {low:g} to {high:g}"
+    if axis.direction == "down" and high <= 0:
+        raise _ambiguous(f"{shown} states that they increase downwards, but none is positive")
+    if axis.direction is not None:
+        return 1.0 if axis.direction == "up" else -1.0
+    named = [text for text in (axis.band_name, *axis.texts) if _DEPTH_WORD.search(text)]
+    if not named or high <= 0:  # depths as negative numbers increase upwards
+        return 1.0
+    if low >= 0 and _DEPTH_BAND.search(axis.band_name):
+        return -1.0
+    raise _ambiguous(f"{shown} may hold depths ({named[0]!r})")
+
+
+def _ambiguous(problem: str) -> TwinError:
+    """Returns the error that asks for `terrain.z`."""
+    return TwinError("terrain.z", f"missing: {problem}", '"up" for elevations, "down" for depths')

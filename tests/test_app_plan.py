@@ -1,0 +1,97 @@
+"""Summary of a plan: expected errors, requirements, warnings, cost, JSON."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.special import ndtri
+
+from twin.app import plan_summary
+from twin.app.expected_error import ExpectedError
+from twin.scenario.file import load_scenario
+from twin.surrogate import error_model_file
+from twin.world.mission import prepare
+
+SMALL = ["terrain.texture_px_m=0.02", "plan.tracks=1", "plan.area_m=[2.0, 1.6]"]
+
+
+def summary_of(*overrides):
+    return plan_summary.summarise(prepare(load_scenario("quickstart", [*SMALL, *overrides])))
+
+
+@pytest.fixture(scope="module")
+def summary():
+    return summary_of('require={"map.le90_m"=0.05, "map.le95_m"=0.0001, "overlap.across_p05"=0.5}')
+
+
+def test_percentiles_of_equal_sigmas_are_those_of_the_normal_distribution():
+    error = ExpectedError(np.full(100, 0.02), 1.0, 0.05, 0.1)
+    assert error.percentile_m(90) == pytest.approx(0.02 * ndtri(0.95), rel=1e-6)
+    assert error.percentile_m(90, holes=0.05) == pytest.approx(0.02 * ndtri((1 + 0.9 / 0.95) / 2), rel=1e-6)
+    assert error.percentile_m(90, holes=0.1) is None
+    assert error.rmse_m == pytest.approx(0.02)
+
+
+def test_percentiles_of_a_mixture_are_those_of_its_samples():
+    rng = np.random.default_rng(0)
+    sigma = rng.uniform(0.001, 0.05, 200_000)
+    drawn = np.abs(rng.normal(0, sigma))
+    found = ExpectedError(sigma, 1.0, 0.05, 0.1).percentile_m(90)
+    assert found == pytest.approx(np.percentile(drawn, 90), rel=0.01)  # standard error 0.4 %
+
+
+def test_requirements_that_the_plan_is_expected_to_miss_are_named(summary):
+    verdicts = {name: row["passed"] for name, row in summary.require.items()}
+    assert verdicts == {"map.le90_m": True, "map.le95_m": False, "overlap.across_p05": True}
+    assert not summary.meets_requirements
+    assert any(w.startswith("map.le95_m is expected to miss its limit: ") for w in summary.warnings)
+
+
+def test_requirements_that_cannot_be_predicted_are_left_out():
+    assert summary_of('require={"trajectory.final.ate_rmse_m"=0.001}').require == {}
+
+
+def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2_over_f_b():
+    flat = ("terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.0")
+    narrow, wide = (summary_of(*flat, f"rig.baseline_m={b}") for b in (0.15, 0.3))
+    per_px = 2.0**2 / (narrow.mission.rig.focal_px * 0.15)
+    sigma_px = narrow.error.sigma_m / per_px
+    model = error_model_file.load().model
+    assert np.ptp(sigma_px) < 1e-6 * sigma_px.mean()
+    assert sigma_px.mean() >= model.depth_error_ratio * model.depth_sigma_px.floor_px
+    assert np.median(narrow.error.sigma_m) == pytest.approx(2 * np.median(wide.error.sigma_m), rel=0.02)
+
+
+def test_a_plan_on_the_plane_warns_of_the_overlap_that_the_floor_lacks(summary):
+    assert not [w for w in summary.warnings if "have an overlap" in w]
+    short = summary_of("plan.overlap_reference=plane", "plan.overlap_along=0.9", "plan.overlap_across=0.8")
+    assert [w for w in short.warnings if w.startswith("5 % of the keyframes have an overlap along the swaths below")]
+
+
+def test_effects_that_the_error_model_leaves_out_are_named():
+    assert "the expected error does not include the effects of [snow]" in summary_of("snow.density_per_m3=50").warnings
+
+
+def test_the_table_has_four_statistics_in_ascending_order(summary):
+    spreads = plan_summary.floor_spreads(summary)
+    assert [row[0] for row in plan_summary.floor_rows(summary)[1:]] == [p[0] for p in plan_summary._PROPERTIES.values()]
+    for values in spreads.values():
+        assert list(values) == sorted(values)
+
+
+def test_the_cost_grows_with_frames_keyframes_and_pixels(summary):
+    more = summary_of("plan.overlap_along=0.95")
+    larger = summary_of("rig.image_width_px=640", "rig.image_height_px=480")
+    for bigger in (more, larger):
+        assert bigger.cost.wall_s > summary.cost.wall_s and bigger.cost.disk_mb > summary.cost.disk_mb
+        assert bigger.cost.memory_mb > summary.cost.memory_mb
+    assert summary_of("imaging.fidelity=surrogate").cost.wall_s < summary.cost.wall_s
+
+
+def test_the_summary_is_json(summary):
+    tree = json.loads(json.dumps(plan_summary.as_json(summary, "plan.png"), allow_nan=False))
+    assert tree["schema"] == "twin.plan/1" and tree["picture"] == "plan.png"
+    assert set(tree["floor"]) == set(plan_summary._PROPERTIES)
+    assert set(tree["floor"]["overlap_along"]) == {"minimum", "p05", "median", "maximum"}
+    assert tree["plan"]["n_frames"] == summary.mission.n_frames
+    assert 0 < tree["coverage"] <= 1 and len(tree["warnings"]) == len(summary.warnings)

@@ -1,0 +1,135 @@
+"""Self-check of the estimators: rectification errors from row differences, repeating texture, and findings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from judge_synthetic import survey
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from twin.core import geometry
+from twin.core.quality import EstimationQuality
+from twin.core.records import StereoObservation, StereoRig
+from twin.estimate.self_check import check_survey
+from twin.estimate.vision import matching
+from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
+from twin.estimate.vision.repetition import repetition
+from twin.estimate.vision.stereo import StereoPoints
+
+RIG = StereoRig(320, 240, 277.0, 0.15)
+NOISE_PX = 0.05
+
+
+def matched(rotation, offset_px, seed=0, n=400):
+    """Returns stereo points of a right camera that is turned by a rotation vector and whose principal point is off."""
+    rng = np.random.default_rng(seed)
+    pixels = np.column_stack([rng.uniform(30, 310, n), rng.uniform(10, 230, n)]).round().astype(np.float32)
+    disparity = RIG.baseline_m / rng.uniform(1.5, 2.5, n)
+    left = RIG.normalised(pixels)
+    right = np.column_stack([left[:, 0] - disparity, left[:, 1], np.ones(n)])
+    turned = right @ geometry.exp(np.append(rotation, np.zeros(3)))[:3, :3].T
+    rows = (turned[:, 1] / turned[:, 2] - left[:, 1]) * RIG.focal_px + offset_px + NOISE_PX * rng.standard_normal(n)
+    measured = np.column_stack([left, disparity])
+    cov = np.tile(np.diag([1.0, 0.5, 2.0]) * (NOISE_PX / RIG.focal_px) ** 2 / 2, (n, 1, 1))
+    xyz = np.column_stack([left, np.ones(n)]) * (RIG.baseline_m / disparity)[:, None]
+    return StereoPoints(pixels, np.zeros((n, 2)), disparity * RIG.focal_px, measured, cov, xyz, rows)
+
+
+def calibrated(rotation, offset_px, n_pairs=10):
+    calibration = EpipolarCalibration()
+    for seed in range(n_pairs):
+        calibration.add(matched(rotation, offset_px, seed), RIG, 11)
+    return calibration
+
+
+@pytest.mark.parametrize("rotation", [(1e-3, 0, 0), (0, 2e-3, 0), (0, 0, -3e-3), (5e-4, -1e-3, 2e-3)])
+def test_row_differences_give_pitch_yaw_and_roll_of_the_right_camera(rotation):
+    report = calibrated(np.array(rotation), 0.0).report()
+    assert np.all(np.abs(report.estimate[:3] - rotation) < 4 * report.sigma[:3])
+    assert np.all(report.sigma[:3] < 2e-4)
+
+
+def test_an_offset_of_the_principal_point_is_told_from_a_pitch_by_the_curvature_of_the_rows():
+    report = calibrated(np.zeros(3), 0.5, n_pairs=40).report()
+    assert report.estimate[3] * RIG.focal_px == pytest.approx(0.5, abs=0.03)
+    assert abs(report.estimate[0]) * RIG.focal_px < 0.03
+
+
+def test_nothing_is_removed_from_a_rectified_pair():
+    calibration = calibrated(np.zeros(3), 0.0)
+    image = np.random.default_rng(1).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    assert not calibration.update(RIG)
+    assert calibration.rectify(image, RIG) is image
+
+
+def test_the_rectified_image_is_the_image_of_a_camera_without_the_error():
+    rotation = np.array([1.5e-3, 0, -4e-3])
+    smooth = gaussian_filter(np.random.default_rng(2).uniform(0, 255, (240, 320)), 3)
+    levels = (smooth - smooth.min()) / np.ptp(smooth) * 220 + 15
+    v, u = np.mgrid[:240, :320].astype(float)
+    rays = np.stack([(u - RIG.cx_px) / RIG.focal_px, (v - RIG.cy_px) / RIG.focal_px, np.ones_like(u)], axis=-1)
+    turned = rays @ geometry.exp(np.append(-rotation, np.zeros(3)))[:3, :3].T
+    x, y = turned[..., 0] / turned[..., 2], turned[..., 1] / turned[..., 2]
+    seen = map_coordinates(
+        levels, [y * RIG.focal_px + RIG.cy_px, x * RIG.focal_px + RIG.cx_px], order=3, mode="nearest"
+    )
+    seen = np.repeat(seen.round().astype(np.uint8)[..., None], 3, axis=2)
+    calibration = calibrated(rotation, 0.0, n_pairs=40)
+    assert calibration.update(RIG)
+    restored = calibration.rectify(seen, RIG)[8:-8, 8:-8, 0].astype(float)
+    assert np.abs(restored - levels[8:-8, 8:-8]).mean() < 1.0
+    assert np.abs(seen[8:-8, 8:-8, 0] - levels[8:-8, 8:-8]).mean() > 2.5
+
+
+def texture(seed=0):
+    fine = gaussian_filter(np.random.default_rng(seed).standard_normal((240, 320)), 1.5)
+    return matching.normalise((128 + 300 * fine).astype(np.float32))
+
+
+def test_repetition_tells_a_tiled_texture_from_a_random_one():
+    tile = texture()[:24, :32]
+    assert repetition(texture(), 11) < 0.35
+    assert repetition(np.tile(tile, (10, 10)), 11) > 0.9
+    assert repetition(np.full((240, 320), 128, np.uint8), 11) == 0.0
+
+
+OBSERVATION = StereoObservation(0, 400, 0.2, 0.0, 0.0, 0.04, 0.05, 0.2)
+
+
+def survey_result():
+    """Returns the result of a synthetic survey, with positions known to 1 mm at a depth of 2 m."""
+    result = survey()[0]
+    n = len(result.keyframe_rows)
+    return replace(result, node_cov=np.tile(np.eye(6) * 1e-6, (n, 1, 1)), keyframe_depth_m=np.full(n, 2.0))
+
+
+def quality(**changes):
+    return EstimationQuality(links_tried=100, link_residual=1.0, link_chi2=1.0)._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "observed", "check"),
+    [
+        ({"frames_lost": 20}, {}, "frames_lost"),
+        ({"nodes_bridged": 1}, {}, "nodes_bridged"),
+        ({"links_failed": 30}, {}, "links_failed"),
+        ({"link_chi2": 5.0}, {}, "link_chi2"),
+        ({"link_residual": 3.0}, {}, "link_residual"),
+        ({}, {"n_points": 20}, "points"),
+        ({}, {"row_spread_px": 0.2}, "row_spread"),
+        ({}, {"row_offset_px": -0.3}, "row_offset"),
+        ({}, {"repetition": 0.9}, "repetition"),
+    ],
+)
+def test_each_check_finds_its_fault_and_nothing_else(changes, observed, check):
+    result = survey_result()
+    good = replace(result, quality=quality(), stereo_observations=[OBSERVATION])
+    bad = replace(result, quality=quality(**changes), stereo_observations=[OBSERVATION._replace(**observed)])
+    assert [finding.check for finding in check_survey(good, RIG)] == []
+    assert [finding.check for finding in check_survey(bad, RIG)] == [check]
+
+
+def test_an_uncertain_position_is_a_finding():
+    result = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION])
+    result.node_cov[-1, 3:, 3:] = np.eye(3) * 0.1**2
+    assert [finding.check for finding in check_survey(result, RIG)] == ["sigma"]

@@ -1,0 +1,246 @@
+"""First lines and badge of a report: each limit of a survey is a sentence on the page, console and recording."""
+
+import copy
+import json
+import re
+
+import pytest
+from judge_synthetic import evaluated, survey, write_folder
+
+from twin.app import console
+from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
+from twin.judge.warnings import metric_warnings
+from twin.report import wording
+from twin.report.run_folder import load_run
+from twin.report.survey_page import write_report
+from twin.report.verdict import badge, first_lines
+from twin.scenario.file import load_scenario
+from twin.scenario.idealisations import idealisations
+
+GOOD = evaluated(*survey())
+GOOD["consistency"]["nees_position_mean"], GOOD["map"]["sigma_ratio"], GOOD["reason"] = 3.0, 1.0, ""
+GOOD |= {"warnings": metric_warnings(GOOD)}
+GOOD |= {"warning": " ".join(GOOD["warnings"])}
+
+
+def changed(**changes):
+    """Returns the metrics of a good survey with changes; a dictionary changes single entries of its section."""
+    metrics = copy.deepcopy(GOOD)
+    for key, value in changes.items():
+        metrics[key] = metrics[key] | value if isinstance(value, dict) else value
+    return metrics | {"warnings": [*changes.get("warnings", ()), *metric_warnings(metrics)]}
+
+
+def missed(name="map.le90_area_m", value=None, limit=0.02):
+    return {"require": {name: {"value": value, "limit": limit, "passed": False}}}
+
+
+CASES = {
+    "good": (changed(), "complete", "good", []),
+    "aborted": (
+        changed(status="aborted", reason="vision lost at 3.0 s"),
+        "aborted", "bad", ["The survey was aborted: vision lost at 3.0 s."],
+    ),
+    "degraded": (
+        changed(status="degraded", reason="the row residuals are 3 px"),
+        "degraded", "bad", ["The survey is degraded: the row residuals are 3 px."],
+    ),
+    "aborted and missed": (
+        changed(status="aborted", reason="interrupted; map skipped", **missed("map.completeness_area", None, 0.9)),
+        "aborted, requirement missed", "bad",
+        ["The survey was aborted: interrupted; map skipped.",
+         "Requirement missed: map.completeness_area is unknown, at least 0.9 is required."],
+    ),
+    "missed": (
+        changed(**missed("map.le90_m", 0.031)), "complete, requirement missed", "bad",
+        ["Requirement missed: map.le90_m is 0.031, at most 0.02 is required."],
+    ),
+    "holes": (
+        changed(map={"completeness_area": 0.81, "le90_area_m": None}, **missed()),
+        "complete, requirement missed", "bad",
+        ["Requirement missed: map.le90_area_m is infinite (only 81 % of the asked area has a height), "
+         "at most 0.02 is required."],
+    ),
+    "NEES": (
+        changed(consistency={"nees_position_mean": 8.71}), "complete, with warnings", "warn",
+        ["The position covariances are too small: the mean NEES is 8.71, where 3 is expected and 2 to 5 accepted."],
+    ),
+    "sigma": (
+        changed(map={"sigma_ratio": 0.41}), "complete, with warnings", "warn",
+        ["The sigmas of the map are too large: the RMS of error / sigma is 0.41, where 1 is expected and 0.5 to 2 "
+         "accepted."],
+    ),
+    "saturation": (
+        changed(vision={"saturated_median": 0.123}), "complete, with warnings", "warn",
+        ["The images are saturated: 12.3 % of the values of the median image (more than 1 %)."],
+    ),
+    "surrogate": (
+        changed(warnings=["The surrogate extrapolates: too murky."]), "complete, with warnings", "warn",
+        ["The surrogate extrapolates: too murky."],
+    ),
+    "ideal": (
+        changed(idealisations=["The cameras are ideal: no port."]), "complete", "good",
+        ["The cameras are ideal: no port."],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_sentences_and_badge_follow_from_the_metrics(case):
+    metrics, text, level, sentences = CASES[case]
+    assert first_lines(metrics) == sentences
+    assert badge(metrics) == (text, level)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_folder(tmp_path_factory.mktemp("verdict") / "run")
+
+
+@pytest.mark.parametrize("case", ["good", "degraded", "holes", "surrogate"])
+def test_the_report_starts_with_the_badge_and_the_sentences(folder, monkeypatch, case):
+    monkeypatch.setattr("twin.report.survey_page.draw_all", lambda _: dict.fromkeys(FIGURES))
+    metrics, text, level, sentences = CASES[case]
+    page = write_report(folder, metrics).read_text()
+    header = page[page.index("<header>") : page.index("</header>")]
+    assert f'<span class="badge {level}">{text}</span>' in header
+    assert re.findall("<li>(.*)</li>", header) == sentences
+    style = page[: page.index("</style>")]
+    assert f".badge.{level} {{ color: var(--{level}" in style or level == "good"
+
+
+FIGURES = (
+    "plan_view path_errors stages tracks stereo_quality elevation error histogram network timing".split()
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ["good", "aborted", "degraded", "holes", "surrogate"])
+def test_the_console_starts_with_the_badge_and_the_sentences(capsys, case):
+    metrics, text, _, sentences = CASES[case]
+    console.print_metrics(metrics)
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == f"synthetic, seed 7: {text}"
+    assert printed[1 : 1 + len(sentences)] == [f"- {sentence}" for sentence in sentences]
+
+
+def test_the_recording_contains_the_sentences(folder, monkeypatch):
+    from twin.report import recording
+
+    logged = {}
+
+    class Log:
+        def log(self, path, entity, **_):
+            logged[path] = entity
+
+    metrics, text, _, sentences = CASES["degraded"]
+    run = load_run(folder, metrics)
+    recording.log_scene(Log(), run)
+    summary = logged["summary"].text.as_arrow_array()[0].as_py()
+    assert summary.startswith(f"# synthetic: {text}\n\n- {sentences[0]}\n")
+
+
+def test_an_unfinished_run_has_a_red_badge():
+    assert badge(None) == ("unfinished", "bad")
+
+
+def test_metrics_of_older_runs_keep_their_warning():
+    older = {key: value for key, value in GOOD.items() if key not in ("warnings", "idealisations")}
+    older["map"] = {key: value for key, value in GOOD["map"].items() if not key.endswith(("area", "area_m"))}
+    older["warning"] = "surrogate: too murky"
+    assert first_lines(older) == ["surrogate: too murky"] and badge(older).level == "warn"
+    assert wording.headline(older, {}) and wording.key_figures(older)
+
+
+def test_every_map_statistic_is_reported_with_completeness():
+    metrics = changed(map={"completeness": 0.876, "completeness_area": 0.765})
+    for figure in wording.key_figures(metrics):
+        if figure.label.startswith(("Map", "Sigma")):
+            assert "87.6 %" in figure.meaning or "76.5 %" in figure.meaning, figure.label
+    for sentence in wording.headline(metrics, {}).split(". "):
+        if "LE90" in sentence:
+            assert "87.6 %" in sentence or "76.5 %" in sentence
+
+
+def test_a_map_with_too_many_holes_has_an_infinite_le90_in_the_text():
+    metrics = changed(map={"completeness_area": 0.5, "le90_area_m": None})
+    assert "LE90 of its heights over this area is infinite" in wording.headline(metrics, {})
+    assert wording.area_le90({"completeness_area": None, "le90_area_m": None}) == wording.DASH
+
+
+@pytest.mark.parametrize(
+    ("value", "n"), [(1.99, 1), (2.0, 0), (5.0, 0), (5.01, 1), (None, 0)]
+)  # fmt: skip
+def test_the_bounds_of_nees_are_two_and_five(value, n):
+    assert len(changed(consistency={"nees_position_mean": value})["warnings"]) == n
+
+
+@pytest.mark.parametrize(("value", "n"), [(0.49, 1), (0.5, 0), (2.0, 0), (2.01, 1), (None, 0)])
+def test_the_bounds_of_the_sigma_ratio_are_a_half_and_two(value, n):
+    assert len(changed(map={"sigma_ratio": value})["warnings"]) == n
+
+
+def test_the_metrics_join_all_warnings():
+    result, elevation, truth, rig = survey()
+    metrics = evaluate(EvaluationInput(result, elevation, truth, rig, warnings=["One."], idealisations=["Two."]))
+    assert metrics["warnings"][0] == "One." and metrics["warning"] == " ".join(metrics["warnings"])
+    assert metrics["idealisations"] == ["Two."]
+
+
+def test_metrics_that_were_not_evaluated_have_the_same_keys_and_meet_no_requirement():
+    result, elevation, truth, rig = survey()
+    identity = {"name": "one", "seed": 3, "status": "aborted", "reason": "interrupted; evaluation skipped"}
+    given = EvaluationInput(result, elevation, truth, rig, identity=identity, require={"map.le90_m": 1.0})
+    empty, whole = unevaluated(given), evaluate(given)
+    assert list(empty) == list(whole)
+    assert {key: empty[key] for key in identity} == identity
+    assert empty["timing"] == whole["timing"] and empty["map"]["le90_m"] is None
+    assert empty["require"]["map.le90_m"] == {"value": None, "limit": 1.0, "passed": False}
+    json.dumps(empty, allow_nan=False)
+
+
+IDEAL = load_scenario("quickstart")
+REAL = [
+    "calibration_error.baseline_error=0.01", 'port.kind="flat"', "sensor.motion_blur=true", "snow.density_per_m3=10",
+    "imaging.forward_scatter=true", "imaging.shadows=true", "current.velocity_mps=[0.1, 0.0, 0.0]",
+]  # fmt: skip
+
+
+def test_a_default_scenario_names_what_it_idealises():
+    assert idealisations(IDEAL) == [
+        "The cameras are ideal: no calibration error, no port, no motion blur.",
+        "The water is ideal: no forward scatter, no marine snow, no current.",
+        "The light is ideal: no shadows of the lamps.",
+    ]
+
+
+def test_a_scenario_with_every_effect_idealises_nothing():
+    assert idealisations(load_scenario("quickstart", REAL)) == []
+
+
+@pytest.mark.parametrize("override", REAL)
+def test_each_effect_removes_its_own_phrase(override):
+    without = idealisations(load_scenario("quickstart", [other for other in REAL if other != override]))
+    assert len(without) == 1 and without[0].count("no ") == 1
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ('water.jerlov="clear"', "The water is ideal: no absorption, no scattering."),
+        ("water.turbidity=0", "The water is ideal: no scattering."),
+        (
+            'imaging.fidelity="surrogate"',
+            "No images were rendered: visual measurements are sampled",
+        ),
+        ("sun.illuminance_lx=1000", "The light is ideal: no caustics."),
+    ],
+)
+def test_further_idealisations_are_named(override, sentence):
+    (found,) = idealisations(load_scenario("quickstart", [*REAL, override]))
+    assert found.startswith(sentence)
+
+
+def test_a_kinematic_vehicle_is_ideal():
+    calm = [override for override in REAL if not override.startswith("current")]
+    found = idealisations(load_scenario("quickstart", [*calm, 'vehicle.dynamics="kinematic"']))
+    assert found == ["The water is ideal: no current.", "The vehicle is ideal: no forces, no inertia."]

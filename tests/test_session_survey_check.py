@@ -1,0 +1,88 @@
+"""Findings about the planned path and the asked area, and the aborts while a survey is flown."""
+
+import functools
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from twin.core.quality import EpipolarError, EstimationQuality
+from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Trajectory
+from twin.errors import SurveyAborted
+from twin.scenario.file import load_scenario
+from twin.session.monitor import SurveyMonitor
+from twin.session.survey_check import calibration_notes, off_course_limit_m, survey_findings
+from twin.world.mission import prepare
+
+
+@functools.cache
+def mission(*overrides):
+    return prepare(load_scenario("quickstart", ["imaging.fidelity=surrogate", "plan.tracks=1", *overrides]))
+
+
+def result_at(positions):
+    """Returns a result without keyframes whose path consists of these positions (n, 3)."""
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions
+    path = Trajectory(np.arange(len(positions)) / 30.0, poses)
+    none = np.zeros(0, np.int64)
+    return SurveyResult(path, path, path, none, none, np.zeros((0, 6, 6)))
+
+
+def elevation(fraction):
+    """Returns a map in which this fraction of the columns of the asked area has heights."""
+    grid = mission().grid
+    x, y = np.meshgrid(*grid.centres())
+    asked = mission().plan.inside_area(x, y)
+    columns = np.flatnonzero(asked.any(axis=0))
+    height = np.zeros((grid.rows, grid.cols), np.float32)
+    height[:, columns[round(fraction * len(columns)) :]] = np.nan
+    return ElevationMap(grid, height, np.ones_like(height), np.zeros((*height.shape, 3), np.uint8))
+
+
+def checks(result, heights, reference):
+    return [finding.check for finding in survey_findings(mission(), result, heights, reference)]
+
+
+def test_a_survey_on_its_path_that_maps_the_area_has_no_findings():
+    path = np.zeros((90, 3))
+    assert checks(result_at(path), elevation(0.95), path) == []
+
+
+def test_an_area_with_a_tenth_missing_is_a_finding():
+    path = np.zeros((90, 3))
+    assert checks(result_at(path), elevation(0.85), path) == ["area_mapped"]
+    assert checks(result_at(path), None, path) == ["area_mapped"]
+
+
+def test_only_a_lasting_departure_from_the_path_is_a_finding():
+    limit_m = off_course_limit_m(mission())
+    assert limit_m == pytest.approx(0.25 * min(mission().plan.footprint_m))
+    for n_frames, expected in ((20, []), (40, ["off_course"])):
+        path = np.zeros((90, 3))
+        path[30 : 30 + n_frames, 1] = 1.1 * limit_m
+        assert checks(result_at(path), elevation(1.0), np.zeros((90, 3))) == expected
+    assert off_course_limit_m(mission("control.off_course_m=0.02")) == 0.02
+
+
+def test_removed_rectification_errors_are_reported():
+    error = EpipolarError(np.array([1e-3, 0, 0, 0]), np.full(4, 1e-5), np.array([1e-3, 0, 0, 2e-3]))
+    result = replace(result_at(np.zeros((1, 3))), quality=EstimationQuality(epipolar=error))
+    (note,) = calibration_notes(result, mission().rig)
+    assert "pitch of +0.057 deg" in note and f"{2e-3 * mission().rig.focal_px:+.2f} px" in note
+    untouched = replace(result, quality=EstimationQuality(epipolar=error._replace(removed=np.zeros(4))))
+    assert calibration_notes(untouched, mission().rig) == []
+
+
+def test_a_survey_whose_position_is_lost_is_aborted():
+    monitor = SurveyMonitor(mission(), SimpleNamespace(log=lambda *_, **__: None), lambda _: None)
+    frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), None)
+    half_m = 0.5 * min(mission().plan.footprint_m)
+
+    def estimate(sigma_m):
+        return Estimate(1.0, np.eye(4), np.eye(4), np.zeros(6), sigma_m, "ok")
+
+    monitor(estimate(0.9 * half_m), frame)
+    with pytest.raises(SurveyAborted, match="standard deviation of the position"):
+        monitor(estimate(1.1 * half_m), frame)

@@ -1,0 +1,84 @@
+"""Ranges that are said to pass do pass: on curves that are not monotonic, at the boundary, and with few surveys."""
+
+import numpy as np
+import pytest
+
+from twin.study.answers import PassRecord, answers_of_ranges, answers_of_values, value_bins
+
+
+def answers(x, passed, required=0.9):
+    return answers_of_ranges(np.asarray(x, float), PassRecord(np.asarray(passed, bool), np.arange(len(x)), required))
+
+
+def of_verdict(found, verdict):
+    return [answer for answer in found if answer.verdict == verdict]
+
+
+def test_two_separate_ranges_that_pass_are_both_found():
+    x = np.linspace(1.0, 3.0, 600)
+    passes = ((x >= 1.6) & (x <= 1.9)) | (x >= 2.5)
+    found = answers(x, passes)
+    bin_m = 600 / 20 * (x[1] - x[0])  # a bin that contains a boundary belongs to neither side
+    low, high = of_verdict(found, "passes")
+    np.testing.assert_allclose([low.low, low.high, high.low, high.high], [1.6, 1.9, 2.5, 3.0], atol=bin_m)
+    assert low.low >= 1.6 and low.high <= 1.9 and high.low >= 2.5
+    assert len(of_verdict(found, "fails")) == 2
+    assert not any(passes[(x >= a.low) & (x <= a.high)].mean() >= 0.9 for a in of_verdict(found, "fails"))
+
+
+def test_a_narrow_range_that_fails_is_not_covered_by_its_neighbours():
+    x = np.linspace(0.0, 1.0, 2000)
+    hole = (x > 0.5) & (x < 0.56)  # 6 %: pooled with both sides, 94 % pass
+    found = of_verdict(answers(x, ~hole), "passes")
+    assert len(found) == 2
+    assert found[0].high <= 0.5 and found[1].low >= 0.56
+
+
+@pytest.mark.parametrize(("fraction", "verdict"), [(0.89, "passes"), (0.95, "fails")])
+def test_at_a_constant_pass_probability_a_wrong_range_is_rare(fraction, verdict):
+    rng, wrong = np.random.default_rng(0), 0
+    for _ in range(40):
+        x = rng.random(100)
+        wrong += bool(of_verdict(answers(x, rng.random(100) < fraction), verdict))
+    assert wrong <= 4  # 2.5 % per study: four or fewer of 40 in 99.7 % of cases
+
+
+def test_one_survey_decides_nothing_and_states_how_many_would():
+    (found,) = answers([2.0], [True])
+    assert (found.verdict, found.label, found.surveys) == ("undecided", "2", 1)
+    assert found.more_surveys == 34  # 35 of 35 are needed for a lower bound of 90 %
+    assert answers([], []) == []
+
+
+def test_a_required_probability_of_1_is_never_shown_but_can_be_refuted():
+    x = np.arange(300.0)
+    (found,) = answers(x, np.ones(300), required=1.0)
+    assert (found.verdict, found.more_surveys) == ("undecided", np.inf)
+    assert of_verdict(answers(x, x < 150, required=1.0), "fails")
+
+
+def test_listed_values_are_judged_one_by_one():
+    names = np.array(["IB"] * 40 + ["II"] * 40 + ["III"] * 4)
+    passed = np.array([True] * 40 + [False] * 40 + [True] * 4)
+    found = answers_of_values(names, PassRecord(passed, np.arange(84), 0.9))
+    assert [(a.label, a.verdict) for a in found] == [("IB", "passes"), ("II", "fails"), ("III", "undecided")]
+    numbers = answers_of_values(np.repeat([0.5, 2.0], 42), PassRecord(passed, np.arange(84), 0.9))
+    assert [(a.low, a.high, a.label) for a in numbers] == [(0.5, 0.5, "0.5"), (2.0, 2.0, "2")]
+
+
+def test_surveys_of_one_sample_count_less_than_independent_ones():
+    x, passed = np.repeat(np.linspace(0, 1, 10), 10), np.ones(100, bool)
+    independent = answers_of_ranges(x, PassRecord(passed, np.arange(100), 0.9))
+    clustered = answers_of_ranges(x, PassRecord(passed, np.repeat(np.arange(10), 10), 0.9))
+    assert [a.verdict for a in independent] == ["passes"]
+    assert [a.verdict for a in clustered] == ["undecided"]
+    assert clustered[0].more_surveys == 246  # 34.6 samples instead of 10
+
+
+def test_equal_values_share_a_bin_and_no_bin_is_small():
+    x = np.random.default_rng(0).integers(0, 40, 500).astype(float)
+    bins = value_bins(x)
+    assert all(len(np.unique(bins[x == value])) == 1 for value in np.unique(x))
+    assert np.bincount(bins).min() >= 12
+    assert (np.diff(bins[np.argsort(x, kind="stable")]) >= 0).all()
+    assert value_bins(np.zeros(5)).tolist() == [0] * 5

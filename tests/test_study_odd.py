@@ -1,0 +1,70 @@
+"""Odd studies end with the right exit status, and what is said about them holds."""
+
+import odd_studies
+import pytest
+
+from twin.study import runner
+from twin.study.summary import summary
+
+
+@pytest.fixture(autouse=True)
+def _no_report(monkeypatch):
+    """Leaves out the report, which takes longer than everything else."""
+    monkeypatch.setattr(runner, "write_report", lambda study, analysis, page: None)
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said"),
+    [
+        ("all refused", 2, ["not allowed (allowed: greater than 0) in sample 0 and 239 more"]),
+        ("no survey can be planned", 2, ["No survey could be evaluated. 8 samples (8 surveys) cannot be flown"]),
+        ("half refused", 0, ["120 of 120 surveys", "120 samples (120 surveys) cannot be flown and are not counted"]),
+        (
+            "non-monotonic",
+            1,
+            [
+                "The required 90 % is not met.",
+                "pass at plan.altitude_m 1.6 to 1.9 and 2.5 to 3; fewer pass at 1 to 1.6 and 1.9 to 2.5.",
+            ],
+        ),
+        ("one sample", 0, ["(95 % confidence interval: 20.7 % to 100 %)", "not decided with 1 survey (about 34 more"]),
+        ("zero passes", 1, ["0 % (95 % confidence interval: 0 % to 24.2 %)", "fewer pass at 1.08 to 2.89."]),
+        ("all pass", 0, ["(95 % confidence interval: 98.4 % to 100 %)", "plan.altitude_m 1.01 to 2.99."]),
+        ("constant parameter", 0, ["plan.altitude_m has one value only."]),
+        ("categorical parameter", 1, ["pass at water.jerlov IB; fewer pass at II and III."]),
+        (
+            "duplicated values",
+            0,
+            ["80 of 80", "40 surveys repeat others (same scenario, same seed) and are not counted"],
+        ),
+        ("interrupted", 130, ["The study is not finished: 235 surveys not flown yet", "not decided with 5 surveys"]),
+    ],
+)
+def test_an_odd_study_says_what_holds(tmp_path, name, status, said):
+    found, lines = odd_studies.says(name, tmp_path)
+    text = " ".join(lines)
+    assert found == status
+    for sentence in said:
+        assert sentence in text
+
+
+def test_refused_samples_are_listed_with_their_values_and_reasons(tmp_path):
+    analysis = odd_studies.run("half refused", tmp_path).analysis
+    listed = summary(analysis, {})["refused_samples"]
+    assert len(listed) == 120
+    assert all(sample["values"]["plan.altitude_m"] <= 0 and "not allowed" in sample["reason"] for sample in listed)
+    (reason,) = analysis.refusal_reasons
+    assert (reason.status, reason.surveys) == ("refused", 120)
+    assert analysis.failure_reasons == []
+    assert analysis.pass_probability.value == 1.0
+
+
+def test_a_range_that_passes_in_the_summary_has_passing_surveys_only(tmp_path):
+    analysis = odd_studies.run("non-monotonic", tmp_path).analysis
+    altitude_m = analysis.numbers("vary.plan.altitude_m")
+    ranges = summary(analysis, {})["answers"]["plan.altitude_m"]
+    assert [r["verdict"] for r in ranges].count("passes") == 2
+    for found in ranges:
+        inside = (altitude_m >= found["low"]) & (altitude_m <= found["high"])
+        assert inside.sum() == found["surveys"]
+        assert analysis.passed[inside].mean() == pytest.approx(found["probability"]["value"])

@@ -1,0 +1,340 @@
+"""A plan found with the surrogate is recommended only if it passes rendered, and its failure improves the search."""
+
+import json
+import math
+
+import pyarrow.parquet as pq
+import pytest
+from study_surveys import SerialEngine, study_of
+
+from twin.app import study_command
+from twin.errors import ScenarioError
+from twin.study import candidates, tuning_report
+from twin.study.candidates import cost_index, tuning_config
+from twin.study.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
+from twin.study.distribution import Distribution
+from twin.study.flight import row_of
+from twin.study.progress import StudyProgress
+from twin.study.tuning import tune
+
+TUNING = """
+scenario = "quickstart"
+
+[set]
+imaging.fidelity = "surrogate"
+
+[vary]
+water.turbidity = { uniform = [5.0, 6.0] }
+
+[sampling]
+method = "lhs"
+samples = 2
+
+[tune]
+objectives = ["timing.simulated_s", "map.le90_m"]
+trials = 24
+batch = 6
+verify = 2
+
+[tune.search]
+plan.altitude_m = { uniform = [1.0, 3.0] }
+plan.speed_mps = { uniform = [0.2, 0.4] }
+
+[require]
+probability = 0.9
+"map.le90_m" = 0.01
+"""
+TINY = """
+scenario = "quickstart"
+keep = "none"
+
+[set]
+imaging.fidelity = "surrogate"
+plan.area_m = [1.2, 0.8]
+plan.tracks = 1
+control.hold_s = 0.5
+
+[tune]
+objectives = ["timing.simulated_s"]
+trials = 4
+batch = 4
+confirm = 2
+verify = 1
+plans = 2
+rounds = 0
+keep = "report"
+
+[tune.search]
+plan.overlap_along = { uniform = [0.8, 0.95] }
+plan.speed_mps = { uniform = [0.2, 0.4] }
+
+[require]
+probability = 0.5
+"map.le90_m" = 0.02
+"""
+SURROGATE_LIMIT_M, RENDERED_LIMIT_M = 2.5, 1.8  # altitude up to which the error meets its limit
+
+
+def flown(survey, error_m, status="complete", warning=""):
+    """Returns the row of a survey whose duration falls with altitude."""
+    return row_of(survey, status, "") | {
+        "timing.simulated_s": 60 / survey.values["plan.altitude_m"],
+        "timing.survey_s": 30.0,
+        "map.le90_m": error_m,
+        "require.map.le90_m.passed": error_m <= 0.01,
+        "warning": warning,
+    }
+
+
+def is_rendered(survey):
+    return survey.scenario.imaging.fidelity == "rendered"
+
+
+def optimistic(survey):
+    """Flies a survey whose surrogate is right at low altitude and too optimistic at high altitude."""
+    altitude_m = survey.values["plan.altitude_m"]
+    limit_m = RENDERED_LIMIT_M if is_rendered(survey) else SURROGATE_LIMIT_M
+    warning = "" if is_rendered(survey) else f"the surrogate extrapolates to {altitude_m:.2f} m"
+    return flown(survey, 0.01 * (altitude_m / limit_m) ** 4, warning=warning)
+
+
+def hopeless(survey):
+    return flown(survey, 0.02 if is_rendered(survey) else 0.008)
+
+
+def degraded(survey):
+    return flown(survey, 0.005, "degraded" if is_rendered(survey) else "complete")
+
+
+def search(study, folder, function=optimistic, engine=None, resume=False):
+    return tune(study, folder, resume, engine or SerialEngine(), StudyProgress(), function)
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verified")
+    study = study_of(folder, TUNING)
+    return study, search(study, folder / "out"), folder / "out"
+
+
+def test_the_recommended_plan_passed_rendered_and_is_the_cheapest_that_did(searched):
+    _, result, _ = searched
+    altitude_m = result.recommended.values["plan.altitude_m"]
+    assert 0.8 * RENDERED_LIMIT_M < altitude_m <= RENDERED_LIMIT_M
+    assert result.verifications[0].surrogate.values["plan.altitude_m"] > RENDERED_LIMIT_M  # the surrogate's choice
+    assert not result.verifications[0].passed
+    assert result.recommended_verification.n_passed == 2
+    passed = [v.surrogate.objectives[0] for v in result.verifications if v.passed]
+    assert result.recommended.objectives[0] == min(passed)
+
+
+def test_no_cheaper_plan_of_the_final_front_is_left_untried(searched):
+    """A cheaper plan of the corrected front would have been flown next, unless the number of plans was reached."""
+    study, result, _ = searched
+    config = tuning_config(study)
+    cheaper = [c for c in result.candidates if c.shortfall <= 0 and c.objectives[0] < result.recommended.objectives[0]]
+    in_round = [v.search_round for v in result.verifications]
+    assert not cheaper or in_round.count(max(in_round)) == config.plans
+
+
+def test_rendered_surveys_are_told_from_surrogate_ones_in_the_table(searched):
+    _, result, folder = searched
+    table = pq.read_table(folder / "results.parquet").to_pylist()
+    rendered = [row for row in table if row["fidelity"] == "rendered"]
+    assert len(rendered) == 2 * len(result.verifications)
+    assert {row["fidelity"] for row in table} == {"rendered", "surrogate"}
+    seeds = {row["seed"] for row in rendered}
+    assert len(seeds) == 2 and not seeds & {row["seed"] for row in table if row["fidelity"] == "surrogate"}
+
+
+def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(searched):
+    study, result, folder = searched
+    config = tuning_config(study)
+    headline = tuning_report.headline(study, config, result)
+    assert "Flown rendered, 2 of 2 surveys were completed and met every requirement" in headline
+    median = result.recommended_verification.medians["map.le90_m"]
+    assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
+    tuning_report.write_tuning_report(study, config, result, folder)
+    warnings = tuning_report.warnings(result)
+    assert any("the surrogate extrapolates to" in text for text in warnings)
+    assert any("the surrogate is wrong about the map height error (LE90)" in text for text in warnings)
+    summary = tuning_report.summary(study, config, result)
+    assert json.loads(json.dumps(summary, allow_nan=False))["warnings"] == warnings
+    assert summary["recommended"]["verified"]
+    page, scenario = (folder / "tuning.html").read_text(), (folder / "recommended.toml").read_text()
+    for text in warnings:
+        assert f"# Warning: {text}" in scenario
+    assert page.count("<b>Warning:</b>") == len(warnings)
+    assert "Plans flown rendered" in page
+
+
+def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_rounds(tmp_path):
+    study = study_of(tmp_path, TUNING)
+    result = search(study, tmp_path / "out", hopeless)
+    assert result.recommended is None
+    assert {v.search_round for v in result.verifications} <= {0, 1, 2}
+    assert 1 <= len(result.verifications) <= 9
+    headline = tuning_report.headline(study, tuning_config(study), result)
+    assert "no plan of the search passed when flown rendered" in headline
+    assert tuning_report.summary(study, tuning_config(study), result)["recommended"] is None
+
+
+def test_a_degraded_survey_does_not_pass(tmp_path):
+    assert search(study_of(tmp_path, TUNING), tmp_path / "out", degraded).recommended is None
+
+
+def test_further_rounds_search_where_the_corrected_surrogate_expects_plans_to_pass(tmp_path):
+    """The first search knows plans above the rendered limit only; a further round goes below it."""
+
+    def surrogate_fails_low(survey):  # the only plans that pass with the surrogate are far too high at first
+        altitude_m = survey.values["plan.altitude_m"]
+        limit_m = 1.7 if is_rendered(survey) else 2.9
+        return flown(survey, 0.01 * (altitude_m / limit_m) ** 3)
+
+    study = study_of(tmp_path, TUNING, ("trials = 24", "trials = 6\nplans = 1\nrounds = 8"))
+    result = search(study, tmp_path / "out", surrogate_fails_low)
+    rounds = [v.search_round for v in result.verifications]
+    assert rounds == sorted(rounds) and max(rounds) > 0
+    assert result.recommended.values["plan.altitude_m"] <= 1.7
+    assert len({c.number for c in result.candidates}) == len(result.candidates) == 6 + 6 * max(rounds)
+
+
+@pytest.mark.parametrize("stop_before", [30, 60, 75])
+def test_an_interrupted_verification_ends_with_the_same_plans(searched, tmp_path, stop_before):
+    study, whole, _ = searched
+    engine, again = SerialEngine(stop_before), SerialEngine()
+    stopped = search(study, tmp_path / "out", engine=engine)
+    assert stopped.interrupted and stopped.recommended is None
+    result = search(study, tmp_path / "out", engine=again, resume=True)
+    assert result == whole
+    assert not set(engine.flown) & set(again.flown)
+
+
+def test_without_verification_the_plan_is_recommended_with_a_warning_in_every_output(tmp_path):
+    study = study_of(tmp_path, TUNING, ("verify = 2", "verify = 0"))
+    config = tuning_config(study)
+    result = search(study, tmp_path / "out")
+    assert result.verifications == []
+    assert result.recommended.values["plan.altitude_m"] > RENDERED_LIMIT_M
+    tuning_report.write_tuning_report(study, config, result, tmp_path / "out")
+    summary = tuning_report.summary(study, config, result)
+    assert not summary["recommended"]["verified"]
+    assert tuning_report.NOT_VERIFIED in tuning_report.headline(study, config, result)
+    assert tuning_report.NOT_VERIFIED in summary["warnings"]
+    assert "Not verified" in (tmp_path / "out" / "tuning.html").read_text()
+    assert f"# Warning: {tuning_report.NOT_VERIFIED}" in (tmp_path / "out" / "recommended.toml").read_text()
+
+
+@pytest.mark.parametrize(("given", "kept"), [("", "metrics"), ('keep = "report"\n', "report")])
+def test_the_expected_time_is_told_before_and_the_run_folders_are_kept_on_request(tmp_path, capsys, given, kept):
+    kept_of = []
+
+    def fly(survey):
+        kept_of.extend([survey.keep] if is_rendered(survey) else [])
+        return optimistic(survey)
+
+    study = study_of(tmp_path, TUNING, ("verify = 2", f"{given}verify = 2"))
+    search(study, tmp_path / "out", fly)
+    lines = capsys.readouterr().err.splitlines()
+    assert "rendered: 2 surveys of about" in lines[0] and "(a rough estimate)" in lines[0]
+    assert lines[1].endswith("flown rendered: 0 of 2 surveys passed")
+    assert "(as measured)" in lines[2]
+    assert set(kept_of) == {kept}
+
+
+def test_a_plan_whose_scenario_is_not_valid_is_refused_and_not_flown(tmp_path, monkeypatch):
+    """Altitudes above 2 m are invalid, as if by their combination with another key: the bounds are checked before."""
+    scenario_of_sample = candidates.scenario_of_sample
+
+    def valid_up_to_2_m(study, base, sample):
+        if sample.values["plan.altitude_m"] > 2:
+            raise ScenarioError(["study.toml:20: tune.search.plan.altitude_m: not allowed"])
+        return scenario_of_sample(study, base, sample)
+
+    monkeypatch.setattr(candidates, "scenario_of_sample", valid_up_to_2_m)
+    study, values = study_of(tmp_path, TUNING), {"plan.altitude_m": 2.5, "plan.speed_mps": 0.3}
+    surveys = candidates.CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    assert list(surveys.missing({0: values})) == []
+    assert {score.status for score in surveys.scores(0, values)} == {"refused"}
+    assert surveys.evaluate(0, values).pass_probability.value == 0.0
+    assert len(list(surveys.missing({1: values | {"plan.altitude_m": 1.5}}))) == 2
+
+
+def test_the_command_line_overrides_the_number_of_rendered_surveys(tmp_path, monkeypatch, capsys):
+    study_of(tmp_path, TUNING)
+    used = []
+
+    def fake(study, *_):
+        used.append(study.tune.verify)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_command.tuning, "tune", fake)
+    with pytest.raises(KeyboardInterrupt):
+        study_command.tune(str(tmp_path / "study.toml"), study_command.StudyOptions(tmp_path / "out", 1, verify=0))
+    assert used == [0]
+
+
+SEARCH = {"a": Distribution(uniform=(0.0, 4.0)), "b": Distribution(log_uniform=(1.0, 100.0))}
+
+
+def test_the_correction_is_close_to_the_ratio_of_a_flown_plan_and_vanishes_far_away():
+    plan = PlanRatio({"a": 0.0, "b": 1.0}, {"map.le90_m": 9.0}, 1.0)
+    at, near, far = (
+        correction_at(SEARCH, [plan], {"a": a, "b": b}).factors["map.le90_m"] for a, b in ((0, 1), (0.4, 1.5), (4, 100))
+    )
+    weight = 1 / (1 + math.exp(-2.0))
+    assert at == pytest.approx(9.0**weight)
+    assert at > near > far
+    assert far == pytest.approx(1.0, abs=1e-6)
+    assert correction_at(SEARCH, [], plan.values) is NO_CORRECTION
+
+
+def test_a_plan_that_was_not_completed_lowers_the_pass_fraction_near_it():
+    plan = PlanRatio({"a": 0.0, "b": 1.0}, {}, 0.0)
+    assert correction_at(SEARCH, [plan], plan.values).pass_factor < 0.15
+    assert correction_at(SEARCH, [plan], {"a": 4.0, "b": 100.0}).pass_factor > 0.999
+
+
+@pytest.mark.parametrize(
+    ("metric", "rendered", "surrogate", "ratio"),
+    [
+        ("map.le90_m", 0.03, 0.01, 3.0),
+        ("map.completeness", 0.4, 0.8, 0.5),
+        ("map.le90_m", None, 0.01, 10.0),
+        ("map.completeness", None, 0.8, 0.1),
+        ("map.le90_m", math.inf, 0.01, 10.0),
+        ("map.le90_m", 5.0, 0.01, 100.0),
+        ("map.le90_m", 0.03, None, 1.0),
+        ("map.bias_m", -0.01, 0.01, 1.0),
+    ],
+)
+def test_the_ratio_of_a_metric_is_limited_and_bad_where_the_rendered_value_is_missing(
+    metric, rendered, surrogate, ratio
+):
+    assert metric_ratio(metric, rendered, surrogate) == pytest.approx(ratio)
+
+
+@pytest.mark.parametrize(
+    ("objectives", "cost"),
+    [
+        ('["map.le90_m", "timing.simulated_s"]', "timing.simulated_s"),
+        ('["timing.simulated_s", "map.le90_m"]', "timing.simulated_s"),
+        ('["map.le90_m", "risk"]', "map.le90_m"),
+    ],
+)
+def test_the_cost_is_the_first_duration_or_else_the_first_objective(tmp_path, objectives, cost):
+    config = tuning_config(study_of(tmp_path, TUNING, ('["timing.simulated_s", "map.le90_m"]', objectives)))
+    assert config.objectives[cost_index(config)] == cost
+
+
+@pytest.mark.slow
+def test_a_tuned_plan_of_a_tiny_survey_is_flown_rendered(tmp_path):
+    (tmp_path / "study.toml").write_text(TINY)
+    options = study_command.StudyOptions(tmp_path / "out", jobs=2)
+    assert study_command.tune(str(tmp_path / "study.toml"), options) == 0
+    rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
+    rendered = [row for row in rows if row["fidelity"] == "rendered"]
+    assert [(row["status"], row["require.map.le90_m.passed"]) for row in rendered[-1:]] == [("complete", True)]
+    assert "Flown rendered, 1 of 1 surveys" in (tmp_path / "out" / "tuning.html").read_text()
+    folders = [folder for folder in (tmp_path / "out" / "runs").iterdir() if (folder / "report.html").is_file()]
+    assert len(folders) == len(rendered)

@@ -1,0 +1,102 @@
+"""Expected height error of the map, from the surrogate's error model at the floor points that the keyframes see."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import root_scalar
+from scipy.special import ndtr
+
+from twin.core.floor_rays import ray_grid
+from twin.core.geometry import Array
+from twin.core.image_overlap import RAY_COLUMNS
+from twin.surrogate import error_model_file
+from twin.surrogate.matchability import Matchability
+from twin.world.coverage import true_heights
+from twin.world.floor_forecast import FloorForecast
+from twin.world.mission import Mission
+
+#: Largest number of floor points from which the distribution of the height error is computed.
+_POINTS = 20_000
+
+
+class ExpectedError(NamedTuple):
+    """Expected height error of the map.
+
+    Args:
+        sigma_m: (n,) standard deviation of the height at floor points spread evenly over the images [m].
+        completeness: share of the floor in view for which the depth filter provides a height.
+        bound_px: largest Cramer-Rao bound of image matching over the depths of the plan [px].
+        fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
+    """
+
+    sigma_m: Array
+    completeness: float
+    bound_px: float
+    fitted_bound_px: float
+
+    def percentile_m(self, percent: float, holes: float = 0.0) -> float | None:
+        """Returns a percentile of the absolute height error [m]; None if it is infinite or no floor is in view.
+
+        The error is a mixture of zero-mean normal distributions with the standard deviations `sigma_m`; in holes of the
+        map it is infinite.
+
+        Args:
+            percent: 0 to 100.
+            holes: share of the area without a height, 0 to 1.
+        """
+        share = percent / 100
+        if share >= 1 - holes or len(self.sigma_m) == 0:
+            return None
+        sigma = self.sigma_m
+        below = lambda x: (1 - holes) * float(np.mean(2 * ndtr(x / sigma) - 1)) - share  # noqa: E731
+        high = float(sigma.max())
+        while below(high) < 0:
+            high *= 2
+        return float(root_scalar(below, bracket=(0.0, high), method="brentq", xtol=1e-9).root)
+
+    @property
+    def rmse_m(self) -> float | None:
+        """Returns the expected RMSE of the heights [m]; None if no floor is in view."""
+        return float(np.sqrt(np.mean(self.sigma_m**2))) if len(self.sigma_m) else None
+
+
+def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
+    """Returns the expected height error of the map, without the errors of the poses.
+
+    The error has two parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
+    length f [px] and baseline b [m]. A lateral error of the mapped surface is a height error in proportion to the slope
+    of the floor. The standard deviations of both errors come from the error model fitted to rendered surveys. The
+    disparity error depends on the water, light, texture and sensor of the scenario, through the Cramer-Rao bound of
+    image matching (`Matchability`).
+    """
+    rig, scenario = mission.rig, mission.scenario
+    fitted = error_model_file.load(scenario.imaging.error_model)
+    model, matching = fitted.model, Matchability(scenario, mission.illumination, mission.terrain)
+    depth, slope = _floor_points(mission, forecast)
+    bound = np.interp(depth, matching.depths_m, matching.bounds_px)
+    table = matching.bounds_px
+    sigma_px = np.interp(depth, matching.depths_m, [model.depth_sigma_px(b) * model.depth_error_ratio for b in table])
+    in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
+    vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px
+    lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
+    return ExpectedError(
+        np.hypot(vertical, lateral), float(in_view.mean()) if len(depth) else 0.0,
+        float(bound.max(initial=0.0)), model.bound_range_px[1],
+    )  # fmt: skip
+
+
+def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Array]:
+    """Returns depths (n,) [m] and slopes (n,) [m/m] at floor points spread evenly over the images of the keyframes."""
+    rig, grid = mission.rig, mission.grid
+    rays = np.column_stack([rig.normalised(ray_grid(rig, RAY_COLUMNS)), np.ones(forecast.depth_m.shape[1])])
+    image, ray = np.nonzero(np.isfinite(forecast.depth_m))
+    kept = np.unique(np.linspace(0, len(image) - 1, min(_POINTS, len(image))).astype(int))
+    image, ray = image[kept], ray[kept]
+    depth, poses = forecast.depth_m[image, ray], forecast.keyframes.world_from_camera[image]
+    x, y, _ = (poses[:, :3, 3] + depth[:, None] * np.einsum("nij,nj->ni", poses[:, :3, :3], rays[ray])).T
+    down, east = np.gradient(true_heights(grid, mission.terrain.height_at), grid.cell_m)
+    rows = np.clip(((grid.north_m - y) / grid.cell_m).astype(int), 0, grid.rows - 1)
+    cols = np.clip(((x - grid.west_m) / grid.cell_m).astype(int), 0, grid.cols - 1)
+    return depth, np.nan_to_num(np.hypot(down, east)[rows, cols])

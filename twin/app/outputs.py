@@ -1,0 +1,70 @@
+"""Output paths given by the user: checks before work begins, and write errors as TwinError."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from twin.core.paths import path_problem
+from twin.errors import TwinError
+
+#: Largest number of bytes of the name of a scenario or study that a file name contains.
+_STEM_BYTES = 100
+
+
+def new_folder(folder: Path, option: str = "--out") -> Path:
+    """Returns the folder. Raises TwinError unless it is new or empty and can be written."""
+    _check_path(folder, option, "a new or an empty folder")
+    if folder.exists() and not is_empty(folder):
+        raise TwinError(option, f"{folder} is not empty", "a new or an empty folder")
+    _check_writable(folder, option)
+    return folder
+
+
+def output_file(file: Path, option: str = "--out") -> Path:
+    """Returns `file`. Raises TwinError if this path exists but is not a regular file, or if it cannot be written."""
+    _check_path(file, option, "the path of a file")
+    if file.exists() and not file.is_file():
+        raise TwinError(option, f"{file} is not a file", "the path of a file")
+    _check_writable(file, option)
+    return file
+
+
+@contextmanager
+def writing(path: Path, option: str = "--out") -> Iterator[None]:
+    """Turns an OSError in this context into a TwinError, which states that the user's `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise TwinError(option, f"{path} cannot be written: {error.strerror or error}", "a writable path") from None
+
+
+def file_stem(name: str) -> str:
+    """Returns the name of a scenario or study for use in a file name: without separators, at most 100 bytes."""
+    text = "".join("_" if character in "/\\\0" else character for character in name)
+    return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
+
+
+def is_empty(folder: Path) -> bool:
+    """Returns whether a path is an empty folder."""
+    return folder.is_dir() and not any(folder.iterdir())
+
+
+def _check_path(path: Path, option: str, allowed: str) -> None:
+    """Raises TwinError if a path can neither exist nor be created."""
+    if problem := path_problem(path):
+        shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
+        raise TwinError(option, f"{shown!r}: {problem}", allowed)
+
+
+def _check_writable(path: Path, option: str) -> None:
+    """Raises TwinError unless the path, or the closest folder above it that exists, can be written."""
+    closest = next(p for p in (path, *path.absolute().parents) if p.exists())
+    folder = closest.parent if closest == path and closest.is_file() else closest
+    try:
+        with tempfile.TemporaryFile(dir=folder):  # permissions do not show whether the file system is writable
+            pass
+    except OSError:
+        raise TwinError(option, f"{closest} is not writable", "a writable folder") from None

@@ -1,0 +1,79 @@
+"""Computing cost of a survey: time, memory and disk, estimated from its plan.
+
+The coefficients are fitted to four rendered surveys of `quickstart` (area 1.2 m x 0.8 m, one track, 413 frames; images
+of 320 x 240 and 640 x 480 px, 19 and 51 keyframes) on a 2-core x86-64 machine without GPU: 30, 39, 47 and 71 s of
+processor time, 485, 502, 585 and 657 MB of memory, 11, 22, 28 and 65 MB of disk. The machine was fully loaded, so
+the time coefficients are multiplied by 0.6; they then reproduce the 46 s of processor time of `quickstart` on an idle
+machine. The coefficients of the surrogate are fitted to `horseshoe` with 50 and 362 keyframes (16 and 22 s on the
+loaded machine). Times on other machines can differ by a factor of two.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from twin.world.mission import Mission
+
+
+class ComputingCost(NamedTuple):
+    """Estimated computing cost of a survey: wall time on an idle 2-core machine [s], peak memory and disk [MB]."""
+
+    wall_s: float
+    memory_mb: float
+    disk_mb: float
+
+
+class _Coefficients(NamedTuple):
+    """Coefficients of a cost (time, memory or disk) that is linear in the numbers of frames and keyframes.
+
+    Args:
+        start: fixed cost of start and report.
+        frame, keyframe: cost per frame and per keyframe.
+        frame_mpx, keyframe_mpx: additional cost per frame and per keyframe for each megapixel of the image.
+    """
+
+    start: float
+    frame: float = 0.0
+    frame_mpx: float = 0.0
+    keyframe: float = 0.0
+    keyframe_mpx: float = 0.0
+
+    def total(self, n_frames: int, n_keyframes: int, megapixels: float) -> float:
+        """Returns the cost of a survey with images of `megapixels` each."""
+        frame = self.frame + self.frame_mpx * megapixels
+        return self.start + n_frames * frame + n_keyframes * (self.keyframe + self.keyframe_mpx * megapixels)
+
+
+_RENDERED_S = _Coefficients(start=11.0, frame=0.0066, frame_mpx=0.048, keyframe=0.066, keyframe_mpx=1.25)
+_SURROGATE_S = _Coefficients(start=9.0, frame=1e-4, keyframe=0.01)
+_RENDERED_DISK_MB = _Coefficients(start=5.0, keyframe=0.07, keyframe_mpx=3.6)
+_SURROGATE_DISK_MB = _Coefficients(start=15.0, keyframe=0.02)
+_RENDERED_MB = _Coefficients(start=415.0, keyframe_mpx=7.0)
+_IMAGES_MB_PER_MPX = 300.0
+_SURROGATE_MB = 380.0
+#: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
+_NODE_MB, _TEXEL_MB = 400e-6, 9e-6
+
+
+def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
+    """Returns the estimated computing cost of simulating a mission.
+
+    Args:
+        mission: the survey.
+        n_keyframes: number of its keyframes.
+    """
+    megapixels = mission.rig.width_px * mission.rig.height_px / 1e6
+    n_frames = mission.n_frames
+    if mission.scenario.imaging.fidelity == "surrogate":
+        return ComputingCost(
+            _SURROGATE_S.total(n_frames, n_keyframes, megapixels), _SURROGATE_MB,
+            _SURROGATE_DISK_MB.total(n_frames, n_keyframes, megapixels),
+        )  # fmt: skip
+    window = n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks))
+    texels = mission.terrain.texture.size / 3
+    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels
+    return ComputingCost(
+        _RENDERED_S.total(n_frames, n_keyframes, megapixels),
+        _RENDERED_MB.total(n_frames, round(window), megapixels) + _IMAGES_MB_PER_MPX * megapixels + floor_mb,
+        _RENDERED_DISK_MB.total(n_frames, n_keyframes, megapixels),
+    )

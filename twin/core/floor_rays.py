@@ -1,0 +1,155 @@
+"""Ray casting on a floor given as a height grid: exact intersection with the two triangles of each cell."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.core.geometry import Array
+from twin.core.records import MapGrid, StereoRig
+
+
+class HeightField(NamedTuple):
+    """Floor as a triangulated height grid.
+
+    Each cell is split along the diagonal from node (r, c) to (r + 1, c + 1), as in `terrains.Terrain`. There is no
+    floor in cells with a NaN corner and outside the grid.
+
+    Args:
+        height_m: (ny, nx) heights of the nodes, row 0 = SOUTH, column 0 = west.
+        spacing_m: distance between neighbouring nodes.
+        west_m, south_m: position of node (0, 0).
+        lowest_m, highest_m: lowest and highest node.
+    """
+
+    height_m: Array
+    spacing_m: float
+    west_m: float
+    south_m: float
+    lowest_m: float
+    highest_m: float
+
+
+def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float, south_m: float) -> HeightField:
+    """Returns the height field with the node heights (ny, nx): at least 2 x 2 nodes, at least one of them finite."""
+    height = np.ascontiguousarray(height_m, np.float64)
+    return HeightField(
+        height, float(spacing_m), float(west_m), float(south_m), float(np.nanmin(height)), float(np.nanmax(height))
+    )
+
+
+def map_height_field(height_m: NDArray[np.floating], grid: MapGrid) -> HeightField:
+    """Returns the height field of a map with heights (rows, cols); its nodes are the centres of the map cells."""
+    south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
+    return height_field(height_m[::-1], grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
+
+
+def ray_grid(rig: StereoRig, n_columns: int) -> Array:
+    """Returns the centres (n, 2) [px] of equal, nearly square cells that tile an image, with `n_columns` columns."""
+    n_rows = max(1, round(n_columns * rig.height_px / rig.width_px))
+    u = (np.arange(n_columns) + 0.5) * rig.width_px / n_columns - 0.5
+    v = (np.arange(n_rows) + 0.5) * rig.height_px / n_rows - 0.5
+    return np.stack([part.ravel() for part in np.meshgrid(u, v)], axis=1)
+
+
+def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array) -> Array:
+    """Returns the depth (n, m) along the optical axis [m] at pixels (m, 2) of n images; inf where there is no floor.
+
+    Args:
+        field: the floor.
+        poses: (n, 4, 4) world_from_camera.
+        rig: calibration of the camera.
+        pixels: (m, 2) column and row [px].
+    """
+    return _cast_directions(field, np.ascontiguousarray(poses, np.float64), rig.normalised(pixels))
+
+
+@njit(cache=True, nogil=True)
+def _cast_directions(field, poses, directions):
+    """Compiled kernel of `cast_pixels`; directions (m, 2) are normalised coordinates."""
+    depth = np.empty((len(poses), len(directions)))
+    for i in range(len(poses)):
+        for k in range(len(directions)):
+            depth[i, k] = cast_camera_ray(field, poses[i], directions[k, 0], directions[k, 1])
+    return depth
+
+
+@njit(cache=True, nogil=True)
+def cast_camera_ray(field, pose, a, b):
+    """Returns the depth at which the ray through the normalised point (a, b) meets the floor; inf if it does not."""
+    dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
+    dy = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2]
+    dz = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2]
+    return cast_ray(field, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
+
+
+@njit(cache=True, nogil=True)
+def cast_ray(field, ox, oy, oz, dx, dy, dz):
+    """Returns the smallest t >= 0 at which the ray o + t d meets the floor; inf if it does not.
+
+    The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
+    each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
+    is also inf if d does not point downwards, or if this traversal starts outside the grid or first enters a cell
+    without floor.
+    """
+    if not dz < 0:
+        return np.inf
+    rows, cols = field.height_m.shape
+    t = max(0.0, (field.highest_m - oz) / dz)
+    t_lowest = (field.lowest_m - oz) / dz + 1e-9
+    col, col_rate = (ox - field.west_m) / field.spacing_m, dx / field.spacing_m
+    row, row_rate = (oy - field.south_m) / field.spacing_m, dy / field.spacing_m
+    c, r = int(np.floor(col + t * col_rate)), int(np.floor(row + t * row_rate))
+    if c == cols - 1 and col + t * col_rate <= cols - 1:
+        c -= 1
+    if r == rows - 1 and row + t * row_rate <= rows - 1:
+        r -= 1
+    while 0 <= c < cols - 1 and 0 <= r < rows - 1:
+        t_col = (c + (col_rate > 0) - col) / col_rate if col_rate != 0 else np.inf
+        t_row = (r + (row_rate > 0) - row) / row_rate if row_rate != 0 else np.inf
+        end = max(t, min(t_col, t_row, t_lowest))
+        met = _meet_cell(field.height_m, r, c, col - c, row - r, oz, col_rate, row_rate, dz, t, end)
+        if not met > end:  # a hit, or NaN: a corner without height
+            return np.inf if np.isnan(met) else met
+        if end >= t_lowest:
+            return np.inf
+        t = end
+        if t_col <= t_row:
+            c += 1 if col_rate > 0 else -1
+        else:
+            r += 1 if row_rate > 0 else -1
+    return np.inf
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
+    """Returns t in [start, end] at which the ray meets the floor of a cell; inf if it does not, NaN if a corner is NaN.
+
+    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u and v from 0 to 1 over the cell.
+    """
+    h00, h01, h10, h11 = height[r, c], height[r, c + 1], height[r + 1, c], height[r + 1, c + 1]
+    top = max(max(h00, h01), max(h10, h11))
+    if np.isnan(h00 + h01 + h10 + h11):
+        return np.nan
+    if z0 + end * z_rate > top:
+        return np.inf
+    side_rate = u_rate - v_rate  # the diagonal is u = v
+    middle = (v0 - u0) / side_rate if side_rate != 0 else end
+    middle = min(max(middle, start), end)
+    for part in range(2):
+        a, b = (start, middle) if part == 0 else (middle, end)
+        t = (a + b) / 2
+        if u0 + t * u_rate >= v0 + t * v_rate:
+            du, dv = h01 - h00, h11 - h01
+        else:
+            du, dv = h11 - h10, h10 - h00
+        gap_a = z0 + a * z_rate - (h00 + (u0 + a * u_rate) * du + (v0 + a * v_rate) * dv)
+        gap_b = z0 + b * z_rate - (h00 + (u0 + b * u_rate) * du + (v0 + b * v_rate) * dv)
+        if gap_a <= 0:
+            return a
+        if gap_b <= 0:
+            return a + (b - a) * gap_a / (gap_a - gap_b)
+    return np.inf

@@ -1,0 +1,41 @@
+"""Georeference of a scene: where its origin lies in the coordinate reference system (CRS) of a measured DEM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Position of the scene in a horizontal CRS and a vertical datum; the scene axes are parallel to theirs.
+
+    With the origin (E0, N0, H0) of the scene and k metres per unit of the CRS, a scene point (x, y, z) [m] lies at
+    E = E0 + x / k, N = N0 + y / k and at the elevation H0 + z.
+
+    Args:
+        easting, northing: coordinates E0, N0 of the scene origin in the CRS, in its unit.
+        elevation_m: elevation H0 of the plane z = 0 above the zero of the vertical datum, positive upwards.
+        crs_wkt: CRS as WKT; None: the source has coordinates but does not name their CRS.
+        metres_per_unit: length k of the horizontal unit of the CRS.
+        vertical_datum: name of the vertical CRS; "" if the source does not name it.
+    """
+
+    easting: float
+    northing: float
+    elevation_m: float = 0.0
+    crs_wkt: str | None = None
+    metres_per_unit: float = 1.0
+    vertical_datum: str = ""
+
+    def to_scene(self, easting: ArrayLike, northing: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the scene coordinates x and y [m] of points in the CRS."""
+        x = (np.asarray(easting, np.float64) - self.easting) * self.metres_per_unit
+        return x, (np.asarray(northing, np.float64) - self.northing) * self.metres_per_unit
+
+    def from_scene(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns the coordinates E and N in the CRS of scene points [m]."""
+        easting = self.easting + np.asarray(x_m, np.float64) / self.metres_per_unit
+        return easting, self.northing + np.asarray(y_m, np.float64) / self.metres_per_unit

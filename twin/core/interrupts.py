@@ -1,0 +1,87 @@
+"""Handling of interrupts (Ctrl-C, SIGTERM): an interrupt ends one stage of a survey; the other results are kept."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Self, TypeVar
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+T = TypeVar("T")
+
+
+class StageGuard:
+    """Context manager that delivers interrupts only within a stage; an interrupt between two stages waits for the next.
+
+    A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered;
+    usually it raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the main
+    thread, which alone receives signals, the context has no effect.
+
+    Attributes:
+        cause: why the survey ended early; "" if it did not.
+        skipped: names of the stages that an interrupt ended.
+    """
+
+    def __init__(self) -> None:
+        self.cause, self.skipped = "", list[str]()
+        self._open, self._waiting = False, list[int]()
+        self._handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+            self._handlers = {number: handler for number, handler in handlers.items() if callable(handler)}
+            for number in self._handlers:
+                signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    @contextmanager
+    def stage(self) -> Iterator[None]:
+        """Delivers interrupts within this context, including one that arrived before it and waits.
+
+        Raises:
+            KeyboardInterrupt: an interrupt came before or within the context.
+        """
+        self._open = True
+        try:
+            if self._waiting:
+                self._deliver(self._waiting.pop(), None)
+            yield
+        finally:
+            self._open = False
+
+    def attempt(self, name: str, function: Callable[[], T]) -> T | None:
+        """Runs `function` as a stage and returns its result.
+
+        If an interrupt ends the stage, adds `name` to `skipped` and returns None.
+        """
+        try:
+            with self.stage():
+                return function()
+        except KeyboardInterrupt:
+            self.skipped.append(name)
+            return None
+
+    @property
+    def reason(self) -> str:
+        """Returns why a survey was aborted, with the skipped stages: "interrupted; map skipped"; "" if it was not."""
+        return f"{self.cause or 'interrupted'}; {', '.join(self.skipped)} skipped" if self.skipped else self.cause
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        """Handles a signal: delivers it within a stage, otherwise keeps it for the next stage."""
+        if self._open:
+            self._open = False  # a second signal must not interrupt the handling of the first
+            self._deliver(number, frame)
+        else:
+            self._waiting = [number]
+
+    def _deliver(self, number: int, frame: FrameType | None) -> None:
+        """Calls the handler that was installed for a signal when the context was entered."""
+        self._handlers[number](number, frame)

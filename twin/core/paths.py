@@ -1,0 +1,38 @@
+"""Checks of paths from user input or files, which may be invalid: null byte, too long, loop of symbolic links."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a path is a regular file; False for an invalid path (null byte, too long)."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def resolved(path: Path) -> Path:
+    """Returns the absolute path without symbolic links; a path that cannot be resolved is only made absolute.
+
+    The attempt to open such a path then fails with the reason.
+    """
+    try:
+        return path.resolve()
+    except (OSError, ValueError, RuntimeError):  # too long; null byte; loop of links
+        return path.absolute()
+
+
+def path_problem(path: Path) -> str | None:
+    """Returns why a path can neither exist nor be created, or None."""
+    text = str(path)
+    if "\0" in text:
+        return "contains a null byte"
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    return None

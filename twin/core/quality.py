@@ -1,0 +1,62 @@
+"""Records of the estimators' self-checks: consistency measured during a survey, and findings."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class EpipolarError(NamedTuple):
+    """Errors of the rectification of the right image, estimated from row differences.
+
+    Args:
+        estimate: (4,) pitch, yaw, roll [rad] and row offset [focal lengths].
+        sigma: (4,) standard deviations of `estimate`.
+        removed: (4,) errors corrected in the right images, in the same units; yaw is never corrected.
+    """
+
+    estimate: Array
+    sigma: Array
+    removed: Array
+
+
+class EstimationQuality(NamedTuple):
+    """Consistency of the estimates of a survey, measured by the estimators without the truth.
+
+    Args:
+        frames_lost: number of frames whose motion could not be measured and was predicted.
+        nodes_bridged: number of nodes linked to the previous node only by predicted or frame-to-frame motion.
+        links_tried, links_failed: number of attempted and of failed measurements of links between nodes.
+        link_residual: median over the links of the residual of the matched points (robust standard deviation),
+            divided by its expected value; None without a measured link.
+        link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected.
+        epipolar: estimated errors of the rectification; None without images.
+    """
+
+    frames_lost: int = 0
+    nodes_bridged: int = 0
+    links_tried: int = 0
+    links_failed: int = 0
+    link_residual: float | None = None
+    link_chi2: float | None = None
+    epipolar: EpipolarError | None = None
+
+
+class Finding(NamedTuple):
+    """A reason why the result of a survey must not be trusted as it stands.
+
+    Args:
+        check: short name of the check, a key of metrics.json.
+        value: measured value.
+        limit: largest (or smallest) value at which the result can be trusted.
+        sentence: the finding in words.
+    """
+
+    check: str
+    value: float
+    limit: float
+    sentence: str

@@ -1,0 +1,124 @@
+"""Checks of a survey without the truth: reasons why its result must not be trusted.
+
+Each check compares a quantity that the estimators measure with a limit. The limits lie between the values of ordinary
+surveys, whose errors agree with their covariances (generated and real floors, Jerlov types I to 3C), and the values of
+surveys whose path was lost; docs/findings.md lists both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from twin.core.quality import Finding
+from twin.core.records import StereoObservation, StereoRig, SurveyResult
+
+MAX_FRAMES_LOST = 0.02  # fraction of the frames
+MAX_LINKS_FAILED = 0.15  # fraction of the links
+MAX_LINK_CHI2 = 2.5  # mean chi-square per degree of freedom
+MAX_LINK_RESIDUAL = 2.0  # median residual / expected residual
+MAX_ROW_SPREAD = 1.6  # scatter of the row differences / claimed standard deviation
+MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correction
+MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
+MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
+MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
+MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a keyframe position / depth of the floor
+_SIGNIFICANT = 4.0  # standard deviations
+
+
+def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
+    """Returns the findings of all checks, the most serious kind first; an empty list if every check passes.
+
+    Args:
+        result: output of the estimators.
+        rig: believed calibration.
+    """
+    return [
+        finding
+        for findings in (_tracking(result), _stereo(result), _rectification(result, rig), _consistency(result))
+        for finding in findings
+    ]
+
+
+def _tracking(result: SurveyResult) -> Iterator[Finding]:
+    """Checks the fractions of lost frames and failed links, and that every node is linked to the previous one."""
+    quality = result.quality
+    lost = quality.frames_lost / max(len(result.online), 1)
+    if lost > MAX_FRAMES_LOST:
+        text = f"the motion of {quality.frames_lost} of {len(result.online)} frames was predicted, not measured"
+        yield Finding("frames_lost", lost, MAX_FRAMES_LOST, text)
+    if quality.nodes_bridged:
+        text = f"{quality.nodes_bridged} keyframes could not be linked to the keyframe before them"
+        yield Finding("nodes_bridged", quality.nodes_bridged, 0, text)
+    failed = quality.links_failed / max(quality.links_tried, 1)
+    if failed > MAX_LINKS_FAILED:
+        text = f"{quality.links_failed} of {quality.links_tried} links between keyframes failed"
+        yield Finding("links_failed", failed, MAX_LINKS_FAILED, text)
+
+
+def _stereo(result: SurveyResult) -> Iterator[Finding]:
+    """Checks the number of stereo matches, the ambiguity of the texture and the scatter of the row differences."""
+    pairs = result.stereo_observations
+    if not pairs:
+        return
+    points = float(np.percentile([pair.n_points for pair in pairs], 10))
+    if points < MIN_POINTS:
+        text = f"one stereo pair in ten has {points:.0f} matched points or fewer"
+        yield Finding("points", points, MIN_POINTS, text)
+    repeated = _median(pair.repetition for pair in pairs)
+    if repeated is not None and repeated > MAX_REPETITION:
+        text = f"the texture repeats (autocorrelation {repeated:.2f}), so matches are ambiguous"
+        yield Finding("repetition", repeated, MAX_REPETITION, text)
+    ratio = _median(_row_ratio(pair) for pair in pairs)
+    if ratio is not None and ratio > MAX_ROW_SPREAD:
+        text = f"row differences of stereo matches scatter {ratio:.1f} times as much as their claimed noise"
+        yield Finding("row_spread", ratio, MAX_ROW_SPREAD, text)
+
+
+def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
+    """Checks for rectification errors that are not removed from the images: a row offset, and the estimated yaw."""
+    offset = _median(pair.row_offset_px for pair in result.stereo_observations)
+    if offset is not None and abs(offset) > MAX_ROW_OFFSET_PX:
+        text = f"the rows of the right image are offset by {offset:+.2f} px"
+        yield Finding("row_offset", offset, MAX_ROW_OFFSET_PX, text)
+    epipolar = result.quality.epipolar
+    if epipolar is not None:
+        yaw, sigma = float(epipolar.estimate[1]), float(epipolar.sigma[1])
+        shift_px = abs(yaw) * rig.focal_px
+        if shift_px > MAX_YAW_PX and abs(yaw) > _SIGNIFICANT * sigma:
+            text = (
+                f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"
+                f" disparities may be off by {shift_px:.1f} px"
+            )
+            yield Finding("yaw", shift_px, MAX_YAW_PX, text)
+
+
+def _consistency(result: SurveyResult) -> Iterator[Finding]:
+    """Checks that the links agree with their covariances and that the position covariances stay small."""
+    quality = result.quality
+    if quality.link_residual is not None and quality.link_residual > MAX_LINK_RESIDUAL:
+        text = f"residuals of points matched between keyframes are {quality.link_residual:.1f} times their noise"
+        yield Finding("link_residual", quality.link_residual, MAX_LINK_RESIDUAL, text)
+    if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
+        text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
+        yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)
+    if len(result.node_cov) and len(result.keyframe_depth_m):
+        sigma_m = float(np.sqrt(np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2).max()))
+        share = sigma_m / float(np.median(result.keyframe_depth_m))
+        if not share <= MAX_SIGMA_DEPTHS:
+            text = f"the standard deviation of a keyframe position reaches {sigma_m * 100:.1f} cm"
+            yield Finding("sigma", share, MAX_SIGMA_DEPTHS, text)
+
+
+def _row_ratio(pair: StereoObservation) -> float | None:
+    """Returns the scatter of the row differences divided by their claimed standard deviation."""
+    if pair.row_spread_px is None or not pair.row_sigma_px:
+        return None
+    return pair.row_spread_px / pair.row_sigma_px
+
+
+def _median(values: Iterator[float | None]) -> float | None:
+    """Returns the median of the values that are not None; None if there are none."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None

@@ -1,0 +1,136 @@
+"""Estimation of small errors of the rectification from the row differences of matched points.
+
+In a rectified pair every point lies in the same row of both images. A rotation of the right camera by the vector w
+[rad] (pitch, yaw, roll about its x, y and z axes) and an offset e of the row of its principal point change the row of a
+point at the normalised coordinates (x, y) of the right image by
+
+    dy = -w_x (1 + y^2) + w_y x y + w_z x + e
+
+(the linearised rotation of a pinhole camera; Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed
+from the right image. Yaw is estimated, but not removed: a lens distortion error causes nearly the same pattern, and a
+wrong yaw would shift all disparities.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.quality import EpipolarError
+from twin.core.records import Image, StereoRig
+from twin.estimate.vision import matching
+from twin.estimate.vision.stereo import StereoPoints
+
+#: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times a poor calibration's errors.
+_PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
+_SIGNIFICANT = 4.0  # the correction is updated if it changes a row at a corner by more than this many sigma ...
+_NOTICEABLE_PX = 0.02  # ... and by more than this
+_HUBER = 1.5
+_ITERATIONS = 5
+_MAD_TO_SIGMA = 1.4826
+
+
+class EpipolarCalibration:
+    """Errors of the rectification, estimated from all stereo pairs so far (recursive weighted least squares).
+
+    Attributes:
+        removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that `rectify` removes.
+    """
+
+    def __init__(self) -> None:
+        self._information = np.diag(_PRIOR_SIGMA**-2)
+        self._vector = np.zeros(4)
+        self.removed = np.zeros(4)
+
+    def add(self, points: StereoPoints, rig: StereoRig, patch_px: int) -> None:
+        """Adds the row differences of one stereo pair whose right image was rectified with `removed`.
+
+        Args:
+            points: matched points of the pair.
+            rig: calibration at the scale of the images.
+            patch_px: side of the matched patches, for the correlation between overlapping patches.
+        """
+        x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]
+        jacobian = np.column_stack([-(1 + y**2), x * y, x, np.ones_like(x)])
+        rows = points.row_difference_px / rig.focal_px + jacobian @ self.removed
+        sigma, inflation = row_sigma(points), matching.variance_inflation(points.pixels, patch_px)
+        estimate, weight = self.estimate, 1 / sigma**2
+        for _ in range(_ITERATIONS):  # the robust weights depend on the estimate, so both are iterated
+            size = np.abs(rows - jacobian @ estimate) / sigma
+            scale = max(1.0, _MAD_TO_SIGMA * float(np.median(size)))
+            weight = np.minimum(1.0, _HUBER * scale / np.maximum(size, 1e-12)) / (scale * sigma) ** 2 / inflation
+            information = self._information + jacobian.T @ (weight[:, None] * jacobian)
+            estimate = np.linalg.solve(information, self._vector + jacobian.T @ (weight * rows))
+        self._information = self._information + jacobian.T @ (weight[:, None] * jacobian)
+        self._vector = self._vector + jacobian.T @ (weight * rows)
+
+    @property
+    def estimate(self) -> Array:
+        """(4,) estimated pitch, yaw, roll [rad] and row offset (normalised)."""
+        return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
+
+    def update(self, rig: StereoRig) -> bool:
+        """Sets pitch, roll and offset of `removed` to their estimates if this changes a row significantly.
+
+        At a corner of the image, the row must change by more than 4 standard deviations and 0.02 px. Returns whether
+        `removed` was changed.
+
+        Args:
+            rig: calibration at full image size.
+        """
+        change = (self.estimate - self.removed) * [1, 0, 1, 1]
+        x, y = np.meshgrid(*((np.array([0, side - 1]) - c) / rig.focal_px for side, c in _sides(rig)))
+        shift = np.column_stack([-(1 + y.ravel() ** 2), 0 * x.ravel(), x.ravel(), np.ones(4)])
+        cov = np.linalg.inv(self._information)
+        shift_sigma = np.sqrt(np.einsum("ni,ij,nj->n", shift, cov, shift))
+        size = np.abs(shift @ change)
+        if not np.any((size > _SIGNIFICANT * shift_sigma) & (size * rig.focal_px > _NOTICEABLE_PX)):
+            return False
+        self.removed = self.removed + change
+        return True
+
+    def rectify(self, right: Image, rig: StereoRig) -> Image:
+        """Returns the right image (H, W, 3) without the errors in `removed`; the image itself if there are none.
+
+        Args:
+            right: right image at full size.
+            rig: calibration at full image size.
+        """
+        if not self.removed.any():
+            return right
+        matrix = rig.matrix
+        offset = geometry.pose(np.eye(3), np.zeros(3))[:3, :3]
+        offset[1, 2] = self.removed[3] * rig.focal_px
+        source_from_result = offset @ matrix @ geometry.exp(np.append(self.removed[:3], np.zeros(3)))[:3, :3]
+        source_from_result = source_from_result @ np.linalg.inv(matrix)
+        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LANCZOS4
+        size = (rig.width_px, rig.height_px)
+        warped = cv2.warpPerspective(right, source_from_result, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(warped, np.uint8)
+
+    def report(self) -> EpipolarError:
+        """Returns the estimated errors, their standard deviations, and the part that `rectify` removes."""
+        sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
+        return EpipolarError(self.estimate, sigma, self.removed.copy())
+
+
+def row_sigma(points: StereoPoints) -> Array:
+    """Returns the claimed standard deviation (n,) of the row differences, normalised.
+
+    `stereo.fuse` averages the rows of a point in the two images, which halves the variance. The variance of their
+    difference is four times the variance of their average.
+    """
+    return 2 * np.sqrt(points.cov[:, 1, 1])
+
+
+def spread(points: StereoPoints) -> float:
+    """Returns the robust standard deviation of the row differences about their median (1.4826 MAD) [px]."""
+    rows = points.row_difference_px
+    return float(_MAD_TO_SIGMA * np.median(np.abs(rows - np.median(rows)))) if len(rows) else 0.0
+
+
+def _sides(rig: StereoRig) -> tuple[tuple[int, float], tuple[int, float]]:
+    """Returns (size, principal point) along columns and rows [px]."""
+    return (rig.width_px, rig.cx_px), (rig.height_px, rig.cy_px)

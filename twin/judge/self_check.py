@@ -1,0 +1,44 @@
+"""Section `self_check` of metrics.json: checks that the estimators compute without the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core.records import SurveyResult
+from twin.judge.summary_statistics import percentile
+
+
+def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
+    """Returns `self_check.*` of metrics.json; a value that was not measured is None.
+
+    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`).
+    link_residual is the median over the links of the residuals of their points, divided by the expected residuals;
+    link_chi2 is the mean chi-square of the links per degree of freedom. row_offset_px, row_spread_ratio and repetition
+    are medians over the stereo pairs: of the row difference of the matched points (right minus left) [px], of the
+    standard deviation of this difference divided by the expected one, and of the largest autocorrelation of the left
+    image away from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (a fraction of the focal length) are the
+    estimated errors of the rectification. sigma_max_m is the largest 3-D standard deviation (square root of the trace
+    of the covariance) of a keyframe position [m].
+    """
+    quality, pairs = result.quality, result.stereo_observations
+    offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
+    ratios = [pair.row_spread_px / pair.row_sigma_px for pair in pairs if pair.row_spread_px and pair.row_sigma_px]
+    repeated = [pair.repetition for pair in pairs if pair.repetition is not None]
+    epipolar = quality.epipolar
+    pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()
+    variances = np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2)
+    return {
+        "frames_lost": quality.frames_lost / len(result.online) if len(result.online) else None,
+        "nodes_bridged": quality.nodes_bridged,
+        "links_failed": quality.links_failed / quality.links_tried if quality.links_tried else None,
+        "link_residual": quality.link_residual,
+        "link_chi2": quality.link_chi2,
+        "row_offset_px": percentile(offsets, 50),
+        "row_spread_ratio": percentile(ratios, 50),
+        "repetition": percentile(repeated, 50),
+        "pitch_deg": pitch,
+        "yaw_deg": yaw,
+        "roll_deg": roll,
+        "row_shift": None if epipolar is None else float(epipolar.estimate[3]),
+        "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
+    }

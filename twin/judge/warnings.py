@@ -1,0 +1,45 @@
+"""Warnings that follow from the metrics of a survey: consistency, sigma calibration and saturated images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+#: Mean NEES of positions outside which a survey is reported as inconsistent; the expectation is 3.
+NEES_BOUNDS = (2.0, 5.0)
+#: Sigma ratio (RMS of height error / sigma) outside which a map is reported as miscalibrated; the expectation is 1.
+SIGMA_RATIO_BOUNDS = (0.5, 2.0)
+#: Saturated fraction of the pixel values (median over the images) above which the images are reported as saturated.
+MOST_SATURATED = 0.01
+
+
+def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence for each metric that is out of its bounds: NEES, sigma ratio, and saturation of the images."""
+    found = (
+        _out_of_bounds(
+            metrics["consistency"]["nees_position_mean"], NEES_BOUNDS,
+            "The position covariances are {}: the mean NEES is {:.3g}, where 3 is expected and {:g} to {:g} accepted.",
+        ),
+        _out_of_bounds(
+            metrics["map"]["sigma_ratio"], SIGMA_RATIO_BOUNDS,
+            "The sigmas of the map are {}: the RMS of error / sigma is {:.3g}, where 1 is expected and "
+            "{:g} to {:g} accepted.",
+        ),
+        _saturation(metrics["vision"]["saturated_median"]),
+    )  # fmt: skip
+    return [sentence for sentence in found if sentence]
+
+
+def _out_of_bounds(value: float | None, bounds: tuple[float, float], sentence: str) -> str:
+    """Returns the sentence with its verdict, the value and the bounds filled in; "" if the value is within bounds."""
+    if value is None or bounds[0] <= value <= bounds[1]:
+        return ""
+    return sentence.format("too small" if value > bounds[1] else "too large", value, *bounds)
+
+
+def _saturation(fraction: float | None) -> str:
+    """Returns a warning if the median saturated fraction exceeds `MOST_SATURATED`, else ""."""
+    if fraction is None or fraction <= MOST_SATURATED:
+        return ""
+    share, limit = 100 * fraction, 100 * MOST_SATURATED
+    return f"The images are saturated: {share:.3g} % of the values of the median image (more than {limit:g} %)."

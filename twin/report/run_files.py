@@ -1,0 +1,145 @@
+"""Validates the scenario and the JSON files of a run folder, which may have been edited since `twin run` wrote them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from twin.judge.metrics import empty_metrics
+from twin.scenario.model import Scenario
+
+#: Key of a template that stands for every key of a table; its value is the template of each of the table's values.
+_ANY = "*"
+#: Template of a number that may be NaN, which Python's json reads and writes, or None.
+_NAN = math.nan
+_LARGEST = 1e15  # largest absolute value of a number
+_OBSERVATION = ("row", "n_points", "contrast")
+_TRACK = {"track": 0} | dict.fromkeys(
+    ("before_ga_rmse_m", "after_ga_rmse_m", "farthest_error_m", "ga_ms", "nodes", "edges")
+)
+_INDEX = {
+    "frames": [0],
+    "tracks": [0],
+    "n_frames_per_keyframe": None,
+    "timing_ms": {_ANY: [0.0]},
+    "stereo_observations": [{name: _NAN for name in _OBSERVATION}],
+}
+
+
+def checked_metrics(metrics: Any) -> dict[str, Any]:
+    """Returns the contents of metrics.json, validated, with None for each missing number.
+
+    Raises:
+        ValueError: a value has another type than `twin` writes; the message names its key.
+    """
+    template = empty_metrics()
+    texts = dict.fromkeys(("name", "status"), "")
+    optional = dict.fromkeys(("version", "scenario_hash", "reason", "warning", "schema"), _OptionalText)
+    sentences = {"warnings": [""], "idealisations": [""]}
+    require = {_ANY: {"value": None, "limit": 0.0, "passed": False}}
+    return conform(
+        metrics, template | texts | optional | sentences | {"tracks": [_TRACK], "require": require}, complete=True
+    )
+
+
+def checked_index(index: Any) -> dict[str, Any]:
+    """Returns the contents of keyframes/index.json, validated; raises ValueError like `checked_metrics`."""
+    index = conform(index, _INDEX)
+    for key in ("frames", "tracks"):
+        if not all(isinstance(number, int) and number >= 0 for number in index.get(key, [])):
+            raise ValueError(f"{key}: not allowed (allowed: integers from 0)")
+    if len(index.get("frames", [])) != len(index.get("tracks", [])):
+        raise ValueError("tracks: must have one number per frame")
+    return index
+
+
+def checked_environment(environment: Any) -> dict[str, Any]:
+    """Returns the contents of env.json; raises ValueError if they are not a JSON object."""
+    return conform(environment, {})
+
+
+def checked_scenario(scenario: Any) -> dict[str, Any]:
+    """Returns the contents of the scenario file, validated; raises ValueError like `checked_metrics`."""
+    template = Scenario().model_dump(mode="json", exclude_none=True)  # a key without a default may have any value
+    return conform(scenario, template | {"lamps": [], "beacons": []})
+
+
+class _OptionalText:
+    """Template of a value that is a text or None."""
+
+
+def conform(given: Any, template: Any, key: str = "", complete: bool = False) -> Any:
+    """Checks that a value has the structure of a template, and returns it.
+
+    Args:
+        given: the value.
+        template: a table (the values of its keys are checked; other keys are accepted unchecked), a list that holds the
+            template of its items or is empty (items are not checked), or the template of a single value: any text,
+            truth value or finite number stands for a value of its type, None for a finite number or None, and NaN for a
+            number, NaN or None.
+        key: dotted key of the value, for the message.
+        complete: add the missing keys of tables, with None for numbers and [] for lists; a missing text is an error.
+
+    Raises:
+        ValueError: the value has another structure, or an item of a list lacks a key; the message names the key.
+    """
+    if isinstance(template, dict):
+        _require(isinstance(given, dict), key, given, "a table")
+        checked = dict(given)
+        for name in template.keys() - given.keys() - {_ANY} if complete else ():
+            _require(template[name] != "", _join(key, name), None, "a text: it is missing")
+            checked[name] = _nothing(template[name])
+        for name in given if _ANY in template else given.keys() & template.keys():
+            checked[name] = conform(given[name], template.get(name, template.get(_ANY)), _join(key, name), complete)
+        return checked
+    if isinstance(template, list):
+        _require(isinstance(given, list), key, given, "a list")
+        return [_item(item, template[0], f"{key}.{k}") for k, item in enumerate(given)] if template else given
+    allowed, fits = _scalar_rule(template, given)
+    _require(fits, key, given, allowed)
+    return given
+
+
+def _item(given: Any, template: Any, key: str) -> Any:
+    """Returns an item of a list after checking it like `conform`; a table must have all keys of its template."""
+    if isinstance(template, dict) and isinstance(given, dict):
+        for name in template.keys() - given.keys():
+            _require(False, f"{key}.{name}", None, "a value: it is missing")
+    return conform(given, template, key)
+
+
+def _nothing(template: Any) -> Any:
+    """Returns the value for missing contents: None for a number or text, [] for a list, a table of such values."""
+    if isinstance(template, dict):
+        return {name: _nothing(value) for name, value in template.items() if name != _ANY}
+    return [] if isinstance(template, list) else None
+
+
+def _join(key: str, name: str) -> str:
+    """Returns the dotted key of an item of a table."""
+    return f"{key}.{name}" if key else name
+
+
+def _scalar_rule(template: Any, given: Any) -> tuple[str, bool]:
+    """Returns what the template of a single value allows, in words, and whether the given value is allowed."""
+    is_number = isinstance(given, int | float) and not isinstance(given, bool)
+    if isinstance(template, str):
+        return "a text", isinstance(given, str)
+    if template is _OptionalText:
+        return "a text or null", given is None or isinstance(given, str)
+    if isinstance(template, bool):
+        return "true or false", isinstance(given, bool)
+    if template is _NAN:
+        return "a number", given is None or (is_number and not abs(given) > _LARGEST)
+    fits = is_number and abs(given) <= _LARGEST
+    if template is None:
+        return f"null or a number up to {_LARGEST:g}", given is None or fits
+    return f"a number up to {_LARGEST:g}", fits
+
+
+def _require(fits: bool, key: str, given: Any, allowed: str) -> None:
+    """Raises ValueError, naming the key and the allowed values, if a value does not fit its template."""
+    if not fits:
+        shown = "a table" if isinstance(given, Mapping) else repr(given)[:80]
+        raise ValueError(f"{key or 'contents'}: {shown} (allowed: {allowed})")

@@ -1,0 +1,63 @@
+"""Idealisations of a scenario: effects of a real survey that it leaves out, which makes simulated errors too small."""
+
+from __future__ import annotations
+
+from twin.scenario.model import CalibrationErrorConfig, Scenario
+
+
+def idealisations(scenario: Scenario) -> list[str]:
+    """Returns a sentence for each idealised part of a scenario: cameras, water, light, vehicle, images."""
+    subjects = {
+        "The cameras are ideal": _cameras(scenario),
+        "The water is ideal": _water(scenario),
+        "The light is ideal": _light(scenario),
+        "The vehicle is ideal": _vehicle(scenario),
+    }
+    sentences = [f"{subject}: {', '.join(missing)}." for subject, missing in subjects.items() if missing]
+    if scenario.imaging.fidelity == "surrogate":
+        sentences.append("No images were rendered: visual measurements are sampled from a fitted error model.")
+    return sentences
+
+
+def _cameras(scenario: Scenario) -> list[str]:
+    """Returns the names of the effects of real cameras that the scenario leaves out."""
+    sensor = scenario.sensor
+    absent = {
+        "no calibration error": scenario.calibration_error == CalibrationErrorConfig(),
+        "no port": scenario.port.kind == "none",
+        "no motion blur": sensor is None or not sensor.motion_blur,
+    }
+    return _named(absent)
+
+
+def _water(scenario: Scenario) -> list[str]:
+    """Returns the names of the effects of real water that the scenario leaves out."""
+    water = scenario.water
+    clear = water.jerlov == "clear" and water.absorption_per_m is None and water.spectrum_file is None
+    absent = {
+        "no absorption": clear,
+        "no scattering": clear or water.turbidity == 0,
+        "no forward scatter": not (clear or scenario.imaging.forward_scatter),
+        "no marine snow": scenario.snow.density_per_m3 == 0,
+        "no current": not any(scenario.current.velocity_mps),
+    }
+    return _named(absent)
+
+
+def _light(scenario: Scenario) -> list[str]:
+    """Returns the names of the effects of real lighting that the scenario leaves out."""
+    absent = {
+        "no shadows of the lamps": bool(scenario.lamps) and not scenario.imaging.shadows,
+        "no caustics": scenario.sun.illuminance_lx > 0 and scenario.sun.caustics == 0,
+    }
+    return _named(absent)
+
+
+def _vehicle(scenario: Scenario) -> list[str]:
+    """Returns the names of the effects of a real vehicle that the scenario leaves out."""
+    return _named({"no forces, no inertia": scenario.vehicle.dynamics == "kinematic"})
+
+
+def _named(absent: dict[str, bool]) -> list[str]:
+    """Returns the names of the effects that are absent."""
+    return [name for name, is_absent in absent.items() if is_absent]

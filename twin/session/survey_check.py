@@ -1,0 +1,73 @@
+"""Checks of a flown survey: whether the vehicle kept to the planned path, and whether the asked area is mapped.
+
+The checks use only the estimates and the plan, and therefore apply to a real survey as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core.quality import Finding
+from twin.core.records import Array, ElevationMap, StereoRig, SurveyResult
+from twin.estimate.self_check import check_survey
+from twin.world.mission import Mission
+
+MIN_AREA_MAPPED = 0.9  # smallest fraction of the asked area that the map may cover
+MAX_OFF_COURSE = 0.25  # largest ratio of distance from the planned path to shorter side of the image footprint
+_OFF_COURSE_S = 1.0  # departures from the path that last less long are ignored
+
+
+def survey_findings(
+    mission: Mission, result: SurveyResult, elevation: ElevationMap | None, reference_m: Array
+) -> list[Finding]:
+    """Returns the findings of all checks: reasons why a survey must not be trusted as it stands; empty if it passes.
+
+    Args:
+        mission: the survey as planned.
+        result: output of the estimators.
+        elevation: elevation map; None if none was built.
+        reference_m: (n, 3) planned positions of the left camera at the frames [m].
+    """
+    return [*check_survey(result, mission.rig), *_off_course(mission, result, reference_m), *_area(mission, elevation)]
+
+
+def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
+    """Returns a sentence on the rectification errors that were estimated and removed; empty if none were."""
+    epipolar = result.quality.epipolar
+    if epipolar is None or not epipolar.removed.any():
+        return []
+    pitch, _, roll = np.rad2deg(epipolar.removed[:3])
+    shift_px = rig.focal_px * epipolar.removed[3]
+    return [
+        f"The right camera is misaligned: a pitch of {pitch:+.3f} deg, a roll of {roll:+.3f} deg and a row offset of"
+        f" {shift_px:+.2f} px were estimated and removed."
+    ]
+
+
+def off_course_limit_m(mission: Mission) -> float:
+    """Returns the distance from the planned path beyond which a survey is degraded [m]."""
+    return mission.scenario.control.off_course_m or MAX_OFF_COURSE * min(mission.plan.footprint_m)
+
+
+def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> list[Finding]:
+    """Returns a finding if the online trajectory was too far from the planned path for too long."""
+    n = min(len(result.online), len(reference_m))
+    limit_m = off_course_limit_m(mission)
+    distance_m = np.linalg.norm(result.online.positions[:n] - reference_m[:n], axis=1)
+    n_long = max(1, round(_OFF_COURSE_S * mission.rig.frame_rate_hz))
+    if n < n_long:
+        return []
+    lasting_m = float(np.lib.stride_tricks.sliding_window_view(distance_m, n_long).min(axis=1).max())
+    if lasting_m <= limit_m:
+        return []
+    text = f"the vehicle was {lasting_m:.2f} m off the planned path for {_OFF_COURSE_S:g} s ({limit_m:.2f} m allowed)"
+    return [Finding("off_course", lasting_m, limit_m, text)]
+
+
+def _area(mission: Mission, elevation: ElevationMap | None) -> list[Finding]:
+    """Returns a finding if the map covers too small a fraction of the asked area."""
+    asked = mission.plan.inside_area(*np.meshgrid(*mission.grid.centres()))
+    mapped = 0.0 if elevation is None else float(np.isfinite(elevation.height_m[asked]).mean())
+    if mapped >= MIN_AREA_MAPPED:
+        return []
+    return [Finding("area_mapped", mapped, MIN_AREA_MAPPED, f"only {100 * mapped:.0f} % of the asked area is mapped")]

@@ -1,0 +1,151 @@
+"""Forecast of a survey over its floor: depth, footprint, overlap and coverage of the planned images by ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.floor_rays import HeightField, cast_pixels, ray_grid
+from twin.core.geometry import Array
+from twin.core.image_overlap import RAY_COLUMNS, image_overlap
+from twin.core.records import MapGrid, StereoRig
+from twin.judge.overlap import KeyframePoses
+from twin.world.coverage import Coverage
+from twin.world.mission import Mission
+from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs
+
+#: Approximate number of columns of the depth images from which the coverage is computed, and largest number of grid
+#: cells along the longer side of the terrain.
+_COVERAGE_COLUMNS = 80
+_COVERAGE_CELLS = 1000
+
+
+class Spread(NamedTuple):
+    """Minimum, 5th percentile, median and maximum of a quantity; all None if it has no finite value."""
+
+    minimum: float | None
+    p05: float | None
+    median: float | None
+    maximum: float | None
+
+
+@dataclass(frozen=True)
+class FloorForecast:
+    """Forecast for the n planned keyframes over the floor; NaN where an image shows no floor.
+
+    There are k pairs of consecutive keyframes along the swaths, and j pairs across neighbouring swaths.
+
+    Args:
+        keyframes: planned poses of the keyframes.
+        depth_m: (n, m) depth along the optical axis at m pixels on a regular grid [m].
+        altitude_m: (n,) height of the camera above the floor straight below it [m].
+        clearance_m: (n,) height of the camera above the highest floor in its image [m].
+        footprint_m: (n, 2) extent of the image on a level floor at its median depth, across and along the heading [m].
+        gsd_m: (n,) ground sample distance at the median depth [m].
+        stereo_share: (n,) share of the floor in the left image that the right image shows too.
+        along_position_m, across_position_m: (k, 2) and (j, 2) horizontal midpoint of the two cameras of each pair [m].
+        overlap_along: (k,) overlap of consecutive keyframes of the same swath.
+        overlap_across: (j,) sidelap: overlap of a keyframe with the image abreast of it on the next swath.
+        coverage: share of the asked area that both cameras see in at least one keyframe.
+    """
+
+    keyframes: KeyframePoses
+    depth_m: Array
+    altitude_m: Array
+    clearance_m: Array
+    footprint_m: Array
+    gsd_m: Array
+    stereo_share: Array
+    along_position_m: Array
+    across_position_m: Array
+    overlap_along: Array
+    overlap_across: Array
+    coverage: float
+
+
+class PlannedOverlap(NamedTuple):
+    """Median overlap over the floor along and across the swaths of the planned path; None if there are no pairs."""
+
+    along: float | None
+    across: float | None
+
+
+def planned_overlap(mission: Mission) -> PlannedOverlap:
+    """Returns the median overlaps forecast for the planned path, to compare with those of the flown survey."""
+    keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
+    field = floor_of(mission.terrain)
+    return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in planned_pairs(keyframes)))
+
+
+def forecast_over_floor(mission: Mission) -> FloorForecast:
+    """Computes the forecast of a mission by casting rays from the planned keyframes to the floor.
+
+    The cameras look straight down from the planned positions. Lens distortion, the port and calibration errors are
+    neglected.
+    """
+    rig, field = mission.rig, floor_of(mission.terrain)
+    keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
+    poses = keyframes.world_from_camera
+    depth = cast_pixels(field, poses, rig, ray_grid(rig, RAY_COLUMNS))
+    depth[np.isinf(depth)] = np.nan
+    median, nearest = _row_statistic(np.nanmedian, depth), _row_statistic(np.nanmin, depth)
+    x, y, z = keyframes.position_m.T
+    along, across = planned_pairs(keyframes)
+    return FloorForecast(
+        keyframes=keyframes,
+        depth_m=depth,
+        altitude_m=z - mission.terrain.height_at(x, y),
+        clearance_m=nearest,  # the optical axis is vertical
+        footprint_m=median[:, None] * [rig.width_px / rig.fx_px, rig.height_px / rig.fy_px],
+        gsd_m=median / rig.focal_px,
+        stereo_share=image_overlap(field, poses, poses @ rig.left_from_right, rig),
+        along_position_m=(along.first[:, :2, 3] + along.second[:, :2, 3]) / 2,
+        across_position_m=(across.first[:, :2, 3] + across.second[:, :2, 3]) / 2,
+        overlap_along=overlaps(field, along, rig),
+        overlap_across=overlaps(field, across, rig),
+        coverage=_coverage(mission, field, poses),
+    )
+
+
+def spread(values: Array) -> Spread:
+    """Returns minimum, 5th percentile, median and maximum of the finite values."""
+    known = values[np.isfinite(values)]
+    if len(known) == 0:
+        return Spread(None, None, None, None)
+    return Spread(*(float(v) for v in np.percentile(known, [0, 5, 50, 100])))
+
+
+def _row_statistic(statistic, values: Array) -> Array:
+    """Returns a NaN-ignoring statistic of each row of values (n, m); NaN for a row without a finite value."""
+    result = np.full(len(values), np.nan)
+    known = np.isfinite(values).any(axis=1)
+    result[known] = statistic(values[known], axis=1)
+    return result
+
+
+def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
+    """Returns the share of the asked area that both cameras see in at least one planned keyframe."""
+    small, grid = _reduced(mission.rig), _grid_of_terrain(mission)
+    coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
+    shape = small.height_px, small.width_px
+    for left in poses:
+        pair = cast_pixels(field, np.stack([left, left @ small.left_from_right]), small, pixels)
+        coverage.add(left, *(depth.reshape(shape).astype(np.float32) for depth in pair))
+    x, y = np.meshgrid(*grid.centres())
+    asked = mission.plan.inside_area(x, y)
+    return float(coverage.seen[asked].mean()) if asked.any() else 0.0
+
+
+def _grid_of_terrain(mission: Mission) -> MapGrid:
+    """Returns a grid over the whole terrain, with cells as large as those of the map, or larger on a large terrain."""
+    t = mission.terrain
+    cell_m = max(mission.grid.cell_m, max(t.size_m) / _COVERAGE_CELLS)
+    cols, rows = (max(1, int(side / cell_m)) for side in t.size_m)
+    return MapGrid(t.west_m, t.north_m, cell_m, rows, cols)
+
+
+def _reduced(rig: StereoRig) -> StereoRig:
+    """Returns the calibration for images binned to about _COVERAGE_COLUMNS columns."""
+    return rig.binned(max(1, rig.width_px // _COVERAGE_COLUMNS))

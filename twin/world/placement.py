@@ -1,0 +1,156 @@
+"""Placement of the survey area in the scene: centre, heading, and polygon from a list or a GeoJSON file."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controllers.survey_area import Corner, SurveyArea, polygon_area
+from terrains import Terrain
+from twin.core.georeference import Georeference
+from twin.core.records import Array
+from twin.errors import TwinError
+from twin.scenario.model import PlanConfig
+
+_MAX_GEOJSON_BYTES = 10_000_000
+_ONE_POLYGON = "GeoJSON with one Polygon without holes"
+#: CRS of a GeoJSON file without a member "crs", if its coordinates are longitude and latitude (RFC 7946).
+_LONGITUDE_LATITUDE = "OGC:CRS84"
+
+
+def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
+    """Returns the area of a survey in the scene.
+
+    Raises:
+        TwinError: the keys of the plan contradict each other, the terrain lacks the coordinates that they need, or the
+            area lies outside the terrain.
+    """
+    heading = math.radians(plan.heading_deg)
+    if plan.polygon is None:
+        shape = "disc" if plan.pattern == "loops" else "rectangle"
+        return SurveyArea(shape, plan.area_m, _centre(plan, terrain), heading)
+    for key, given in (("pattern", plan.pattern == "loops"), ("centre_m", any(plan.centre_m)),
+                       ("centre_crs", plan.centre_crs is not None)):  # fmt: skip
+        if given:
+            raise TwinError(f"plan.{key}", f"{getattr(plan, key)!r} has no effect with plan.polygon", "one of the two")
+    corners = plan.polygon if not isinstance(plan.polygon, str) else read_geojson(Path(plan.polygon), terrain)
+    area = polygon_area(corners, heading)
+    _check_inside("plan.polygon", area.outline(), terrain)
+    return area
+
+
+def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
+    """Returns the centre of the area in the scene [m]."""
+    if plan.centre_crs is None:
+        _check_inside("plan.centre_m", np.array([plan.centre_m]), terrain)
+        return plan.centre_m
+    if any(plan.centre_m):
+        raise TwinError("plan.centre_crs", "replaces plan.centre_m, which is given too", "one of the two")
+    origin = _georeference("plan.centre_crs", terrain)
+    x, y = (float(c) for c in origin.to_scene(*plan.centre_crs))
+    if np.isnan(terrain.height_at(x, y)):
+        (west, east), (south, north) = origin.from_scene(
+            [terrain.west_m, terrain.east_m], [terrain.south_m, terrain.north_m]
+        )
+        shown = ", ".join(f"{c:.2f}" for c in plan.centre_crs)
+        raise TwinError(
+            "plan.centre_crs", f"[{shown}] lies outside the DEM",
+            f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f}",
+        )  # fmt: skip
+    return x, y
+
+
+def _georeference(field: str, terrain: Terrain) -> Georeference:
+    """Returns the georeference of a terrain. Raises TwinError if it has none."""
+    if terrain.georeference is None:
+        raise TwinError(field, "the terrain has no coordinates", "a GeoTIFF with coordinates as terrain.height_file")
+    return terrain.georeference
+
+
+def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
+    """Raises TwinError if one of the points (n, 2) lies outside the terrain."""
+    outside = np.isnan(terrain.height_at(*points.T))
+    if outside.any():
+        x, y = points[outside][0]
+        raise TwinError(
+            field, f"({x:.2f}, {y:.2f}) lies outside the terrain",
+            f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
+        )  # fmt: skip
+
+
+def read_geojson(file: Path, terrain: Terrain) -> Array:
+    """Reads a polygon from a GeoJSON file; returns its corners (n, 2) in the scene [m].
+
+    The coordinates are in the CRS that the member "crs" names. In a file without this member they are longitude and
+    latitude (RFC 7946) if all of them lie within +-180 and +-90 degrees and, read in the CRS of the DEM, no corner lies
+    on the DEM; otherwise they are in the CRS of the DEM.
+
+    Raises:
+        TwinError: the file cannot be read or does not contain exactly one polygon without holes, its coordinates cannot
+            be transformed, or the terrain has no coordinates.
+    """
+    try:
+        if file.stat().st_size > _MAX_GEOJSON_BYTES:
+            raise TwinError("plan.polygon", f"{file.name!r} is too large", f"at most {_MAX_GEOJSON_BYTES} bytes")
+        tree = json.loads(file.read_text(encoding="utf-8"))
+        corners = np.array(_ring(tree, file), np.float64)[:, :2]
+    except (OSError, ValueError, TypeError, IndexError, RecursionError) as error:
+        raise TwinError("plan.polygon", f"{file.name!r} cannot be read: {error}", _ONE_POLYGON) from None
+    if not np.isfinite(corners).all():
+        raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _ONE_POLYGON)
+    origin = _georeference("plan.polygon", terrain)
+    crs = _named_crs(tree)
+    if crs is None and _is_longitude_latitude(corners, terrain, origin):
+        crs = _LONGITUDE_LATITUDE
+    if crs is not None:
+        corners = _projected(corners, crs, origin)
+    return np.column_stack(origin.to_scene(*corners.T))
+
+
+def _ring(tree: Any, file: Path) -> list[Any]:
+    """Returns the outer ring of the only polygon of a GeoJSON object: geometry, feature or feature collection."""
+    if isinstance(tree, dict) and tree.get("type") == "FeatureCollection" and len(tree.get("features", [])) == 1:
+        tree = tree["features"][0]
+    if isinstance(tree, dict) and tree.get("type") == "Feature":
+        tree = tree.get("geometry")
+    polygon = tree.get("coordinates", []) if isinstance(tree, dict) else []
+    if isinstance(tree, dict) and tree.get("type") == "MultiPolygon" and len(polygon) == 1:
+        polygon = polygon[0]
+    elif not isinstance(tree, dict) or tree.get("type") != "Polygon":
+        raise TwinError("plan.polygon", f"{file.name!r} does not hold exactly one polygon", _ONE_POLYGON)
+    if len(polygon) != 1 or len(polygon[0]) < 4:
+        raise TwinError("plan.polygon", f"{file.name!r} has a polygon with holes or without corners", _ONE_POLYGON)
+    return polygon[0]
+
+
+def _named_crs(tree: Any) -> str | None:
+    """Returns the name of the CRS in the member "crs" of a GeoJSON object (GeoJSON 2008); None if there is none."""
+    try:
+        return str(tree["crs"]["properties"]["name"])
+    except (KeyError, TypeError):
+        return None
+
+
+def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeference) -> bool:
+    """Returns whether corners (n, 2) must be longitude and latitude: within their range, and off the DEM in its CRS."""
+    within = (np.abs(corners) <= [180.0, 90.0]).all()
+    x, y = origin.to_scene(*corners.T)
+    return bool(within and origin.crs_wkt is not None and np.isnan(terrain.height_at(x, y)).all())
+
+
+def _projected(corners: Array, crs: str, origin: Georeference) -> Array:
+    """Returns corners (n, 2) transformed from the named CRS to that of the DEM."""
+    from rasterio.crs import CRS  # imported here: it takes 20 MB, and few plans need it
+    from rasterio.errors import RasterioError
+    from rasterio.warp import transform
+
+    try:
+        target = CRS.from_wkt(origin.crs_wkt or "")
+        return np.column_stack(transform(CRS.from_user_input(crs), target, *corners.T.tolist())[:2])
+    except (RasterioError, ValueError) as error:
+        problem = f"{crs!r} cannot be transformed to the CRS of the DEM: {error}"
+        raise TwinError("plan.polygon", problem, "coordinates in the CRS of the DEM") from None

@@ -1,0 +1,93 @@
+"""Thrust authority: checks that the thrusters can hold station and fly the plan against the current."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import root_scalar
+
+from controllers.survey_plan import SurveyPlan
+from twin.core.geometry import Array
+from twin.errors import TwinError
+from twin.scenario.model import Scenario
+from twin.simulate.autopilot import thrust_loads
+
+#: A path over the floor may climb and sink at this share of the greatest vertical speed at cruise speed; the rest is
+#: reserved for the controller.
+_CLIMB_SHARE = 0.5
+#: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
+_MAX_SLOPE = 0.6
+
+
+def check_thrust(scenario: Scenario, plan: SurveyPlan) -> None:
+    """Checks that the thrusters hold station in the current, and reach the planned velocities against it.
+
+    Raises:
+        TwinError: a thruster saturates; the message gives the greatest allowed current or cruise speed.
+    """
+    current = np.array(scenario.current.velocity_mps)
+    if scenario.vehicle.dynamics == "kinematic" or not (current.any() or plan.surface is not None):
+        return
+    yaw, velocity = _planned_velocities(plan)
+    hold = _body_velocities(yaw, -np.tile(current, (len(yaw), 1)))
+    _check_station_keeping(scenario, hold)
+    through_water = lambda factor: _body_velocities(yaw, factor * velocity - current)  # noqa: E731
+    if _load(scenario, through_water(1.0)) > 1:
+        factor = _root(lambda k: _load(scenario, through_water(k)) - 1, 1.0)
+        against = f" in a current of {np.linalg.norm(current):.2f} m/s" if current.any() else " up the slopes"
+        raise TwinError(
+            "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters{against}",
+            f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",
+        )  # fmt: skip
+
+
+def climb_slope(scenario: Scenario) -> float:
+    """Returns the greatest slope of a path: half the slope that saturates a thruster at cruise speed, at most 0.6."""
+    speed_mps = scenario.plan.speed_mps
+    ahead = np.array([speed_mps, 0.0, 0.0])
+    excess = lambda climb: _load(scenario, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
+    if excess(0.0) >= 0:
+        return _MAX_SLOPE  # `prepare` reports that the speed is too high
+    high = _MAX_SLOPE / _CLIMB_SHARE * speed_mps
+    climb = high if excess(high) <= 0 else _root(excess, high)
+    return _CLIMB_SHARE * climb / speed_mps
+
+
+def _check_station_keeping(scenario: Scenario, hold: Array) -> None:
+    """Raises TwinError if station keeping, at body velocities through the water (n, 3), saturates a thruster."""
+    if _load(scenario, hold) <= 1:
+        return
+    factor = _root(lambda k: _load(scenario, k * hold) - 1, 1.0)
+    speed_mps = float(np.linalg.norm(scenario.current.velocity_mps))
+    raise TwinError(
+        "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
+        f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
+    )  # fmt: skip
+
+
+def _root(function: Callable[[float], float], high: float) -> float:
+    """Returns the root of a function that has opposite signs at 0 and at `high`."""
+    return float(root_scalar(function, bracket=(0.0, high), method="brentq", xtol=1e-4).root)
+
+
+def _load(scenario: Scenario, velocities: Array) -> float:
+    """Returns the greatest thrust of any thruster at body velocities (n, 3) through the water; 1 is full thrust."""
+    return float(thrust_loads(scenario.vehicle, velocities).max(initial=0.0))
+
+
+def _planned_velocities(plan: SurveyPlan) -> tuple[Array, Array]:
+    """Returns the distinct pairs of yaw (n,) [rad] and world velocity (n, 3) [m/s] along the plan, rounded to 0.001."""
+    rows = []
+    for track in range(1, plan.n_tracks + 1):
+        reference = plan.references(track, plan.frames_of_track(track)[0])
+        rows.append(np.round(np.column_stack([np.asarray(reference.yaw), reference.velocity]), 3))
+    unique = np.unique(np.concatenate(rows), axis=0)
+    return unique[:, 0], unique[:, 1:]
+
+
+def _body_velocities(yaw: Array, velocity: Array) -> Array:
+    """Rotates velocities (n, 3) from the world to the body axes of a level vehicle at yaws (n,) [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = velocity.T
+    return np.column_stack([c * x + s * y, c * y - s * x, z])
