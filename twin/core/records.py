@@ -303,6 +303,11 @@ class StereoObservation(NamedTuple):
     row_sigma_px: float | None = None
     repetition: float | None = None
 
+    @property
+    def row_spread_ratio(self) -> float | None:
+        """Returns the scatter of the row differences / their expected standard deviation; None without an image."""
+        return self.row_spread_px / self.row_sigma_px if self.row_spread_px is not None and self.row_sigma_px else None
+
 
 @dataclass
 class SurveyResult:

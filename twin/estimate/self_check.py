@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from twin.core.quality import Finding
-from twin.core.records import StereoObservation, StereoRig, SurveyResult
+from twin.core.records import StereoRig, SurveyResult
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
@@ -70,7 +70,7 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
     if repeated is not None and repeated > MAX_REPETITION:
         text = f"the texture repeats (autocorrelation {repeated:.2f}), so matches are ambiguous"
         yield Finding("repetition", repeated, MAX_REPETITION, text)
-    ratio = _median(_row_ratio(pair) for pair in pairs)
+    ratio = _median(pair.row_spread_ratio for pair in pairs)
     if ratio is not None and ratio > MAX_ROW_SPREAD:
         text = f"row differences of stereo matches scatter {ratio:.1f} times as much as their claimed noise"
         yield Finding("row_spread", ratio, MAX_ROW_SPREAD, text)
@@ -109,13 +109,6 @@ def _consistency(result: SurveyResult) -> Iterator[Finding]:
         if not share <= MAX_SIGMA_DEPTHS:
             text = f"the standard deviation of a keyframe position reaches {sigma_m * 100:.1f} cm"
             yield Finding("sigma", share, MAX_SIGMA_DEPTHS, text)
-
-
-def _row_ratio(pair: StereoObservation) -> float | None:
-    """Returns the scatter of the row differences divided by their claimed standard deviation."""
-    if pair.row_spread_px is None or not pair.row_sigma_px:
-        return None
-    return pair.row_spread_px / pair.row_sigma_px
 
 
 def _median(values: Iterator[float | None]) -> float | None:

@@ -22,7 +22,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
-    ratios = [pair.row_spread_px / pair.row_sigma_px for pair in pairs if pair.row_spread_px and pair.row_sigma_px]
+    ratios = [pair.row_spread_ratio for pair in pairs if pair.row_spread_ratio is not None]
     repeated = [pair.repetition for pair in pairs if pair.repetition is not None]
     epipolar = quality.epipolar
     pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()

@@ -35,18 +35,10 @@ def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
     keyframe = np.concatenate([is_keyframe for _, is_keyframe in frames])
     number = np.repeat(np.arange(plan.n_tracks), [len(r.position) for r in references])
     swath = number if pattern == "loops" else np.where(is_turning(yaw), -1, leg_numbers(position))
-    poses = _down_looking(position[keyframe], yaw[keyframe])
+    poses = np.tile(np.eye(4), (int(keyframe.sum()), 1, 1))
+    poses[:, :3, :3] = geometry.rotations_of_down_camera(yaw[keyframe])
+    poses[:, :3, 3] = position[keyframe]
     return KeyframePoses(poses, travel_direction(position)[keyframe], swath[keyframe])
-
-
-def _down_looking(position: Array, yaw: Array) -> Array:
-    """Returns world_from_camera (n, 4, 4) of cameras that look straight down from positions (n, 3) at yaws (n,)."""
-    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)
-    poses = np.tile(np.eye(4), (len(position), 1, 1))
-    turn = np.stack([np.stack([c, -s, zero], 1), np.stack([s, c, zero], 1), np.stack([zero, zero, zero + 1], 1)], 1)
-    poses[:, :3, :3] = turn @ geometry.BODY_FROM_DOWN_CAMERA
-    poses[:, :3, 3] = position
-    return poses
 
 
 def planned_pairs(keyframes: KeyframePoses) -> tuple[ImagePairs, ImagePairs]:

@@ -101,7 +101,7 @@ class EpipolarCalibration:
         if not self.removed.any():
             return right
         matrix = rig.matrix
-        offset = geometry.pose(np.eye(3), np.zeros(3))[:3, :3]
+        offset = np.eye(3)
         offset[1, 2] = self.removed[3] * rig.focal_px
         source_from_result = offset @ matrix @ geometry.exp(np.append(self.removed[:3], np.zeros(3)))[:3, :3]
         source_from_result = source_from_result @ np.linalg.inv(matrix)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 
+from twin.core.geometry import Array
 from twin.estimate.vision.matching import Image
 
 _SMALLEST_WEIGHT = 0.2  # shifts with a smaller overlap of the tapers, relative to zero shift, are ignored
@@ -20,17 +23,26 @@ def repetition(image: Image, patch_px: int) -> float:
         image: (height, width) normalised image (`matching.normalise`).
         patch_px: side of the matched patches; smaller shifts belong to the main peak.
     """
-    height, width = image.shape
-    taper = np.outer(np.hanning(height), np.hanning(width))
-    values = (image.astype(np.float64) - image.mean()) * taper
-    shape = [cv2.getOptimalDFTSize(2 * side) for side in (height, width)]
-    correlation, weight = (
-        np.fft.irfft2(np.abs(np.fft.rfft2(part, shape)) ** 2, shape)[: height // 2] for part in (values, taper)
-    )
+    taper, weight = _taper(*image.shape)
+    correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
     if correlation[0, 0] <= 0:
         return 0.0
-    rows, columns = np.mgrid[: correlation.shape[0], : correlation.shape[1]]
-    columns = np.minimum(columns, shape[1] - columns)
+    rows, columns = np.mgrid[: weight.shape[0], : weight.shape[1]]
+    columns = np.minimum(columns, weight.shape[1] - columns)
     shifted = (np.hypot(rows, columns) >= patch_px) & (weight > _SMALLEST_WEIGHT * weight[0, 0])
     ratio = correlation[shifted] / weight[shifted] * (weight[0, 0] / correlation[0, 0])
     return float(np.clip(ratio.max(initial=0.0), 0.0, 1.0))
+
+
+@lru_cache(maxsize=4)
+def _taper(height: int, width: int) -> tuple[Array, Array]:
+    """Returns the taper (height, width) of images of one size, and its autocorrelation."""
+    taper = np.outer(np.hanning(height), np.hanning(width))
+    return taper, _autocorrelation(taper)
+
+
+def _autocorrelation(values: Array) -> Array:
+    """Returns the autocorrelation at row shifts from 0 to half the height and at all column shifts, cyclic."""
+    shape = [cv2.getOptimalDFTSize(2 * side) for side in values.shape]
+    spectrum = np.abs(np.fft.rfft2(values, shape)) ** 2
+    return np.asarray(np.fft.irfft2(spectrum, shape)[: values.shape[0] // 2], np.float64)
