@@ -510,6 +510,7 @@ def test_frame_to_frame_motion_bridges_a_failed_link():
     np.testing.assert_allclose(result.final.world_from_camera, poses, atol=1e-6)
     missing = [node.dvl_displacement is None for node in navigator.network.nodes]
     assert missing == [True, False, False, True, False, False]
+    assert result.quality.nodes_bridged == 1
 
 
 def test_only_the_newest_keyframe_keeps_its_points():

@@ -7,10 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from twin.core.quality import EpipolarError, EstimationQuality
+from twin.core.links import Link, Links
+from twin.core.quality import EpipolarError, EstimationQuality, Finding
 from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Trajectory
 from twin.errors import SurveyAborted
+from twin.estimate.alignment import _mean_chi2
 from twin.scenario.file import load_scenario
+from twin.session.conclusion import _identity
 from twin.session.monitor import SurveyMonitor
 from twin.session.survey_check import calibration_notes, off_course_limit_m, survey_findings
 from twin.world.mission import prepare
@@ -86,3 +89,17 @@ def test_a_survey_whose_position_is_lost_is_aborted():
     monitor(estimate(0.9 * half_m), frame)
     with pytest.raises(SurveyAborted, match="standard deviation of the position"):
         monitor(estimate(1.1 * half_m), frame)
+
+
+def test_findings_degrade_a_survey_and_an_abort_outranks_them():
+    finding = Finding("points", 20.0, 60.0, "one stereo pair in ten has 20 matched points or fewer")
+    expected = {("", ()): "complete", ("", (finding,)): "degraded", ("vision lost", (finding,)): "aborted"}
+    for (abort, findings), status in expected.items():
+        identity = _identity(mission(), abort, findings)
+        assert identity["status"] == status
+        assert identity["reason"] == (abort or "; ".join(f.sentence for f in findings))
+
+
+def test_the_chi_square_of_links_is_that_of_their_own_covariances():
+    links = Links(Link(0, k, np.eye(4), 3 * np.eye(6), 0.8, 100, shared_by=3) for k in (1, 2))
+    assert _mean_chi2(links, np.array([2.0, 4.0])) == pytest.approx(3 * 3.0 / 6)
