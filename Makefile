@@ -2,7 +2,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: env demo test slow
+.PHONY: env demo test slow agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions
 
@@ -23,3 +23,7 @@ test: env ## style, types and the fast tests
 
 slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow
+
+agreement: env ## the gate of the surrogate: 64 rendered surveys, then docs/agreement.md and its figure
+	$(BIN)/twin study agreement --out runs/study-agreement --resume; status=$$?; \
+	cp runs/study-agreement/agreement.md runs/study-agreement/agreement.png docs/ && exit $$status

@@ -1,4 +1,4 @@
-"""Procedural terrains: flat, sand ripples, fractal ground, coral reef."""
+"""Procedural terrains: flat, sand ripples, fractal ground, coral reef, cliffs."""
 
 from __future__ import annotations
 
@@ -94,6 +94,14 @@ def _reef(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
     return _limit_slope(height.astype(np.float32), relief_m, grid_m)
 
 
+def _cliffs(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
+    """Generates rough terraces in three levels; the walls between them rise within one cell of the grid."""
+    level = fractal_field(shape, max(2.0 / grid_m, 8), 0.5, rng)
+    terrace = np.searchsorted(np.quantile(level, [1 / 3, 2 / 3]), level)
+    rough_m = 0.04 * relief_m * fractal_field(shape, max(0.5 / grid_m, 4), 0.6, rng)
+    return (0.4 * relief_m * terrace + rough_m).astype(np.float32)
+
+
 def _staircase(level: Heights) -> Heights:
     """Returns terraces: levels rounded to the nearest integer, with smooth transitions halfway between integers."""
     step = np.floor(level)
@@ -146,4 +154,5 @@ KINDS: dict[str, Callable[[tuple[int, int], float, float, np.random.Generator], 
     "ripples": _ripples,
     "fractal": _fractal,
     "reef": _reef,
+    "cliffs": _cliffs,
 }

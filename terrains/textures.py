@@ -25,6 +25,7 @@ MATERIALS = {
     "ripples": (DETRITUS, SAND, SAND, SAND),
     "fractal": (SAND, DETRITUS, ROCK, ALGAE),
     "reef": (SAND, ALGAE, ROCK, CORAL),
+    "cliffs": (SAND, ALGAE, ROCK, CORAL),
     "file": (SAND, ALGAE, ROCK, CORAL),
 }
 LEVELS = 256 // 4  #: tones per material in the palette
@@ -59,7 +60,10 @@ def generate_texture(
 def _material_level(
     height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the material level (rows, cols), 0 (low, flat) to 255 (high, steep), with patches up to 1 m in size."""
+    """Returns the weight (rows, cols) that blends the floor materials, in patches of up to 1 m.
+
+    It is 0 on low, flat ground and 255 on high, steep ground.
+    """
     north_up = np.ascontiguousarray(height_m[::-1])
     relief_m = max(float(np.ptp(north_up)), 1e-6)
     spacing_px = shape[1] / (height_m.shape[1] - 1)

@@ -94,5 +94,5 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
 
 
 def _ambiguous(problem: str) -> TwinError:
-    """Returns the error that asks for `terrain.z`."""
+    """Returns the error for an ambiguous vertical axis, whose message tells the user to set `terrain.z`."""
     return TwinError("terrain.z", f"missing: {problem}", '"up" for elevations, "down" for depths')

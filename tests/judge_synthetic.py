@@ -182,7 +182,7 @@ def _write_keyframes(folder: Path, result: SurveyResult, rig: StereoRig) -> None
     ground = cv2.GaussianBlur(rng.normal(0, 1, (600, 900)), (0, 0), 1.5)
     ground = np.clip(110 + 45 * ground / ground.std(), 0, 255).astype(np.uint8)
     for k, frame in enumerate(result.keyframe_rows):
-        view = np.roll(ground, (-k, -2 * k), (0, 1))[: rig.height_px, : rig.width_px]
+        view = np.roll(ground, (-k, -2 * k), (0, 1))[: rig.height_px // 4, : rig.width_px // 4]  # small: fast
         for side, tint in (("left", (0.6, 0.9, 0.8)), ("right", (0.6, 0.85, 0.8))):
             image = (view[..., None] * np.array(tint)).astype(np.uint8)
             cv2.imwrite(str(folder / f"{frame:06d}_{side}.png"), np.ascontiguousarray(image[..., ::-1]))

@@ -48,7 +48,8 @@ def down_camera(
 ) -> np.ndarray:
     """Returns the pose world_from_camera (4, 4) of a down-looking camera on a body with this roll, pitch and yaw."""
     return geometry.pose(
-        geometry.rotation_from_rpy(*rpy_rad) @ geometry.BODY_FROM_DOWN_CAMERA, np.array([x_m, y_m, z_m])
+        geometry.rotation_from_rpy(*map(float, rpy_rad)) @ geometry.BODY_FROM_DOWN_CAMERA,
+        np.array([x_m, y_m, z_m], float),
     )
 
 
@@ -129,8 +130,29 @@ def _colour(texture, px, x, y):
 
 
 @njit(cache=True, nogil=True)
+def _crossing(z, spacing, west, south, position, dx, dy, dz, low, high):
+    """Returns the ray parameter between `low` (above the floor) and `high` (below) at the floor: regula falsi."""
+    x, y = position[0] + low * dx, position[1] + low * dy
+    above = position[2] + low * dz - _height(z, spacing, west, south, x, y)
+    x, y = position[0] + high * dx, position[1] + high * dy
+    below = position[2] + high * dz - _height(z, spacing, west, south, x, y)
+    t, side = high, 0
+    for _ in range(60):
+        t = (low * below - high * above) / (below - above)
+        x, y = position[0] + t * dx, position[1] + t * dy
+        error = position[2] + t * dz - _height(z, spacing, west, south, x, y)
+        if abs(error) < 1e-9:
+            break
+        if error < 0:  # an end that stays twice counts half (Illinois)
+            high, below, above, side = t, error, above / 2 if side < 0 else above, -1
+        else:
+            low, above, below, side = t, error, below / 2 if side > 0 else below, 1
+    return t
+
+
+@njit(cache=True, nogil=True)
 def _cast(z, spacing, west, south, texture, px, rotation, position, focal, width, height, samples):
-    """Renders image and depth (H, W): ray marching, then bisection; depth is NaN unless samples is 1."""
+    """Renders image and depth (H, W): ray marching, then regula falsi; depth is NaN unless samples is 1."""
     image = np.zeros((height, width), np.float32)
     depth = np.full((height, width), np.nan)
     top = z.max() + 1e-6
@@ -152,15 +174,9 @@ def _cast(z, spacing, west, south, texture, px, rotation, position, focal, width
                     if h <= _height(z, spacing, west, south, x, y) or h < bottom:
                         break
                     t += step
-                low, high = max(t - step, 0.0), t
-                for _ in range(26):
-                    mid = 0.5 * (low + high)
-                    x, y, h = position[0] + mid * dx, position[1] + mid * dy, position[2] + mid * dz
-                    if h <= _height(z, spacing, west, south, x, y):
-                        high = mid
-                    else:
-                        low = mid
+                t = _crossing(z, spacing, west, south, position, dx, dy, dz, max(t - step, 0.0), t)
+                x, y = position[0] + t * dx, position[1] + t * dy
                 image[v, u] += _colour(texture, px, x, y) / (samples * samples)
                 if samples == 1:
-                    depth[v, u] = high
+                    depth[v, u] = t
     return image, depth

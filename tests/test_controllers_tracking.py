@@ -135,7 +135,7 @@ def test_a_greater_weight_reduces_a_thrust_and_the_weighted_effort_is_minimal():
 def test_body_and_camera_references_differ_by_the_lever_arm_rotated_by_yaw():
     camera = Reference(np.array([1.0, 2.0, 3.0]), np.zeros(3), 0.7, np.zeros(3))
     body = body_reference(camera, LEVER_M)
-    pose = geometry.pose(geometry.rotation_from_rpy(0, 0, 0.7), body.position)
+    pose = geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, 0.7), body.position)
     np.testing.assert_allclose(geometry.transform(pose, LEVER_M[None])[0], camera.position, atol=1e-12)
 
 
@@ -173,4 +173,4 @@ def test_station_keeping_in_a_current_works_at_any_heading(yaw):
     for _ in range(20 * 30):
         rov.step(controller.command(rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
     np.testing.assert_allclose(rov.world_from_body[:3, 3], 0, atol=0.005)
-    np.testing.assert_allclose(rov.world_from_body[:3, :3], geometry.rotation_from_rpy(0, 0, yaw), atol=0.005)
+    np.testing.assert_allclose(rov.world_from_body[:3, :3], geometry.rotation_from_rpy(0.0, 0.0, yaw), atol=0.005)

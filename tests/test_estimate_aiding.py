@@ -116,12 +116,12 @@ def sea_path(n):
     velocity = np.column_stack([speed, 0.1 * np.cos(t), 0.05 * np.sin(t)])
     # positions are integrated in steps a hundred times finer
     fine = np.arange((n - 1) * 100 + 1) / RIG.frame_rate_hz / 100
-    turns = np.array([geometry.rotation_from_rpy(0, 0, a) for a in 0.3 * np.sin(1.5 * fine)])
+    turns = np.array([geometry.rotation_from_rpy(0.0, 0.0, a) for a in 0.3 * np.sin(1.5 * fine)])
     world = np.einsum(
         "nij,nj->ni", turns, np.column_stack([0.4 + 0.1 * np.sin(2 * fine), 0.1 * np.cos(fine), 0.05 * np.sin(fine)])
     )
     path = np.concatenate([np.zeros((1, 3)), np.cumsum((world[1:] + world[:-1]) / 2, axis=0)]) * (fine[1] - fine[0])
-    poses = [geometry.pose(geometry.rotation_from_rpy(0, 0, a), p) for a, p in zip(yaw, path[::100], strict=True)]
+    poses = [geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, a), p) for a, p in zip(yaw, path[::100], strict=True)]
     return np.array(poses), velocity
 
 

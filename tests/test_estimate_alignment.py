@@ -138,7 +138,7 @@ def test_the_covariance_of_a_node_with_height_and_attitude_readings_is_that_of_t
     body = np.array([0.1, -0.2, 0.7])
 
     def camera(rpy):
-        return geometry.rotation_from_rpy(*rpy) @ RIG.body_from_camera[:3, :3]
+        return geometry.rotation_from_rpy(*map(float, rpy)) @ RIG.body_from_camera[:3, :3]
 
     pose, wide = geometry.pose(camera(body), np.array([1.0, 2.0, 3.0])), {0: np.eye(6) * 1e2}
     cov = align(keyframes([pose], [Readings(3.0, body)]), [], wide, RIG, NOISE).covs[0]

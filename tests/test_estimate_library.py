@@ -36,7 +36,7 @@ def hills():
 
 def image(floor, pose, rng):
     """Returns the RGB image of one camera of `RIG`."""
-    gray = scene.digitise(scene.render_view(floor, RENDERED, pose)[0], rng, 1.5)[CROP]
+    gray = scene.digitise(scene.render_view(floor, RENDERED, pose, samples=1)[0], rng, 1.5)[CROP]
     matrix = np.array([[1, 0, 0], [0, ROW_SCALE, 0.5 * ROW_SCALE - 0.5]])
     gray = cv2.warpAffine(gray, matrix, (RIG.width_px, RIG.height_px), borderMode=cv2.BORDER_REPLICATE)
     return np.repeat(gray[..., None], 3, axis=2)
@@ -142,7 +142,7 @@ def test_cropped_depth_maps_with_their_principal_point_give_the_crop_of_the_resu
     _, depth = scene.render_view(hills(), full, scene.down_camera(0, 0, 1.6))
     whole = depth_filter.DepthMap(depth.astype(np.float32), np.full(depth.shape, 1e-4, np.float32))
     step, cov = geometry.exp(np.array([0.03, -0.02, 0.3, 0.02, 0.01, 0.03])), np.eye(6) * 1e-6
-    part = depth_filter.DepthMap(whole.depth_m[rows, cols], whole.variance_m2[rows, cols])
+    part = depth_filter.DepthMap(whole.depth_m[rows, cols].copy(), whole.variance_m2[rows, cols].copy())
     ends = [depth_filter.propagate(one, one, step, cov, rig).fused for one, rig in ((whole, full), (part, cropped))]
     inner = np.s_[25:45, 30:50]
     for a, b in zip(ends[0], ends[1], strict=True):

@@ -134,6 +134,27 @@ def test_the_covariance_follows_the_scatter_of_single_points():
     assert old_nees.mean() > 9
 
 
+@pytest.mark.parametrize(
+    ("growth", "measured_scatter", "low", "high"), [(1.0, True, 4, 8), (6.0, True, 4, 8), (6.0, False, 12, np.inf)]
+)
+def test_the_covariance_follows_the_scatter_of_points_without_disparity(growth, measured_scatter, low, high):
+    """As frames between keyframes are matched: two coordinates per point; NEES of six, standard error of 40 is 0.55."""
+    rng, nees = np.random.default_rng(11), []
+    settings = PairMotionSettings(n_measured=2, measured_scatter=measured_scatter)
+    for _ in range(40):
+        b = smooth_floor(rng)
+        a, _, _ = transfer(b, TRUE, RIG.baseline_m)
+        a = a + noise(rng, len(a)) * np.where(np.abs(b[:, :1]) > 0.3, growth, 1.0)
+        cov_a = covs(len(a)) * np.outer([1, 1, 0], [1, 1, 0])
+        cov_a[:, 2, 2] = 1.0
+        measured = PairMeasurements(a, b + noise(rng, len(b)), cov_a, covs(len(b)))
+        motion = two_view_motion.pair_motion(measured, RIG.baseline_m, TRUE, settings)
+        assert motion is not None
+        error = geometry.log(geometry.inverse(TRUE) @ motion.a_from_b)
+        nees.append(error @ np.linalg.solve(motion.cov, error))
+    assert low < np.mean(nees) < high
+
+
 def test_the_scatter_of_noise_as_reported_gives_the_reported_covariance():
     """Law: where the reported covariances hold, nothing changes. Of 300 points, each sigma is known to about 5 %."""
     rng = np.random.default_rng(9)
@@ -197,3 +218,26 @@ def relief_nees(tmp_path_factory):
 def test_claimed_sigma_of_links_over_steep_relief_is_within_a_factor_of_1_5_of_the_error(relief_nees):
     """Mean NEES of 8 links: 6 if consistent, with a standard error of 1.2."""
     assert 6 / 1.5**2 < relief_nees.mean() < 6 * 1.5**2
+
+
+def test_over_a_level_floor_the_noise_is_not_taken_for_pixel_locking():
+    """All points are displaced by the same fraction of a pixel, in both images."""
+    depth_m = RIG.focal_px * RIG.baseline_m / 15.1  # disparity 15.1 px
+    motion = geometry.pose(np.eye(3), np.array([12.1, -8.1, 0]) * depth_m / RIG.focal_px)
+
+    def make(rng):
+        pixels = np.column_stack([rng.integers(30, RIG.width_px - 30, 300), rng.integers(30, RIG.height_px - 30, 300)])
+        b = np.column_stack([RIG.normalised(pixels), np.full(300, RIG.baseline_m / depth_m)])
+        a = transfer(b, motion, RIG.baseline_m)[0]
+        a, b = a + noise(rng, 300), b + noise(rng, 300)
+        return a, b, locking_of(a, b)
+
+    rng, nees = np.random.default_rng(5), []
+    for _ in range(20):
+        a, b, locking = make(rng)
+        cov, settings = covs(300), PairMotionSettings(locking=locking, measured_scatter=True)
+        found = two_view_motion.pair_motion(PairMeasurements(a, b, cov, cov), RIG.baseline_m, motion, settings)
+        assert found is not None
+        error = geometry.log(geometry.inverse(motion) @ found.a_from_b)
+        nees.append(error @ np.linalg.solve(found.cov, error))
+    assert np.mean(nees) < 12  # 6 expected

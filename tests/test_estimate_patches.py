@@ -42,7 +42,8 @@ def pair(warp, shift, light=None, noise=0.0, seed=0, longest_px=20):
     target = waves.at((pixels() - centre - shift) @ np.linalg.inv(warp).T + centre)
     if light is not None:
         target = (target - 128) * light(pixels()) + 128
-    images = [np.clip(i + rng.normal(size=i.shape) * noise + 0.5, 0, 255).astype(np.uint8) for i in (source, target)]
+    noisy = (image + rng.normal(size=image.shape) * noise for image in (source, target))
+    images = [np.floor(np.clip(image + 0.5, 0, 255)).astype(np.float32) for image in noisy]  # as of `matching.gray`
     columns, rows = np.meshgrid(np.arange(45, 120, 6), np.arange(35, 90, 6))
     points = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
     return images, points, (points - centre) @ warp.T + centre + shift
@@ -112,7 +113,7 @@ def test_a_different_texture_is_not_matched():
 
 
 def test_uniform_patches_and_patches_across_the_border_are_not_matched():
-    uniform = np.full(SHAPE, 90, np.uint8)
+    uniform = np.full(SHAPE, 90, np.float32)
     points = np.array([[80.0, 60.0], [2.0, 60.0]])
     assert not match([uniform, uniform], points, points, np.eye(2)).ok.any()
 

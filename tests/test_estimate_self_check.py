@@ -104,7 +104,7 @@ def survey_result():
 
 
 def quality(**changes):
-    return EstimationQuality(links_tried=100, link_residual=1.0, link_chi2=1.0)._replace(**changes)
+    return EstimationQuality(links_tried=100, link_residual=1.0, link_chi2=1.0, frame_sigma_m=0.003)._replace(**changes)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +115,7 @@ def quality(**changes):
         ({"links_failed": 30}, {}, "links_failed"),
         ({"link_chi2": 5.0}, {}, "link_chi2"),
         ({"link_residual": 3.0}, {}, "link_residual"),
+        ({"frame_sigma_m": 0.05}, {}, "frame_sigma"),
         ({}, {"n_points": 20}, "points"),
         ({}, {"row_spread_px": 0.2}, "row_spread"),
         ({}, {"row_offset_px": -0.3}, "row_offset"),

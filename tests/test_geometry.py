@@ -136,9 +136,9 @@ def test_rpy_from_rotation_inverts_rotation_from_rpy(roll, pitch, yaw):
 
 
 def test_roll_pitch_yaw_have_the_signs_of_the_body_axes():
-    np.testing.assert_allclose(g.rotation_from_rpy(0, 0, np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)  # bow to north
-    np.testing.assert_allclose(g.rotation_from_rpy(0, np.pi / 2, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # bow down
-    np.testing.assert_allclose(g.rotation_from_rpy(np.pi / 2, 0, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # port up
+    np.testing.assert_allclose(g.rotation_from_rpy(0.0, 0.0, np.pi / 2) @ [1, 0, 0], [0, 1, 0], atol=1e-12)  # bow north
+    np.testing.assert_allclose(g.rotation_from_rpy(0.0, np.pi / 2, 0.0) @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # bow down
+    np.testing.assert_allclose(g.rotation_from_rpy(np.pi / 2, 0.0, 0.0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # port up
 
 
 @given(st.floats(-1e3, 1e3))
@@ -150,7 +150,7 @@ def test_wrapping_changes_an_angle_by_full_turns(angle):
 
 @given(st.floats(-3.1, 3.1))
 def test_the_heading_of_a_down_looking_camera_is_the_yaw_of_the_body(yaw):
-    rotation = g.rotation_from_rpy(0, 0, yaw) @ g.BODY_FROM_DOWN_CAMERA
+    rotation = g.rotation_from_rpy(0.0, 0.0, yaw) @ g.BODY_FROM_DOWN_CAMERA
     np.testing.assert_allclose(g.heading_of_camera(g.pose(rotation, np.zeros(3))), yaw, atol=1e-12)
 
 

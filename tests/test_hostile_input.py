@@ -28,7 +28,7 @@ from twin.world import limits
 LIMIT_S = 15.0
 
 
-@settings(max_examples=60, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
 @given(mutations())
 def test_a_mutated_scenario_is_accepted_or_refused(tmp_path_factory, changes):
     folder = tmp_path_factory.mktemp("case")
@@ -182,9 +182,7 @@ def test_an_odd_command_line_is_refused(command, words):
     assert len(err) < 4000
 
 
-@pytest.mark.parametrize(
-    "name", ["[/x]", "$\\frac", "$x_{", "a/b", "../x", "\0", "\x1b[31m", "n" * 80, "é" * 80, "<b>&"]
-)
+@pytest.mark.parametrize("name", ["[/x]", "$\\frac$x_{", "../x", "\0", "\x1b[31m", "é" * 80])
 def test_a_plan_of_any_name_is_printed_and_drawn_literally(command, tmp_path, name):
     (tmp_path / "odd.toml").write_text(f'extends = "{Path(cli.__file__).parent.parent}/scenes/quickstart.toml"\n')
     text = json.dumps(name, ensure_ascii=False).replace("\0", "\\u0000").replace("\x1b", "\\u001b")
@@ -259,23 +257,33 @@ def test_an_edited_run_folder_is_read_or_refused_with_the_name_of_its_file(run_f
     assert len(EDITS) > refused > len(EDITS) / 2
 
 
-@pytest.mark.parametrize(
-    ("name", "key", "value"),
-    [
-        ("metrics.json", "map", "DELETED"),
+@pytest.fixture
+def report_of(run_folder, tmp_path):
+    """Returns a function that gives the report of a copy of the run folder with edits (file, key, value)."""
+
+    def page(*edits):
+        shutil.copytree(run_folder, tmp_path / "run")
+        for name, key, value in edits:
+            file = tmp_path / "run" / name
+            file.write_text(edited(file.read_text(), key, value))
+        return write_report(tmp_path / "run").read_text()
+
+    return page
+
+
+def test_the_report_shows_odd_texts_literally(report_of):
+    page = report_of(
         ("metrics.json", "name", "<script>$\\frac[/x]"),
         ("metrics.json", "status", "[/x]<b>"),
-        ("keyframes/index.json", "frames", "DELETED"),
         ("env.json", "<b>", {"a": [1]}),
-    ],
-)
-def test_the_report_of_an_edited_run_is_written_or_refused(run_folder, tmp_path, name, key, value):
-    folder = tmp_path / "run"
-    shutil.copytree(run_folder, folder)
-    (folder / name).write_text(edited((folder / name).read_text(), key, value))
+    )
+    for text in ("<script>$", "[/x]<b>", "<td><b>"):
+        assert text not in page and text.replace("<", "&lt;").replace(">", "&gt;").removeprefix("&lt;td&gt;") in page
+
+
+@pytest.mark.parametrize(("name", "key"), [("metrics.json", "map"), ("keyframes/index.json", "frames")])
+def test_the_report_of_a_run_without_a_part_is_written_or_refused(report_of, tmp_path, name, key):
     try:
-        page = write_report(folder).read_text()
+        report_of((name, key, "DELETED"))
     except TwinError as error:
-        assert error.field == str(folder / name)
-    else:
-        assert "<script>$" not in page and "[/x]<b>" not in page and "<td><b>" not in page
+        assert error.field == str(tmp_path / "run" / name)

@@ -22,7 +22,7 @@ from twin.imaging.renderer import Renderer, linear_depth, visible_tiles
 
 W, H, VFOV = 160, 120, 45.0
 POSES = [
-    geometry.pose(geometry.rotation_from_rpy(*rpy) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
+    geometry.pose(geometry.rotation_from_rpy(*map(float, rpy)) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
     for rpy, position in [
         ((0.0, 0.0, 0.0), (0.2, 0.1, 2.2)),
         ((0.1, -0.15, 2.0), (-1.3, 0.4, 1.9)),

@@ -32,7 +32,7 @@ SCENARIO = Scenario.model_validate(
 RIG = SCENARIO.believed_rig()
 VFOV = float(np.rad2deg(2 * np.arctan(RIG.height_px / 2 / RIG.focal_px)))
 POSES = [
-    geometry.pose(geometry.rotation_from_rpy(*rpy) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
+    geometry.pose(geometry.rotation_from_rpy(*map(float, rpy)) @ geometry.BODY_FROM_DOWN_CAMERA, np.array(position))
     for rpy, position in [((0.0, 0.0, 0.0), (0.2, 0.1, 2.4)), ((0.1, -0.15, 2.0), (-1.3, 0.4, 2.2))]
 ]
 

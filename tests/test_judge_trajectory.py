@@ -54,7 +54,7 @@ def straight(n: int, yaw_rad: float = 0.0, offset_m: float = 0.0) -> Trajectory:
     poses = np.tile(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)), (n, 1, 1))
     poses[:, 0, 3] = np.arange(n)
     poses[1:, 2, 3] = offset_m
-    poses[1:, :3, :3] = geometry.rotation_from_rpy(0, 0, yaw_rad) @ geometry.BODY_FROM_DOWN_CAMERA
+    poses[1:, :3, :3] = geometry.rotation_from_rpy(0.0, 0.0, yaw_rad) @ geometry.BODY_FROM_DOWN_CAMERA
     return Trajectory(np.arange(n, dtype=float), poses)
 
 
@@ -71,7 +71,7 @@ def test_a_constant_height_error_has_its_closed_form():
 
 @pytest.mark.parametrize("yaw_deg", [5.0, 359.0, -359.0, 179.0])
 def test_heading_error_is_wrapped(yaw_deg):
-    facing_west = geometry.pose(geometry.rotation_from_rpy(0, 0, np.deg2rad(178)), np.zeros(3))  # wraps at 180 deg
+    facing_west = geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, np.deg2rad(178)), np.zeros(3))  # wraps at 180 deg
     estimate, truth = straight(5, yaw_rad=np.deg2rad(yaw_deg)), straight(5)
     rotated = (Trajectory(t.times_s, facing_west @ t.world_from_camera) for t in (estimate, truth))
     errors = path_errors(*rotated)

@@ -130,7 +130,7 @@ def test_with_every_effect_the_light_is_still_the_sum_of_its_layers():
     np.testing.assert_allclose(layers.total, total, rtol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], EFFECTS, PHYSICAL])
+@pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], [*EFFECTS, *PHYSICAL]])
 def test_the_sheet_is_a_picture(tmp_path, settings):
     here = mission(*settings)
     file = look_sheet.draw(here.scenario, render_view(here), tmp_path / "below" / "sheet.png")

@@ -24,6 +24,11 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def report(folder):
+    return write_report(folder).read_text()
+
+
+@pytest.fixture(scope="module")
 def unfinished(tmp_path_factory):
     return write_folder(tmp_path_factory.mktemp("unfinished") / "run", finished=False)
 
@@ -39,18 +44,16 @@ def test_a_written_run_folder_is_read_back(folder):
     assert run.frames_with_image() == run.keyframes.frames.tolist()
 
 
-def test_the_report_is_self_contained(folder):
-    page = write_report(folder).read_text()
-    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+def test_the_report_is_self_contained(report):
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', report)
     assert len(sources) > 8 + 1 + 2
     assert all(source.startswith("data:image/") for source in sources)
-    assert not re.search(r"https?://|@import|url\(", page)
-    assert len(page) < 5_000_000
+    assert not re.search(r"https?://|@import|url\(", report)
+    assert len(report) < 5_000_000
 
 
-def test_the_report_contains_the_values_of_the_metrics(folder):
-    metrics = json.loads((folder / "metrics.json").read_text())
-    page = write_report(folder).read_text()
+def test_the_report_contains_the_values_of_the_metrics(folder, report):
+    metrics, page = json.loads((folder / "metrics.json").read_text()), report
     assert "The survey is complete" in page and "Jerlov type IB" in page
     for value in (metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"], metrics["map"]["nmad_m"]):
         assert wording.length(value) in page
@@ -66,9 +69,15 @@ def test_the_report_contains_the_values_of_the_metrics(folder):
         assert f'<section id="{section}">' in page, section
 
 
-def test_the_report_uses_metrics_that_are_not_written_yet(folder, tmp_path):
+def test_the_report_uses_metrics_that_are_not_written_yet_also_without_stages_and_links(folder):
     metrics = json.loads((folder / "metrics.json").read_text()) | {"status": "aborted", "reason": "disk <full>"}
-    assert "The survey was aborted: disk &lt;full&gt;." in write_report(folder, metrics).read_text()
+    page = write_report(folder, {k: v for k, v in metrics.items() if k not in ("links", "stages")}).read_text()
+    assert "The survey was aborted: disk &lt;full&gt;." in page
+    assert (
+        '<section id="network">' in page
+        and '<section id="stages">' not in page
+        and "Eq. (2) treats the depth" not in page
+    )
 
 
 def test_the_report_of_an_unfinished_run_is_marked_as_unfinished(unfinished):
@@ -113,16 +122,6 @@ def test_trajectories_are_read_back_from_tum_files(folder):
     run.trajectories["f2f"].save(copy)
     back = Trajectory.load(copy)
     np.testing.assert_allclose(back.world_from_camera, run.trajectories["f2f"].world_from_camera, atol=1e-8)
-
-
-def test_metrics_without_stages_and_links_have_a_report(folder):
-    metrics = json.loads((folder / "metrics.json").read_text())
-    page = write_report(folder, {k: v for k, v in metrics.items() if k not in ("links", "stages")}).read_text()
-    assert (
-        '<section id="network">' in page
-        and '<section id="stages">' not in page
-        and "Eq. (2) treats the depth" not in page
-    )
 
 
 def stages(**errors_m):

@@ -110,7 +110,7 @@ BAD_FILES = [
     ),
     (
         '[terrain]\nkind = "lava"',
-        ["2: terrain.kind: 'lava': not allowed (allowed: 'flat', 'ripples', 'fractal', 'reef' or 'file')"],
+        ["2: terrain.kind: 'lava': not allowed (allowed: 'flat', 'ripples', 'fractal', 'reef', 'cliffs' or 'file')"],
     ),
     ('[require]\n"map.le90_m" = "x"', ["2: require.map.le90_m: 'x': not allowed (allowed: a number)"]),
     ('extends = "none.toml"', ["1: extends: no such file 'none.toml'"]),

@@ -91,6 +91,27 @@ def test_a_survey_whose_position_is_lost_is_aborted():
         monitor(estimate(1.1 * half_m), frame)
 
 
+def test_a_survey_without_vision_is_aborted_after_it_has_held_station():
+    frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), None)
+    lost, ok = (Estimate(1.0, np.eye(4), np.eye(4), np.zeros(6), 0.0, status) for status in ("lost", "ok"))
+    second = round(mission().rig.frame_rate_hz)
+
+    def fly(estimates):
+        events = []
+        log = SimpleNamespace(log=lambda event, **fields: events.append((event, fields.get("action"))))
+        monitor = SurveyMonitor(mission(), log, lambda _: None)
+        for estimate in estimates:
+            monitor(estimate, frame)
+            monitor.actions(estimate)
+        return events
+
+    assert ("action", "hold") in fly([lost] * (5 * second))
+    with pytest.raises(SurveyAborted, match="vision lost at"):
+        fly([lost] * (7 * second))
+    with pytest.raises(SurveyAborted, match="stopped for 60 s in total"):
+        fly(([lost] * (5 * second) + [ok]) * 15)
+
+
 def test_findings_degrade_a_survey_and_an_abort_outranks_them():
     finding = Finding("points", 20.0, 60.0, "one stereo pair in ten has 20 matched points or fewer")
     expected = {("", ()): "complete", ("", (finding,)): "degraded", ("vision lost", (finding,)): "aborted"}

@@ -242,6 +242,25 @@ def test_the_expected_time_is_told_before_and_the_run_folders_are_kept_on_reques
     assert set(kept_of) == {kept}
 
 
+def test_plans_outside_the_fit_of_the_surrogate_are_not_recommended_and_are_told(tmp_path):
+    """The surrogate refuses altitudes above 2 m, where it would be right."""
+    reason = "imaging.fidelity: the error model does not hold for {:.2f} m (allowed: up to 2 m, or --extrapolate)"
+
+    def refusing(survey):
+        altitude_m = survey.values["plan.altitude_m"]
+        if altitude_m > 2 and not is_rendered(survey):
+            return row_of(survey, "refused", reason.format(altitude_m))
+        return flown(survey, 0.005)
+
+    study = study_of(tmp_path, TUNING)
+    result = search(study, tmp_path / "out", refusing)
+    n_refused = sum(c.values["plan.altitude_m"] > 2 for c in result.candidates)
+    assert n_refused and list(result.refused.values()) == [n_refused]
+    assert result.recommended.values["plan.altitude_m"] <= 2
+    (text,) = (text for text in tuning_report.warnings(result) if "could not be flown" in text)
+    assert text.startswith(f"{n_refused} of {len(result.candidates)} plans") and "--extrapolate" in text
+
+
 def test_a_plan_whose_scenario_is_not_valid_is_refused_and_not_flown(tmp_path, monkeypatch):
     """Altitudes above 2 m are invalid, as if by their combination with another key: the bounds are checked before."""
     scenario_of_sample = candidates.scenario_of_sample

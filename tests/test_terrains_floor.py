@@ -10,7 +10,7 @@ import terrains
 from terrains import Terrain
 from twin.errors import TwinError
 
-KINDS = ("ripples", "fractal", "reef")
+KINDS = ("ripples", "fractal", "reef", "cliffs")
 
 
 def floor(kind: str, seed: int = 1, size_m: tuple[float, float] = (6.0, 4.0)) -> Terrain:
@@ -54,6 +54,14 @@ def test_a_reef_is_steep_but_not_beyond_sixty_degrees() -> None:
     slope_deg = np.rad2deg(np.arctan(np.hypot(*np.gradient(terrain.height_m, terrain.spacing_m))))
     assert np.percentile(slope_deg, 99.5) <= 60.5
     assert np.percentile(slope_deg, 97) > 35.0
+
+
+def test_cliffs_are_terraces_with_walls_of_one_cell() -> None:
+    terrain = floor("cliffs", size_m=(9.0, 7.0))
+    step_m = np.abs(np.diff(terrain.height_m, axis=1))
+    walls = step_m > 0.25 * 0.6
+    assert 0.005 < walls.mean() < 0.1
+    assert np.percentile(step_m[~walls], 90) < 0.05 * 0.6
 
 
 @pytest.mark.parametrize("kind", ("flat", *KINDS))

@@ -23,18 +23,26 @@ SMALL = [
     "control.hold_s=0.4",
     "navigation.aiding=[]",
 ]
-LOOPS = [*SMALL, "plan.pattern=loops", "plan.area_m=[2.0, 2.0]", "plan.speed_mps=0.25", "plan.tracks=2"]
+LOOPS = [*SMALL, "plan.pattern=loops", "plan.area_m=[1.6, 1.6]", "plan.speed_mps=0.25", "plan.tracks=2"]
 FLAT = [*SMALL, "vehicle.dynamics=kinematic", "plan.area_m=[0.8, 0.5]"]
+
+
+def flown(settings, folder, outputs):
+    """Flies a survey; its report has the tracks only, because all figures take longer than the flight."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin.report.survey_page.draw_all", lambda _: {"tracks": "data:,"})
+        patch.setattr("twin.report.survey_page.surface_picture", lambda _: None)
+        return survey.run(load_scenario("quickstart", settings), folder, outputs=outputs)
 
 
 @pytest.fixture(scope="module")
 def looped(tmp_path_factory):
-    return survey.run(load_scenario("quickstart", LOOPS), tmp_path_factory.mktemp("looped"))
+    return flown(LOOPS, tmp_path_factory.mktemp("looped"), ("report",))
 
 
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory):
-    return survey.run(load_scenario("quickstart", FLAT), tmp_path_factory.mktemp("flat"))
+    return flown(FLAT, tmp_path_factory.mktemp("flat"), ())
 
 
 def edges(folder):

@@ -28,7 +28,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-reproductions = typer.Typer(help="Reproduce experiments of Negahdaripour & Madjidi (2003).", no_args_is_help=True)
+reproductions = typer.Typer(
+    help="Reproduce experiments of Negahdaripour & Madjidi (2003); compare the light model with its reference.",
+    no_args_is_help=True,
+)
 app.add_typer(reproductions, name="reproduce")
 
 SceneArgument = Annotated[
@@ -43,6 +46,12 @@ SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
 PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-plan.png.")]
 SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-look.png.")]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Compute a few cells only.")]
+WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Random walks per cell of the Monte Carlo.")]
+PhaseOption = Annotated[
+    str,
+    typer.Option("--phase", help="Phase function of the reference: model (Henyey-Greenstein) or sea (with Petzold's)."),
+]
 TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None,
@@ -88,6 +97,13 @@ VerifyOption = Annotated[
         help="Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
     ),
 ]
+ExtrapolateOption = Annotated[
+    bool,
+    typer.Option(
+        "--extrapolate",
+        help="Fly surrogate surveys outside the range of the error model's fit, with a warning, instead of refusing.",
+    ),
+]
 LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
 PlanJsonOption = Annotated[bool, typer.Option("--json", help="Print only the predicted properties, as JSON.")]
@@ -125,9 +141,11 @@ def run(
     out: OutOption = None,
     live: LiveOption = False,
     as_json: JsonOption = False,
+    extrapolate: ExtrapolateOption = False,
 ) -> None:
     """Run one survey and write its folder: map, trajectories, report, recording, metrics."""
-    result = _run_survey(scene, overrides + ([] if seed is None else [f"seed={seed}"]), out, live)
+    options = ([] if seed is None else [f"seed={seed}"]) + (["imaging.extrapolate=true"] if extrapolate else [])
+    result = _run_survey(scene, overrides + options, out, live)
     if as_json:
         print(json.dumps(result.metrics, indent=1))
     else:
@@ -208,6 +226,31 @@ def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: Summary
         print(f"Sheet: {out / 'turbidity.png'}")
 
 
+@reproductions.command()
+def light(
+    out: TurbidityOutOption = Path("runs/light"),
+    quick: QuickOption = False,
+    walks: WalksOption = 40_000,
+    phase: PhaseOption = "model",
+    as_json: SummaryOption = False,
+) -> None:
+    """Compare the light of the images with a Monte Carlo of any order of scattering, in green light."""
+    from twin.reproduce import light as comparison
+
+    if phase not in ("model", "sea"):
+        raise TwinError("--phase", repr(phase), "model or sea")
+    outputs.output_file(out / "light.png")
+    selection = comparison.QUICK if quick else comparison.ALL
+    found = list(comparison.cells(selection, walks, phase))
+    with outputs.writing(out):
+        summary = comparison.write(found, out)
+    if as_json:
+        print(json.dumps(summary, indent=1))
+    else:
+        console.print_table("Light model and reference, green band", comparison.table(found))
+        print(f"Sheet: {out / 'light.png'}")
+
+
 @app.command("fit-surrogate")
 def fit_surrogate(
     files: FitArgument = None,
@@ -237,13 +280,15 @@ def study(
     resume: ResumeOption = False,
     live: LinesOption = False,
     as_json: SummaryOption = False,
+    extrapolate: ExtrapolateOption = False,
 ) -> None:
     """Run the surveys of a study and estimate the probability that a survey meets the requirements."""
     from twin.app import study_command
 
     if not scheduler:
         _require_rendering()
-    raise typer.Exit(study_command.run(file, study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json)))
+    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, extrapolate=extrapolate)
+    raise typer.Exit(study_command.run(file, options))
 
 
 @app.command()
@@ -256,13 +301,14 @@ def tune(
     live: LinesOption = False,
     as_json: SummaryOption = False,
     verify: VerifyOption = None,
+    extrapolate: ExtrapolateOption = False,
 ) -> None:
     """Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario."""
     from twin.app import study_command
 
     if not scheduler:
         _require_rendering()
-    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify)
+    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify, extrapolate)
     raise typer.Exit(study_command.tune(file, options))
 
 

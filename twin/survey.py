@@ -14,9 +14,11 @@ from twin.report.run_writer import PICTURES, RunFolder
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
 from twin.session.conclusion import Flight, RunResult, conclude
+from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
 from twin.world.mission import Course, Mission, prepare
-from twin.world.pilot import make_pilot
+from twin.world.pace import FULL
+from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
 
 
@@ -55,15 +57,22 @@ def run(
         with make_navigator(mission, world, out, stopwatch) as navigator:
             try:
                 with guard.stage():
-                    fly(mission, world, navigator, monitor)
+                    fly(mission, world, navigator, monitor, monitor.actions)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
             return conclude(Flight(mission, world, navigator, stopwatch, guard), folder, monitor)
 
 
-def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[[Estimate, Frame], None]) -> None:
+def fly(
+    mission: Mission,
+    world: World,
+    navigator: Navigator,
+    observe: Callable[[Estimate, Frame], None],
+    actions: MissionActions | None = None,
+) -> None:
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
+    If tracking is poor or lost, the vehicle slows down or stops on its path until it is sound again (`MissionActions`).
     After each track, the vehicle keeps station while the navigator runs a global alignment.
 
     Args:
@@ -71,6 +80,7 @@ def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[
         world: simulates the vehicle, which executes the commands, and returns the frames.
         navigator: estimates the pose from the frames.
         observe: called with the estimate and its frame after every update of the navigator.
+        actions: chooses the pace along the path; None: the vehicle flies at the planned speed in any case.
     """
     pilot = make_pilot(mission)
     fast_forward = world.fast_forward(navigator, pilot)
@@ -82,8 +92,18 @@ def fly(mission: Mission, world: World, navigator: Navigator, observe: Callable[
             frame = world.observe(course[k])
             estimate = navigator.update(frame, track)
             observe(estimate, frame)
-            world.act(pilot(estimate, course[k].reference))
-            k = fast_forward(course, k + 1)
+            reference = course[k].reference
+            world.act(pilot(without_feedback(estimate, reference, frame.readings), reference))
+            pace = FULL if actions is None else actions(estimate)
+            k += 1
+            if course.holding or (pace == FULL and course.rate == 1):
+                first, k = k, fast_forward(course, k)
+                if actions is not None:
+                    actions.add_sound_frames(k - first)
+            else:
+                world.end_course(k)
+                course, k = mission.fly_on(track, course.path_times_s[k - 1], pace), 0
+                world.start_course(course, track)
 
     for track in mission.tracks:
         follow(mission.fly(track), track)

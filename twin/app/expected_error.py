@@ -12,6 +12,7 @@ from twin.core.floor_rays import ray_grid
 from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.surrogate import error_model_file
+from twin.surrogate.map_model import EDGE_PX, WINDOW_PX, roughness
 from twin.surrogate.matchability import Matchability
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import FloorForecast
@@ -65,30 +66,36 @@ class ExpectedError(NamedTuple):
 def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     """Returns the expected height error of the map, without the errors of the poses.
 
-    The error has two parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
-    length f [px] and baseline b [m]. A lateral error of the mapped surface is a height error in proportion to the slope
-    of the floor. The standard deviations of both errors come from the error model fitted to rendered surveys. The
+    The error has three parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
+    length f [px] and baseline b [m]; it decreases with the number of keyframes that observe a point, which is
+    1 / (1 - overlap along the leg). A lateral error of the mapped surface is a height error in proportion to the slope
+    of the floor. Edges and other roughness within the matching window cause an error in proportion to the roughness.
+    The standard deviations of all errors come from the error model fitted to rendered surveys. The
     disparity error depends on the water, light, texture and sensor of the scenario, through the Cramer-Rao bound of
     image matching (`Matchability`).
     """
     rig, scenario = mission.rig, mission.scenario
     fitted = error_model_file.load(scenario.imaging.error_model)
     model, matching = fitted.model, Matchability(scenario, mission.illumination, mission.terrain)
-    depth, slope = _floor_points(mission, forecast)
+    depth, slope, rough_m = _floor_points(mission, forecast)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
     sigma_px = np.interp(depth, matching.depths_m, [model.depth_sigma_px(b) * model.depth_error_ratio for b in table])
     in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
-    vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px
+    share = float(model.depth_error_views(np.array(1 / (1 - scenario.plan.overlap_along))))
+    vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
+    rough_px = rough_m * rig.focal_px * rig.baseline_m / depth**2
+    edge = model.edge_error_gain * rough_m * rough_px**2 / (rough_px**2 + EDGE_PX**2)
+    sigma_m = np.sqrt(vertical**2 + lateral**2 + edge**2)
     return ExpectedError(
-        np.hypot(vertical, lateral), float(in_view.mean()) if len(depth) else 0.0,
+        sigma_m, float(in_view.mean()) if len(depth) else 0.0,
         float(bound.max(initial=0.0)), model.bound_range_px[1],
     )  # fmt: skip
 
 
-def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Array]:
-    """Returns depths (n,) [m] and slopes (n,) [m/m] at floor points spread evenly over the images of the keyframes."""
+def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Array, Array]:
+    """Returns depths (n,) [m], slopes (n,) [m/m] and roughness (n,) [m] at points spread evenly over the images."""
     rig, grid = mission.rig, mission.grid
     rays = np.column_stack([rig.normalised(ray_grid(rig, RAY_COLUMNS)), np.ones(forecast.depth_m.shape[1])])
     image, ray = np.nonzero(np.isfinite(forecast.depth_m))
@@ -96,7 +103,10 @@ def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Arr
     image, ray = image[kept], ray[kept]
     depth, poses = forecast.depth_m[image, ray], forecast.keyframes.world_from_camera[image]
     x, y, _ = (poses[:, :3, 3] + depth[:, None] * np.einsum("nij,nj->ni", poses[:, :3, :3], rays[ray])).T
-    down, east = np.gradient(true_heights(grid, mission.terrain.height_at), grid.cell_m)
+    heights = true_heights(grid, mission.terrain.height_at)
+    down, east = np.gradient(heights, grid.cell_m)
+    typical_m = float(np.median(depth)) if len(depth) else 1.0
+    rough = roughness(heights, WINDOW_PX * typical_m / rig.focal_px / grid.cell_m)
     rows = np.clip(((grid.north_m - y) / grid.cell_m).astype(int), 0, grid.rows - 1)
     cols = np.clip(((x - grid.west_m) / grid.cell_m).astype(int), 0, grid.cols - 1)
-    return depth, np.nan_to_num(np.hypot(down, east)[rows, cols])
+    return depth, np.nan_to_num(np.hypot(down, east)[rows, cols]), rough[rows, cols].astype(float)

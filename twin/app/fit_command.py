@@ -13,7 +13,7 @@ from twin.study.surveys import surveys
 from twin.surrogate import error_model_file
 from twin.surrogate_fit.rendered_surveys import fit_to_surveys, survey_statistics
 
-DEFAULT_STUDIES = ("fit_reef", "fit_sun", "fit_paper")
+DEFAULT_STUDIES = ("fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper")
 
 
 def run(files: Sequence[str], out: Path, runs: Path) -> int:

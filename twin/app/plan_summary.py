@@ -162,7 +162,6 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> list[str]:
     given = {
         "[port]": scenario.port.kind != "none",
         "[calibration_error]": scenario.calibration_error != type(scenario.calibration_error)(),
-        "[snow]": scenario.snow.density_per_m3 > 0,
     }
     if any(given.values()):
         sections = ", ".join(name for name, present in given.items() if present)

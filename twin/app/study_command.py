@@ -12,7 +12,7 @@ from typing import NamedTuple
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.errors import TwinError
-from twin.study import summary, tuning, tuning_report, wording
+from twin.study import agreement, agreement_report, summary, tuning, tuning_report, wording
 from twin.study.candidates import tuning_config
 from twin.study.engine import Engine
 from twin.study.local_engine import LocalEngine, default_jobs
@@ -33,6 +33,7 @@ class StudyOptions(NamedTuple):
     live: bool = False
     as_json: bool = False
     verify: int | None = None
+    extrapolate: bool = False
 
     def engine(self) -> AbstractContextManager[Engine]:
         """Returns a context manager that yields the engine selected by these options; see `open_engine`."""
@@ -74,7 +75,7 @@ def run(file: str, options: StudyOptions) -> int:
     Raises:
         TwinError: the study file or an option is invalid; no survey was run.
     """
-    study = load_study(file)
+    study = load(file, options)
     folder = _folder(options, "study", study)  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
         result = run_study(study, folder, options.resume, engine, progress)
@@ -97,7 +98,7 @@ def tune(file: str, options: StudyOptions) -> int:
     Raises:
         TwinError: the study file or an option is invalid; no survey was run.
     """
-    study = load_study(file)
+    study = load(file, options)
     config = tuning_config(study)
     if options.verify is not None:
         config = config.model_copy(update={"verify": options.verify})
@@ -116,6 +117,14 @@ def tune(file: str, options: StudyOptions) -> int:
         if result.recommended:
             print(f"Plan: {folder / 'recommended.toml'}")
     return 130 if result.interrupted else 0 if result.recommended else 1
+
+
+def load(file: str, options: StudyOptions) -> Study:
+    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it."""
+    study = load_study(file)
+    if not options.extrapolate:
+        return study
+    return study.model_copy(update={"set": study.set | {"imaging.extrapolate": True}})
 
 
 def _folder(options: StudyOptions, command: str, study: Study) -> Path:
@@ -143,6 +152,8 @@ def _print_result(study: Study, result: StudyResult) -> None:
         for metric in analysis.metric_summaries
     ]
     console.print_table(f"{study.name}: median and 95 % bound of the surveys", rows)
+    if (compared := agreement.agreement(analysis)) is not None:
+        console.print_table(agreement_report.verdict_line(compared), agreement_report.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
         console.print_table(f"{len(analysis.refused_samples)} samples cannot be flown: surveys, reason", reasons)
@@ -157,12 +168,14 @@ def _print_result(study: Study, result: StudyResult) -> None:
 def exit_status(result: StudyResult) -> int:
     """Returns the exit status of a study.
 
-    130 if interrupted; 2 if every survey was refused; 1 if too few surveys passed, none could be evaluated, or results
-    could not be written; 0 otherwise.
+    130 if interrupted; 2 if every survey was refused; 1 if too few surveys passed, none could be evaluated, surrogate
+    and rendered surveys do not agree, or results could not be written; 0 otherwise.
     """
     if result.interrupted:
         return 130
     analysis = result.analysis
     if len(analysis.refused) and analysis.refused.all():
         return 2
-    return 1 if analysis.requirement_missed or result.write_errors or not analysis.evaluated.any() else 0
+    compared = agreement.agreement(analysis)
+    disagrees = bool(analysis.study.compare) and (compared is None or not compared.agrees)
+    return 1 if disagrees or analysis.requirement_missed or result.write_errors or not analysis.evaluated.any() else 0

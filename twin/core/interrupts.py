@@ -1,4 +1,4 @@
-"""Handling of interrupts (Ctrl-C, SIGTERM): an interrupt ends one stage of a survey; the other results are kept."""
+"""Handling of interrupts (Ctrl-C, SIGTERM): an interrupt ends the current stage of a survey, the others run."""
 
 from __future__ import annotations
 

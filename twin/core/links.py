@@ -21,10 +21,13 @@ class Link(NamedTuple):
         cov: (6, 6) covariance of [rotation, translation] (rad, m) in camera j, as used by the alignment.
         overlap: fraction of the matched points of node j that project into image i (0 to 1).
         n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
-        shared_by: number of links that share the stereo observation of node j, this link included. Their errors are
-            correlated; to account for this, `cov` is the covariance of the single measurement times this number.
+        shared_by: effective number of links that share the errors of this one: those that share the stereo observation
+            of node j, times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). To account
+            for the correlation, `cov` is the covariance of the single measurement times this number.
         closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
             exact; None: not computed.
+        floor_share: fraction (0 to 1) of the variance of the measurement that its image noise does not explain. It
+            belongs to the patches of floor and recurs in all links over them. Only in links that have not been stored.
     """
 
     i: int
@@ -33,8 +36,9 @@ class Link(NamedTuple):
     cov: Array
     overlap: float
     n_points: int
-    shared_by: int = 1
+    shared_by: float = 1.0
     closed_form: Array | None = None
+    floor_share: float = 0.0
 
     @property
     def own_cov(self) -> Array:
@@ -45,7 +49,7 @@ class Link(NamedTuple):
 _LINK = np.dtype(
     [
         ("i", int), ("j", int), ("i_from_j", float, (4, 4)), ("information", float, (6, 6)), ("overlap", float),
-        ("n_points", int), ("shared_by", int),
+        ("n_points", int), ("shared_by", float),
     ]
 )  # fmt: skip
 
@@ -89,7 +93,7 @@ class Links(Sequence[Link]):
         if isinstance(k, slice):
             return [self[index] for index in range(*k.indices(len(self)))]
         i, j, i_from_j, information, overlap, n_points, shared_by = self._table[k]
-        numbers = float(overlap), int(n_points), int(shared_by)
+        numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
         return Link(int(i), int(j), i_from_j, cov, *numbers, self._closed_forms[k])
 
@@ -119,8 +123,8 @@ class Links(Sequence[Link]):
         return self.cov / self._table["shared_by"][:, None, None]
 
     @property
-    def shared_by(self) -> NDArray[np.int64]:
-        """Returns the number (n,) of links that share the stereo observation of the later keyframe."""
+    def shared_by(self) -> Array:
+        """Returns the effective number (n,) of links that share the errors of each link, see `Link.shared_by`."""
         return self._table["shared_by"]
 
     @property
@@ -150,7 +154,7 @@ class Links(Sequence[Link]):
         """Converts all links added since the last conversion to rows."""
         if self._pending:
             pending, self._pending = self._pending, []
-            *columns, closed_forms = zip(*pending, strict=True)
+            *columns, closed_forms, _ = zip(*pending, strict=True)
             table = np.empty(len(pending), _LINK)
             for name, column in zip(_LINK.names or (), columns, strict=True):
                 table[name] = symmetric_inverses(np.array(column)) if name == "information" else column

@@ -35,6 +35,8 @@ class EstimationQuality(NamedTuple):
             divided by its expected value; None without a measured link.
         link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected.
         epipolar: estimated errors of the rectification; None without images.
+        frame_sigma_m: standard deviation (3-D) that the position of a frame accumulates by frame-to-frame motion until
+            the next node, 90th percentile over the nodes [m]; None without a second node.
     """
 
     frames_lost: int = 0
@@ -44,6 +46,7 @@ class EstimationQuality(NamedTuple):
     link_residual: float | None = None
     link_chi2: float | None = None
     epipolar: EpipolarError | None = None
+    frame_sigma_m: float | None = None
 
 
 class Finding(NamedTuple):
@@ -60,3 +63,17 @@ class Finding(NamedTuple):
     value: float
     limit: float
     sentence: str
+
+
+class ActionTimes(NamedTuple):
+    """Time that the vehicle flew slowly and that it was stopped [s]."""
+
+    slowed_s: float = 0.0
+    held_s: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        """Returns what the vehicle did and why; "" if it flew at the planned speed throughout."""
+        done = [f"slowed for {self.slowed_s:.1f} s because frames were lost"] * (self.slowed_s > 0)
+        done += [f"held station for {self.held_s:.1f} s because vision was lost"] * (self.held_s > 0)
+        return f"The vehicle {' and '.join(done)}." if done else ""

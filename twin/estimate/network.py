@@ -85,6 +85,8 @@ class AlignmentHistory:
             measurement failed.
         nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
             failed), because the link could not be measured.
+        frame_sigmas_m: for each node after the first, the standard deviation (3-D) of the motion since the previous
+            node, accumulated over the frames [m].
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -92,6 +94,7 @@ class AlignmentHistory:
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
     link_residuals: list[float] = field(default_factory=list[float])
+    frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0
 
 

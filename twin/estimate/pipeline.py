@@ -218,6 +218,7 @@ class Navigator:
             link_residual=None if failed.all() else float(np.median(residuals[~failed])),
             link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
             epipolar=self.vision.epipolar_error(),
+            frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
         )
 
     @property
@@ -322,7 +323,7 @@ class Navigator:
         if found is not None:
             source = keyframes[found.reference_keyframe]
             accumulated = from_world @ (keyframe.accumulated_cov - source.accumulated_cov) @ from_world.T
-            since = clip_covariance(accumulated, step_cov, lower=1.0) if nodes else accumulated
+            since = clip_covariance(accumulated, np.ascontiguousarray(step_cov), 1.0, np.inf) if nodes else accumulated
             cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
             reduction = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
             if reduction is not None:
@@ -334,6 +335,8 @@ class Navigator:
         The motion since the last node then restarts at this node.
         """
         bridge = None
+        if self.network.nodes:
+            self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(self.since_node.cov[3:, 3:]))))
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
             bridge = Link(self.network.nodes[-1].number, node.number, self.since_node.motion, cov, 0.0, 0)

@@ -23,7 +23,7 @@ MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correcti
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
-MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a keyframe position / depth of the floor
+MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
 _SIGNIFICANT = 4.0  # standard deviations
 
 
@@ -103,6 +103,11 @@ def _consistency(result: SurveyResult) -> Iterator[Finding]:
     if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
         text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
         yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)
+    if quality.frame_sigma_m is not None and len(result.keyframe_depth_m):
+        share = quality.frame_sigma_m / float(np.median(result.keyframe_depth_m))
+        if share > MAX_SIGMA_DEPTHS:
+            text = f"the standard deviation of positions between keyframes reaches {quality.frame_sigma_m * 100:.1f} cm"
+            yield Finding("frame_sigma", share, MAX_SIGMA_DEPTHS, text)
     if len(result.node_cov) and len(result.keyframe_depth_m):
         sigma_m = float(np.sqrt(np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2).max()))
         share = sigma_m / float(np.median(result.keyframe_depth_m))

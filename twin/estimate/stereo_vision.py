@@ -29,7 +29,6 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe
-_SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
 
 
 class _MatchedPair(NamedTuple):
@@ -75,7 +74,7 @@ class StereoVision:
         self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()
         self._row_scale = rig.fx_px / rig.fy_px
         self._cell_m, self._folder = cell_m, folder
-        self._times_s: tuple[float, float] = (np.nan, np.nan)  # of the last two frames
+        self._last_s = np.nan  # time of the last frame
         self._plane_from_world: Array | None = None
         self.calibration = EpipolarCalibration()
         self._configure(binning=1)
@@ -116,12 +115,10 @@ class StereoVision:
         """Returns the image resampled to square pixels."""
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
-    def _interval_ratio(self, time_s: float) -> float:
-        """Returns the time since the last frame divided by the previous interval; 1 if they differ by rounding only."""
-        before, last = self._times_s
-        self._times_s = last, time_s
-        ratio = (time_s - last) / (last - before) if last > before else 1.0
-        return ratio if abs(ratio - 1) > _SAME_INTERVAL else 1.0
+    def _interval_s(self, time_s: float) -> float | None:
+        """Returns the time since the last frame [s]; None at the first frame."""
+        last, self._last_s = self._last_s, time_s
+        return time_s - last if time_s > last else None
 
     def _on_plane(self, world_from_camera: Array) -> Array:
         """Returns the pose (4, 4) in the axes of the mosaic, which are set at the first keyframe."""
@@ -146,7 +143,7 @@ class StereoVision:
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         with self.stopwatch("f2f"):
             self._set_image(self._square(frame.left))
-            return self.f2f.step(self._image, self._interval_ratio(frame.time_s))
+            return self.f2f.step(self._image, self._interval_s(frame.time_s))
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None

@@ -1,7 +1,7 @@
 """Brown-Conrady lens distortion, with the parameters of OpenCV (Brown 1971, Close-range camera calibration).
 
-A ray in front of the lens with direction (X, Y, Z) has the tangents x = X / Z, y = Y / Z. With r^2 = x^2 + y^2, its
-distorted image coordinates, in units of the focal length, are
+A ray in front of the lens with direction (X, Y, Z) has the normalised coordinates x = X / Z, y = Y / Z. With
+r^2 = x^2 + y^2, its distorted image coordinates, in units of the focal length, are
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
@@ -41,9 +41,9 @@ def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Dist
     return true_lens(lens)._replace(k1=lens.k1 - calibration.k1_error, k2=lens.k2 - calibration.k2_error)
 
 
-def distort(tangents: Array, lens: Distortion) -> Array:
-    """Returns the distorted image coordinates (..., 2) of rays with tangents (..., 2), by the Brown-Conrady model."""
-    x, y = tangents[..., 0], tangents[..., 1]
+def distort(normalised: Array, lens: Distortion) -> Array:
+    """Returns the distorted image coordinates (..., 2) of rays with normalised coordinates (..., 2)."""
+    x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     return np.stack(
@@ -56,19 +56,19 @@ def distort(tangents: Array, lens: Distortion) -> Array:
 
 
 def undistort(distorted: Array, lens: Distortion) -> Array:
-    """Returns the tangents (..., 2) of the rays imaged at distorted coordinates (..., 2); NaN if no such ray exists.
+    """Returns the normalised coordinates (..., 2) of rays from their distorted coordinates (..., 2); NaN without a ray.
 
     Inverse of `distort` by Newton's method.
     """
-    tangents = distorted
+    normalised = distorted
     for _ in range(STEPS):
-        residual = distort(tangents, lens) - distorted
+        residual = distort(normalised, lens) - distorted
         if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
             break
-        tangents = tangents - solve(_jacobian(tangents, lens), residual)
-    converged = np.abs(distort(tangents, lens) - distorted).max(axis=-1) < 1e3 * TOLERANCE
-    converged &= np.hypot(tangents[..., 0], tangents[..., 1]) < fold(lens)
-    return np.where(converged[..., None], tangents, np.nan)
+        normalised = normalised - solve(_jacobian(normalised, lens), residual)
+    converged = np.abs(distort(normalised, lens) - distorted).max(axis=-1) < 1e3 * TOLERANCE
+    converged &= np.hypot(normalised[..., 0], normalised[..., 1]) < fold(lens)
+    return np.where(converged[..., None], normalised, np.nan)
 
 
 def fold(lens: Distortion) -> float:
@@ -88,9 +88,9 @@ def solve(jacobian: Array, residual: Array) -> Array:
         return np.stack([x, y], axis=-1) / (a * d - b * c)[..., None]
 
 
-def _jacobian(tangents: Array, lens: Distortion) -> Array:
-    """Returns the Jacobian (..., 2, 2) of `distort` with respect to the tangents."""
-    x, y = tangents[..., 0], tangents[..., 1]
+def _jacobian(normalised: Array, lens: Distortion) -> Array:
+    """Returns the Jacobian (..., 2, 2) of `distort` with respect to the normalised coordinates."""
+    x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     bend = 2 * (lens.k1 + r2 * (2 * lens.k2 + 3 * r2 * lens.k3))

@@ -140,7 +140,10 @@ def _filter_rows(image, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect(near, positions, parallax, out, first, end):
-    """Fills rows `first` to `end` of `out` by fixed-point iteration (see `intersect`); `near` is 1 / depth."""
+    """Writes the intersections of rows `first` to `end` (exclusive) to `out`; `near` is the inverse depth.
+
+    See `intersect` for the fixed-point iteration.
+    """
     rows, cols = near.shape
     for v in range(first, end):
         for u in range(out.shape[1]):

@@ -178,7 +178,10 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light):
-    """Adds to `light` (3, W) the daylight on the floor, times `share` (W,), attenuated on the path to the camera."""
+    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
+
+    `share` (W,) is the daylight on the floor relative to its mean, see `_sample_caustics`.
+    """
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for c in range(3):
         incident, by_depth, by_range = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]

@@ -84,7 +84,7 @@ class MarineSnow:
         size = np.array([self._rig.width_px, self._rig.height_px])
         inside = np.all((pixel > -margin) & (pixel < size + margin), axis=1)
         points = points[inside]
-        return VisibleParticles(pixel[inside], points[:, 2], self._radiance(points, self._light_sources[camera]))
+        return VisibleParticles(pixel[inside], points[:, 2].copy(), self._radiance(points, self._light_sources[camera]))
 
     def draw(self, light: Radiance, depth: Depth, world_from_left: Array, camera: int, time_s: float) -> None:
         """Draws the particles in front of the floor into the radiance `light` (H, W, 3) of a camera, in place."""

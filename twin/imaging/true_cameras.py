@@ -213,8 +213,8 @@ def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
 def _believed_model(scenario: Scenario) -> CameraModel:
     """Returns the camera model for the rectification.
 
-    A port whose refraction was not calibrated (`port.calibrated_at_m` = 0) enters through its effect on the focal
-    length alone.
+    If the refraction of the port was not calibrated (`port.calibrated_at_m` = 0), the model contains only its effect
+    on the focal length.
     """
     rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
     lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)

@@ -10,7 +10,7 @@ from twin.judge.swaths import travel_direction
 
 
 def control_metrics(truth: Truth) -> dict[str, float | None]:
-    """Returns `control.*` of metrics.json.
+    """Returns `control.*` of metrics.json, without slowed_s and held_s, the durations of the mission's actions [s].
 
     The cross-track error is computed over the frames in which the vehicle travels, the altitude error over all frames,
     and the station-keeping error (3-D distance) over the frames in which the vehicle keeps station.

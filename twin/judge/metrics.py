@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from twin.core.quality import ActionTimes
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.judge.alignment import track_metrics
@@ -46,6 +47,7 @@ class EvaluationInput:
         require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
         warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
         idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
+        actions: how long the vehicle flew slowly and was stopped because its estimators lost track.
     """
 
     result: SurveyResult
@@ -58,6 +60,7 @@ class EvaluationInput:
     require: Mapping[str, float] = field(default_factory=dict)
     warnings: Sequence[str] = ()
     idealisations: Sequence[str] = ()
+    actions: ActionTimes = ActionTimes()
 
 
 def evaluate(survey: EvaluationInput) -> dict[str, Any]:
@@ -81,7 +84,7 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
         "vision": stereo_quality(result),
         "self_check": self_check_metrics(result),
         "stages": stage_metrics(result, truth),
-        "control": control_metrics(truth),
+        "control": control_metrics(truth) | survey.actions._asdict(),
         "overlap": overlap_metrics(result, truth, survey.rig, grid, dict(survey.plan)),
         "timing": _timing(survey.timing, len(result.online), len(result.keyframe_rows)),
     }

@@ -18,7 +18,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     standard deviation of this difference divided by the expected one, and of the largest autocorrelation of the left
     image away from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (a fraction of the focal length) are the
     estimated errors of the rectification. sigma_max_m is the largest 3-D standard deviation (square root of the trace
-    of the covariance) of a keyframe position [m].
+    of the covariance) of a keyframe position [m], and frame_sigma_m that of the frames just before the next keyframe
+    relative to the last one, 90th percentile [m].
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
@@ -41,4 +42,5 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
         "roll_deg": roll,
         "row_shift": None if epipolar is None else float(epipolar.estimate[3]),
         "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
+        "frame_sigma_m": quality.frame_sigma_m,
     }

@@ -49,7 +49,7 @@ def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
 
 
 def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns, as item "ga", a frame number and the duration [ms] of each global alignment; {} if there is none.
+    """Returns {"ga": (frame numbers, durations [ms])} of the global alignments; {} if there is none.
 
     An alignment is plotted at the frame of the last keyframe of its track.
     """

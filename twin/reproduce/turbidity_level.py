@@ -38,6 +38,6 @@ class TurbidityLevel(NamedTuple):
 
     @property
     def visibility_m(self) -> float | None:
-        """Returns the shortest range at which the contrast in green is below `MIN_VISIBLE_CONTRAST`, or None."""
+        """Returns the shortest range [m] with a green contrast below `MIN_VISIBLE_CONTRAST`; None if there is none."""
         invisible = np.flatnonzero(self.contrast[:, 1] < MIN_VISIBLE_CONTRAST)
         return float(self.ranges_m[invisible[0]]) if invisible.size else None

@@ -79,7 +79,8 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 
     Args:
         tree: keys and values of a scenario; not modified.
-        values: dotted keys and their new values; relative file paths refer to the folder of `source.path`.
+        values: dotted keys and their new values; relative file paths refer to the folder of `source.path`. An empty
+            path leaves its key as it is in `tree`, so that a table can set a file in some of its rows only.
         source: file that the new values come from, for error messages.
 
     Raises:
@@ -90,6 +91,8 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
         if new_key := _renamed(key):
             raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
         is_path = key in _PATH_KEYS and isinstance(value, str)
+        if is_path and not value:
+            continue
         try:
             _assign(changed, key, str(_expand(value, source.path.parent)) if is_path else value, key)
         except ScenarioError as error:

@@ -57,7 +57,7 @@ class Section(BaseModel):
 class TerrainConfig(Section):
     """Sea floor."""
 
-    kind: Literal["flat", "ripples", "fractal", "reef", "file"] = Field(
+    kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file"] = Field(
         default="reef", description="generator of the heights, or file for a measured DEM"
     )
     size_m: tuple[Metres, Metres] = Field(
@@ -134,6 +134,11 @@ class ImagingConfig(Section):
     )
     error_model: FilePath | None = Field(
         default=None, description="error model of the surrogate, written by `twin fit-surrogate`; default: built-in"
+    )
+    extrapolate: bool = Field(
+        default=False,
+        description="fly a surrogate survey that lies outside the range of the error model's fit, with a warning, "
+        "instead of refusing it; set by --extrapolate",
     )
     gray_level: float = Field(
         default=0.45, gt=0.01, lt=1, description="target of auto-exposure: mean image level, a fraction of full scale"

@@ -44,7 +44,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def value_errors(tree: dict[str, Any]) -> Iterator[TwinError]:
-    """Yields an error for each value nested too deeply, integer beyond 64 bits, and key that is too long."""
+    """Yields an error for each value that is nested too deeply, each integer beyond 64 bits and each key too long."""
     pending: list[tuple[str, int, Any]] = [("", 0, tree)]
     while pending:
         key, level, value = pending.pop()

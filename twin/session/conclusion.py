@@ -77,9 +77,11 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     for finding in findings:
         folder.log("finding", **finding._asdict())
     identity = _identity(mission, guard.reason, findings)
+    actions = monitor.actions.times
     survey = EvaluationInput(
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
-        [*world.warnings, *calibration_notes(result, mission.rig)], idealisations(scenario),
+        [*world.warnings, *calibration_notes(result, mission.rig), *filter(None, [actions.sentence])],
+        idealisations(scenario), actions,
     )  # fmt: skip
     metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
     monitor.report_stage("report", 0.0)

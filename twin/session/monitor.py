@@ -9,9 +9,11 @@ from typing import NamedTuple
 from twin.core.records import Estimate, Frame
 from twin.errors import SurveyAborted
 from twin.report.run_writer import RunFolder
+from twin.session.mission_actions import Action, MissionActions
 from twin.world.mission import Mission
 
-_MAX_BLIND_S = 2.0  # the survey is aborted if vision is lost for longer
+_MAX_BLIND_S = 6.0  # the survey is aborted if vision is lost for longer; the vehicle has then been stopped for a while
+_MAX_HELD_S = 60.0  # the survey is aborted if the vehicle is stopped for longer in total
 _MAX_SIGMA = 0.5  # largest ratio of position sigma to shorter side of the footprint; the survey is aborted beyond it
 
 
@@ -52,6 +54,7 @@ class SurveyMonitor:
 
             self.live = LiveViewer(mission.rig)
         self.n_blind, self.status = 0, "ok"
+        self.actions = MissionActions(mission, self._log_action)
         self.max_sigma_m = _MAX_SIGMA * min(mission.plan.footprint_m)
 
     def __call__(self, estimate: Estimate, frame: Frame) -> None:
@@ -67,15 +70,21 @@ class SurveyMonitor:
             self.status = estimate.status
         if self.live is not None:
             self.live.log_frame(frame, estimate)
-        share = (frame.index + 1) / self.n_frames
+        share = min((frame.index + 1) / self.n_frames, 1.0)  # a slowed survey has more frames than planned
         self.progress(SurveyProgress(estimate.time_s, self.wall_s, share, estimate.sigma_m, "survey"))
         if self.n_blind > _MAX_BLIND_S * self.rate_hz:
             raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
+        if self.actions.times.held_s > _MAX_HELD_S:
+            raise SurveyAborted(f"the vehicle was stopped for {_MAX_HELD_S:g} s in total because vision was lost")
         if estimate.sigma_m > self.max_sigma_m:
             raise SurveyAborted(
                 f"the standard deviation of the position reached {estimate.sigma_m:.2f} m at {estimate.time_s:.1f} s"
                 f" (at most {self.max_sigma_m:.2f} m allowed)"
             )
+
+    def _log_action(self, action: Action, estimate: Estimate) -> None:
+        """Logs an action of the mission with its time and the status of vision."""
+        self.folder.log("action", time_s=estimate.time_s, action=action, status=estimate.status)
 
     def report_stage(self, stage: str, share: float) -> None:
         """Reports the completed fraction of a stage that follows the flight, "map" or "report"."""

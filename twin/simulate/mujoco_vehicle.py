@@ -70,7 +70,7 @@ class MujocoVehicle:
         return self._data.xmat[self._body].reshape(3, 3)
 
     def _velocity_now(self) -> Array:
-        """Returns the velocity of the free joint (6,) at the time of the pose."""
+        """Returns the velocity of the free joint (6,), ordered as `qvel`, at the same time as the current pose."""
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
 
     def step(self, thruster_u: Array, duration_s: float) -> None:

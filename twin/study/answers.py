@@ -18,11 +18,11 @@ _MAX_BINS = 20
 
 
 class Answer(NamedTuple):
-    """Verdict on the pass probability in one range of a key, or at one of its listed values.
+    """Verdict on the pass probability for one range of values of a scenario key, or for one of its listed values.
 
     Args:
         verdict: "passes" if the lower confidence bound of the pass probability reaches the required value, "fails" if
-            the upper bound is below it, else "undecided". For ranges, the bounds allow for the number of ranges tried.
+            the upper bound is below it, else "undecided". The bounds of ranges are corrected for multiple comparisons.
         label: the range or the value as text, e.g. "1.6 to 1.9".
         low: smallest value in the range; NaN for text.
         high: largest value in the range; NaN for text.
@@ -59,7 +59,7 @@ class PassRecord(NamedTuple):
     fail_level: float = LEVEL
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
-        """Returns the answer for the chosen surveys (n,)."""
+        """Returns the verdict on the surveys that the mask `chosen` (n,) selects, with the range of their key."""
         passed, clusters = self.passed[chosen], self.clusters[chosen]
         n, k = effective_number(passed, clusters), float(passed.mean())
         verdict: Verdict = "undecided"

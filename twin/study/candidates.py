@@ -32,13 +32,17 @@ _PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna d
 
 
 class SurveyScore(NamedTuple):
-    """Part of a survey's result that the search uses: status, whether it passed, metrics to optimise or limit."""
+    """Part of a survey's result that the search uses: status, whether it passed, metrics to optimise or limit.
+
+    `reason` states why the survey was refused; it is empty for other surveys.
+    """
 
     status: str
     passed: bool
     metrics: dict[str, float | None]
     warning: str = ""
     scenario_hash: str = ""
+    reason: str = ""
 
 
 class Candidate(NamedTuple):
@@ -143,7 +147,9 @@ class CandidateSurveys:
     def add(self, row: Row) -> None:
         """Adds the result of a survey; it replaces an earlier result with the same sample and seed."""
         metrics = {name: row.get(name) for name in self.metrics}
-        score = SurveyScore(row["status"], has_passed(row), metrics, row.get("warning") or "", row["scenario_hash"])
+        reason = row["reason"] if row["status"] == "refused" else ""
+        warning, identity = row.get("warning") or "", row["scenario_hash"]
+        score = SurveyScore(row["status"], has_passed(row), metrics, warning, identity, reason)
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
@@ -198,6 +204,19 @@ class CandidateSurveys:
         """Returns the number of surveys of the given candidates with each warning, the most frequent first."""
         scores = (score for plan in plans for score in self.scores(plan.number, plan.values))
         return count_similar(score.warning for score in scores if score.warning)
+
+    def refusals(self, plans: Mapping[int, dict[str, Any]]) -> dict[str, int]:
+        """Returns the number of plans that were refused in every survey, by reason, the most frequent first.
+
+        Args:
+            plans: values of the searched keys, by number of the plan.
+        """
+        reasons = []
+        for number, values in plans.items():
+            scores = self.scores(number, values)
+            if scores and all(score.status == "refused" for score in scores):
+                reasons.append(scores[0].reason)
+        return count_similar(reasons)
 
     def evaluate(self, number: int, values: dict[str, Any], correction: PlanCorrection = NO_CORRECTION) -> Candidate:
         """Returns a candidate with its objectives and pass probability; surveys that failed are not counted.

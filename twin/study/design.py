@@ -41,7 +41,7 @@ def samples(study: Study) -> Iterator[Sample]:
 
 
 def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
-    """Returns the seeds of a sample: the same for all samples if `sampling.paired`, else different per design point."""
+    """Returns the seeds of a sample: the same for all samples if `sampling.paired`, else those of its design point."""
     plan = study.sampling
     first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]

@@ -13,7 +13,7 @@ from twin.study.worker import TaskLimits, WorkerPool
 
 
 class LocalEngine:
-    """Engine that runs tasks in worker processes on this machine, with one waiting thread per worker.
+    """Engine that runs tasks in worker processes on this machine, with a thread per worker that waits for results.
 
     Args:
         jobs: number of worker processes.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from twin.report.html import render_page
-from twin.study import wording
+from twin.study import agreement, agreement_report, wording
 from twin.study.analysis import StudyAnalysis
 from twin.study.figures import draw_all
 from twin.study.statistics import RESAMPLES
@@ -25,8 +25,12 @@ def write_report(study: Study, analysis: StudyAnalysis, page: Path) -> None:
 
 def context(study: Study, analysis: StudyAnalysis) -> dict[str, Any]:
     """Returns the variables of the page template `study.html.j2`."""
+    compared = agreement.agreement(analysis)
     return {
         "study": study,
+        "agreement": compared,
+        "agreement_report": agreement_report,
+        "agreement_figure": None if compared is None else agreement_report.figure_uri(analysis),
         "analysis": analysis,
         "wording": wording,
         "headline": wording.headline(study, analysis),

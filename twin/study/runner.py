@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from twin.errors import TwinError
+from twin.study.agreement_report import write_document
 from twin.study.analysis import StudyAnalysis
 from twin.study.design import samples, seeds_of_sample
 from twin.study.engine import Engine, Outcome
@@ -55,7 +56,7 @@ def run_study(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> StudyResult:
-    """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
+    """Flies the surveys for which the folder has no result, and writes results.parquet, study.html and agreement.md.
 
     Ctrl-C ends the study early; the results obtained until then are written.
 
@@ -98,6 +99,7 @@ def run_study(
         log.flush,
         lambda: write_parquet(analysis.rows, folder / "results.parquet"),
         lambda: write_report(study, analysis, page),
+        lambda: write_document(analysis, folder),
     )
     return StudyResult(analysis, page, write_errors, interrupted, throughput)
 

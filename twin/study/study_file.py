@@ -21,6 +21,7 @@ SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
 #: Largest number of surveys of a study; limited because all scenarios are validated before the first survey is flown.
 MAX_SURVEYS = 100_000
+FIDELITIES = {"rendered", "surrogate"}  #: values of imaging.fidelity in a study with `compare`
 DEFAULT_METRICS = (
     "trajectory.final.ate_rmse_m", "map.le90_area_m", "map.completeness_area", "map.le90_m", "map.completeness",
     "vision.points_median", "vision.contrast_median",
@@ -119,6 +120,11 @@ class Study(Section):
     retries: int = Field(default=2, ge=0, le=100, description="retries if the process of a survey was killed")
     show: tuple[str, ...] = Field(
         default=DEFAULT_METRICS, description="metrics shown in the report, in addition to those with a limit"
+    )
+    compare: tuple[str, ...] = Field(
+        default=(),
+        description="metrics whose values in rendered and surrogate surveys are compared; needs "
+        'vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }',
     )
     set: dict[str, Any] = Field(default={}, description="keys of the scenario that have a fixed value in this study")
     vary: dict[str, Distribution] = Field(default={}, description="distribution of each varied key of the scenario")
@@ -296,7 +302,7 @@ def _metric_errors(study: Study) -> Iterable[TwinError]:
             check_metric_names([name], known)
         except TwinError as error:
             yield error
-    named = [("show", name) for name in study.show]
+    named = [*(("show", name) for name in study.show), *(("compare", name) for name in study.compare)]
     if study.tune is not None:
         named += [("tune.objectives", name) for name in study.tune.objectives if name != "risk"]
         for key, distribution in study.tune.search.items():
@@ -308,6 +314,9 @@ def _metric_errors(study: Study) -> Iterable[TwinError]:
             check_metric_names([name], known)
         except TwinError as error:
             yield TwinError(study_key, f"{name}: {error.problem}", error.allowed)
+    fidelity = study.vary.get("imaging.fidelity")
+    if study.compare and (fidelity is None or fidelity.grid is None or set(fidelity.grid) != FIDELITIES):
+        yield TwinError("compare", "needs surveys of both fidelities", "vary.imaging.fidelity with a grid of both")
     if study.seek is not None:
         distribution = study.vary.get(study.seek)
         if distribution is None or not all(isinstance(value, int | float) for value in distribution.values):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from twin.study.agreement import agreement
 from twin.study.analysis import StudyAnalysis
 from twin.study.answers import Answer
 from twin.study.statistics import Interval
@@ -39,6 +40,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
         "probability": probability,
         "requirement_missed": analysis.requirement_missed,
         "seek": analysis.study.seek,
+        "agreement": _agreement(analysis),
         "answers": {key: [_answer(answer) for answer in answers] for key, answers in analysis.answers.items()},
         "metrics": metrics,
         "failure_reasons": [reason._asdict() for reason in analysis.failure_reasons],
@@ -46,6 +48,26 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
         "refused_samples": [refused._asdict() for refused in analysis.refused_samples],
         "warnings": analysis.warning_counts,
     }
+
+
+def _agreement(analysis: StudyAnalysis) -> dict[str, Any] | None:
+    """Returns the agreement of surrogate with rendered surveys as JSON values; None if the study compares none."""
+    result = agreement(analysis)
+    if result is None:
+        return None
+    metrics = {
+        m.metric: {
+            "pairs": m.pairs,
+            "rendered": _finite(m.rendered),
+            "surrogate": _finite(m.surrogate),
+            "ratio": _as_dict(m.ratio),
+            "p_value": _finite(m.p_value),
+            "agrees": m.agrees,
+        }
+        for m in result.metrics
+    }
+    verdicts = _as_dict(result.verdicts) | {"agrees": result.verdicts_agree}
+    return {"agrees": result.agrees, "pairs": result.pairs, "verdicts": verdicts, "metrics": metrics}
 
 
 def _answer(answer: Answer) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from twin.scenario.model import Scenario
@@ -34,6 +35,7 @@ class TuningResult(NamedTuple):
         interrupted: whether Ctrl-C ended the search.
         needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
         warnings: for each warning, the number of the finalists' surveys that have it.
+        refused: for each reason, the number of plans whose surveys were all refused in the search.
     """
 
     candidates: list[Candidate]
@@ -44,6 +46,7 @@ class TuningResult(NamedTuple):
     interrupted: bool
     needs_rendering: bool
     warnings: dict[str, int]
+    refused: Mapping[str, int] = MappingProxyType({})
 
     @property
     def recommended_verification(self) -> Verification | None:
@@ -178,6 +181,7 @@ class Tuning:
             interrupted,
             self.needs_rendering,
             self.confirmation.warnings(self.finalists.values()),
+            self.trials.refusals(self.plans),
         )
 
     def _search(self, search_round: int) -> None:

@@ -118,7 +118,7 @@ def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
 
 
 def warnings(result: TuningResult) -> list[str]:
-    """Returns the warnings of a search: unverified plan, large errors of the surrogate, warnings of the surveys."""
+    """Returns the warnings of a search: unverified plan, errors of the surrogate, refused plans, and the surveys'."""
     texts = []
     if result.recommended and result.needs_rendering and result.recommended_verification is None:
         texts.append(NOT_VERIFIED)
@@ -132,6 +132,10 @@ def warnings(result: TuningResult) -> list[str]:
                     f"{wording.metric_name(name)}: {surrogate} expected, {rendered} flown rendered."
                 )
         texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
+    texts += [
+        f"{n} of {len(result.candidates)} plans could not be flown in the search: {reason}"
+        for reason, n in result.refused.items()
+    ]
     return texts + [f"{text} (in {n} surveys of the finalists by the surrogate)" for text, n in result.warnings.items()]
 
 

@@ -19,6 +19,8 @@ _METRIC_NAMES = {
     "map.le90_area_m": "map height error over the asked area (LE90)",
     "map.completeness_area": "map completeness (asked area)",
     "map.rmse_m": "map height error (RMSE)",
+    "map.sigma_ratio": "sigma ratio of the map (RMS of error / sigma)",
+    "self_check.sigma_max_m": "largest standard deviation of a position",
     "map.nmad_m": "map height error (NMAD)",
     "timing.simulated_s": "survey duration",
     "vision.points_median": "matched points (median)",

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from twin.core.geometry import Array
+
 
 class SigmaLaw(NamedTuple):
     """Standard deviation as a function of the Cramer-Rao bound c [px]: sqrt(floor_px^2 + (slope c)^2).
@@ -45,6 +47,23 @@ class FractionLaw(NamedTuple):
         return float(self.maximum / (1 + (bound_px / self.half_px) ** self.exponent))
 
 
+class ViewsLaw(NamedTuple):
+    """Variance after n keyframes, relative to that of one keyframe: common + (1 - common) / (1 + gain (n - 1)).
+
+    Args:
+        common: fraction of the variance that all keyframes share.
+        gain: information that each further keyframe adds, relative to the first one. The first one gives a depth from
+            stereo; each further one gives a depth from stereo and one from the motion between the keyframes.
+    """
+
+    common: float
+    gain: float
+
+    def __call__(self, n_views: Array) -> Array:
+        """Returns the relative variance for numbers of keyframes (any shape)."""
+        return self.common + (1 - self.common) / (1 + self.gain * (n_views - 1))
+
+
 class ErrorModel(NamedTuple):
     """Parameters of the measurement errors.
 
@@ -62,6 +81,10 @@ class ErrorModel(NamedTuple):
             is multiplied by 1 + (lamp_error_growth * lamp_share)^2, where lamp_share is the fraction of the reflected
             light that comes from the lamps.
         match_fraction: fraction of a keyframe's points in the field of view of another keyframe that are matched there.
+        match_parallax_px: parallax of the relief within a patch, i.e. its unevenness times distance / depth, at which
+            half of the points that could be matched between two keyframes are matched. The fraction is
+            1 / (1 + (parallax / match_parallax_px)^2), because the patch then looks different from the two keyframes.
+            Not fitted: the parallaxes of the surveys of the fit are too small to determine it.
         match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
             correlated; see `matching.variance_inflation`.
         match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
@@ -84,12 +107,22 @@ class ErrorModel(NamedTuple):
         f2f_anticorrelation: fraction of the independent error of a frame-to-frame motion that the next motion cancels
             (a first-order moving average), because both motions are measured relative to the same points.
         mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
-            deviation of one flow vector if the registration were estimated from as many flow vectors as F2F.
+            deviation of one flow vector if the registration were estimated from as many flow vectors as F2F, times the
+            fraction of the field of view that the mosaic covers.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_sigma_px: reported standard deviation of a pixel's depth from the Kalman depth filter [px of disparity].
+        depth_sigma_px: reported standard deviation of a pixel's depth from the Kalman depth filter, if only one
+            keyframe observed the pixel [px of disparity].
+        depth_error_views: decrease of the true variance of a pixel's depth with the number of keyframes.
+        depth_sigma_views: the same for the reported variance.
         depth_error_ratio: ratio of the true to the reported standard deviation of a pixel's filtered depth.
         lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
-        map_completeness: fraction of the map cells in view for which the Kalman depth filter provides a depth.
+        map_completeness: fraction of the smooth map cells in view for which the Kalman depth filter provides a depth.
+        edge_error_gain: true standard deviation of the height error due to the roughness of a cell, per unresolved
+            roughness. The roughness is the RMS deviation of the floor from a plane within the window of dense matching;
+            see `map_model.EDGE_PX` for the unresolved part. The error is common to all views of the cell: at an edge,
+            the matching window shows two surfaces.
+        edge_sigma_gain: reported standard deviation of the height due to roughness, per unresolved roughness.
+        edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
 
     bound_range_px: tuple[float, float] = (0.0, 1.0)
@@ -98,6 +131,7 @@ class ErrorModel(NamedTuple):
     match_error_ratio: float = 1.05
     lamp_error_growth: float = 0.0
     match_fraction: FractionLaw = FractionLaw(0.97, 1.0, 4.0)
+    match_parallax_px: float = 3.0
     match_covariance_inflation: float = 1.5
     match_bias_fraction: float = 0.8
     distance_growth: float = 0.0
@@ -110,5 +144,10 @@ class ErrorModel(NamedTuple):
     mosaic_error_ratio: float = 2.0
     depth_sigma_px: SigmaLaw = SigmaLaw(0.05, 1.0)
     depth_error_ratio: float = 1.0
+    depth_error_views: ViewsLaw = ViewsLaw(0.3, 1.0)
+    depth_sigma_views: ViewsLaw = ViewsLaw(0.3, 1.0)
     lateral_sigma_px: float = 0.2
     map_completeness: FractionLaw = FractionLaw(0.999, 2.0, 4.0)
+    edge_error_gain: float = 0.3
+    edge_sigma_gain: float = 0.3
+    edge_half_px: float = 10.0

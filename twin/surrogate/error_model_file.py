@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from twin.core.paths import is_file
 from twin.errors import TwinError
 from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
-from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate.coverage import QUANTITIES, Departure, Range, departures
+from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw, ViewsLaw
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_RANGE_FACTOR = 1.5  # factor by which a Cramer-Rao bound may lie outside the fitted range without a warning
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
@@ -53,25 +53,22 @@ class FittedErrorModel:
         n_surveys: number of rendered surveys to which the model was fitted.
         misfit: root mean square over the surveys of ln(reported / modelled standard deviation), for each fitted
             parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
+        fitted_range: smallest and largest value in these surveys of further quantities, by name (a subset of
+            `coverage.QUANTITIES`); the Cramer-Rao bound's is `ErrorModel.bound_range_px`.
     """
 
     model: ErrorModel
     n_surveys: int
     misfit: Mapping[str, float]
+    fitted_range: Mapping[str, Range] = field(default_factory=dict)
 
-    def coverage_warning(self, smallest_px: float, largest_px: float) -> str:
-        """Returns a warning if the Cramer-Rao bounds of a survey lie outside the fitted range, else "".
+    def departures(self, conditions: Mapping[str, Range]) -> list[Departure]:
+        """Returns the quantities of a survey in which it lies outside the range of the fit.
 
         Args:
-            smallest_px, largest_px: smallest and largest Cramer-Rao bound of the survey.
+            conditions: smallest and largest value of each quantity in the survey (`coverage.survey_conditions`).
         """
-        fitted_smallest, fitted_largest = self.model.bound_range_px
-        if fitted_smallest / _RANGE_FACTOR <= smallest_px and largest_px <= fitted_largest * _RANGE_FACTOR:
-            return ""
-        return (
-            f"matching precision of {smallest_px:.3g} to {largest_px:.3g} px is outside the range of "
-            f"{fitted_smallest:.3g} to {fitted_largest:.3g} px that the error model was fitted to"
-        )
+        return departures(conditions, {"bound_px": self.model.bound_range_px, **self.fitted_range})
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
@@ -93,7 +90,7 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
             raise _invalid(path, str(error))
         _check_names(path, tree)
         model = ErrorModel(**{name: _value(name, tree["model"][name]) for name in ErrorModel._fields})
-        return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]))
+        return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]), _ranges(path, tree))
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise _invalid(path, repr(error)) from None
 
@@ -106,6 +103,7 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
         "",
         "[misfit]  # root mean square of ln(measured / model)",
         *(f"{name} = {value:.4g}" for name, value in fitted.misfit.items()),
+        *_range_lines(fitted.fitted_range),
         "",
         "[model]",
         *(f"{name} = {_text(value)}" for name, value in fitted.model._asdict().items()),
@@ -113,9 +111,26 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def _ranges(path: Path, tree: Mapping[str, Any]) -> dict[str, Range]:
+    """Returns the table [fitted_range] of a file; empty if there is none."""
+    ranges: dict[str, Range] = {}
+    for name, (low, high) in tree.get("fitted_range", {}).items():
+        if name not in QUANTITIES:
+            raise _invalid(path, f"fitted_range.{name}: unknown quantity")
+        ranges[name] = float(low), float(high)
+    return ranges
+
+
+def _range_lines(ranges: Mapping[str, Range]) -> list[str]:
+    """Returns the lines of the table [fitted_range]; none if it is empty."""
+    lines = [f"{name} = {_text(limits)}" for name, limits in ranges.items()]
+    return ["", "[fitted_range]  # smallest and largest value in the surveys of the fit", *lines] if lines else []
+
+
 def _check_names(path: Path, tree: Mapping[str, Any]) -> None:
     """Raises a TwinError that lists the renamed keys in a file, if there are any."""
-    renamed = [f"{name} was renamed to {_RENAMED[name]}" for name in dict.fromkeys(_keys(tree)) if name in _RENAMED]
+    former = {name: value for name, value in tree.items() if name != "fitted_range"}
+    renamed = [f"{name} was renamed to {_RENAMED[name]}" for name in dict.fromkeys(_keys(former)) if name in _RENAMED]
     if renamed:
         raise _invalid(path, ", ".join(renamed))
 
@@ -133,13 +148,13 @@ def _invalid(path: Path, problem: str) -> TwinError:
 def _value(name: str, given: Any) -> Any:
     """Converts a TOML value to the type of the parameter `name`."""
     kind = type(ErrorModel._field_defaults[name])
-    if kind in (SigmaLaw, FractionLaw):
+    if kind in (SigmaLaw, FractionLaw, ViewsLaw):
         return kind(**{key: float(given[key]) for key in kind._fields})
     return tuple(map(float, given)) if kind is tuple else float(given)
 
 
 def _text(value: Any) -> str:
     """Returns the value of a parameter in TOML syntax."""
-    if isinstance(value, SigmaLaw | FractionLaw):
+    if isinstance(value, SigmaLaw | FractionLaw | ViewsLaw):
         return "{ " + ", ".join(f"{key} = {number:.4g}" for key, number in value._asdict().items()) + " }"
     return str([float(f"{v:.4g}") for v in value]) if isinstance(value, tuple) else f"{value:.4g}"

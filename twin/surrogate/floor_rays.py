@@ -17,11 +17,11 @@ class FloorRayCaster:
     """Intersects camera rays with the triangulated height grid of a terrain (see `core.floor_rays`)."""
 
     def __init__(self, terrain: Terrain):
-        self._field = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+        self.field = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
 
     def depth_at(self, pixels: Array, world_from_camera: Array, rig: StereoRig) -> Array:
         """Returns the depth (n,) along the optical axis [m] at pixels (n, 2); inf where a ray misses the floor."""
-        return cast_pixels(self._field, world_from_camera[None], rig, pixels)[0]
+        return cast_pixels(self.field, world_from_camera[None], rig, pixels)[0]
 
     def depth(self, world_from_camera: Array, rig: StereoRig) -> Depth:
         """Returns the depth image (height_px, width_px) along the optical axis [m]; inf where rays miss the floor."""

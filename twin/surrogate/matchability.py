@@ -5,7 +5,8 @@ the gradient of the grey image along a row, and s the standard deviation of the 
 the measured shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao bound).
 
 Matching models the floor under a patch as a plane. Relief above or below that plane causes parallax and thus a matching
-error. The unevenness is the RMS of this parallax, in pixels per unit of baseline / depth.
+error. The unevenness is the RMS of this parallax in a typical patch, in pixels per unit of baseline / depth. Patches
+with an edge have a far larger parallax, but they are not matched or are rejected as outliers.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from twin.imaging.illumination import Illumination
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
+from twin.surrogate.snow_noise import snow_effect, snow_poses
 
 _DEPTHS = 6  # number of tabulated depths
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
@@ -44,6 +46,7 @@ class Matchability:
         bounds_px: (m,) Cramer-Rao bound c at these depths [px].
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
+        clear_share: (m,) fraction of the matches that marine snow leaves, at these depths.
     """
 
     def __init__(
@@ -58,13 +61,17 @@ class Matchability:
         if scenario.plan.height == "floor":
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
-        self.bounds_px = bounds_px(scenario, illumination, terrain, self.depths_m)
+        self.bounds_px, self.clear_share = precision(scenario, illumination, terrain, self.depths_m)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate)
         self.lamp_share = lamp_share(scenario, illumination, terrain)
 
     def bound_at(self, depth_m: float) -> float:
-        """Returns the Cramer-Rao bound at a depth [px]."""
+        """Returns the Cramer-Rao bound of a patch's position [px] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.bounds_px))
+
+    def clear_share_at(self, depth_m: float) -> float:
+        """Returns the fraction of the matches that marine snow leaves, at a depth."""
+        return float(np.interp(depth_m, self.depths_m, self.clear_share))
 
     def unevenness_at(self, depth_m: float) -> float:
         """Returns the unevenness at a depth [px per unit of baseline / depth]."""
@@ -73,11 +80,53 @@ class Matchability:
 
 def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array) -> Array:
     """Returns the Cramer-Rao bound (n,) [px] at depths (n,) [m]."""
-    scenario = _without_unmodelled_effects(scenario)
+    return precision(scenario, illumination, terrain, depths_m)[0]
+
+
+def precision(
+    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array
+) -> tuple[Array, Array]:
+    """Returns the Cramer-Rao bound [px] and the fraction of matches that marine snow leaves (n,) at depths (n,) [m]."""
+    clear = _without_unmodelled_effects(scenario)
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
-    formation = ImageFormation(scenario, illumination, terrain, rng)
+    formation = ImageFormation(clear, illumination, terrain, rng)
     texture, texel_m = _texture(scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
-    return np.array([_bound_px(scenario, rig, formation, _albedo(texture, texel_m, rig, z), z, rng) for z in depths_m])
+    albedos = [_albedo(texture, texel_m, rig, z) for z in depths_m]
+    if not scenario.snow.density_per_m3:
+        bounds = [_bound_px(clear, rig, formation, albedo, z, rng) for albedo, z in zip(albedos, depths_m, strict=True)]
+        return np.array(bounds), np.ones(len(depths_m))
+    with_snow = scenario.model_copy(update={"imaging": clear.imaging})
+    formations = formation, ImageFormation(with_snow, illumination, terrain, rng)
+    both = [_in_snow(scenario, rig, formations, albedo, z) for albedo, z in zip(albedos, depths_m, strict=True)]
+    return np.array([bound for bound, _ in both]), np.array([share for _, share in both])
+
+
+def _in_snow(
+    scenario: Scenario, rig: StereoRig, formations: tuple[ImageFormation, ImageFormation], albedo: Image, depth_m: float
+) -> tuple[float, float]:
+    """Returns the Cramer-Rao bound [px] and the fraction of matches that marine snow leaves, at one depth.
+
+    Args:
+        scenario: description of the survey.
+        rig: believed calibration.
+        formations: image formation without and with snow.
+        albedo: albedo image of the floor.
+        depth_m: depth of the floor.
+    """
+    depth, camera_pose = _level_floor(scenario, depth_m)
+    clean, snowy = (
+        [formation.radiance(albedo, depth, 0, pose) for pose in snow_poses(camera_pose)] for formation in formations
+    )
+    sensor, rng = sensor_of(scenario, rig), np.random.default_rng(0)
+    setting = sensor.meter(snowy[0])
+    first, second = (_gray(sensor.image(clean[0], setting, rng).astype(np.float32)) for _ in range(2))
+    clean_signals, snowy_signals = (
+        [_gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32)) for light in lights]
+        for lights in (clean, snowy)
+    )
+    noise = float((first - second).std()) / np.sqrt(2)
+    effect = snow_effect(clean_signals, snowy_signals, noise, scenario.estimate.patch_px)
+    return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 
 def lamp_share(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
@@ -114,7 +163,7 @@ def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose
 
 
 def _without_unmodelled_effects(scenario: Scenario) -> Scenario:
-    """Returns the scenario without the effects that the surrogate does not model: shadows and marine snow."""
+    """Returns the scenario without shadows, which the surrogate does not model, and without marine snow."""
     imaging = scenario.imaging.model_copy(update={"shadows": False})
     snow = scenario.snow.model_copy(update={"density_per_m3": 0.0})
     return scenario.model_copy(update={"imaging": imaging, "snow": snow})
@@ -126,10 +175,11 @@ def unevenness_px(
     depths_m: Array,
     locate: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], RMS over the planned area.
+    """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], the median over the planned area.
 
     It is the parallax relative to the best-fit plane, in pixels per unit of baseline / depth: f rms(z) / depth, with z
-    the height above that plane [m] and f the focal length [px].
+    the height above that plane [m] and f the focal length [px]. The median over the patches leaves out those with an
+    edge: they are not matched or are rejected as outliers.
 
     Args:
         scenario: description of the survey.
@@ -150,7 +200,8 @@ def unevenness_px(
     for depth_m in depths_m:
         points = centres + np.column_stack([x, y]) * (patch_px * depth_m / focal_px)
         height_m = terrain.height_at(points[..., 0], points[..., 1])
-        unevenness.append(focal_px * np.sqrt(np.nanmean((height_m @ residual_of) ** 2)) / depth_m)
+        mean_squares = np.nanmean((height_m @ residual_of) ** 2, axis=-1)
+        unevenness.append(focal_px * np.sqrt(np.nanmedian(mean_squares)) / depth_m)
     return np.array(unevenness)
 
 

@@ -43,11 +43,13 @@ class MosaicView(NamedTuple):
         numbers: (n,) numbers of the keyframes, ascending.
         estimated: (n, 4, 4) estimated poses at which the keyframes were added to the mosaic.
         fractions: (n,) fraction of the mosaic in view that comes from each keyframe; sums to 1.
+        coverage: fraction of the field of view that the mosaic covers.
     """
 
     numbers: list[int]
     estimated: Array
     fractions: Array
+    coverage: float
 
 
 class MosaicModel:
@@ -69,11 +71,12 @@ class MosaicModel:
             self._first_keyframe.setdefault(cell, number)
 
     def view(self, cells: Cells) -> MosaicView | None:
-        """Returns the keyframes that the mosaic shows in these cells; None if the mosaic covers too few of them."""
+        """Returns the keyframes whose images fill these cells; None if the mosaic covers too few of the cells."""
         counts = Counter(map(self._first_keyframe.get, cells.tolist()))
         counts.pop(None, None)
         if counts.total() < _MIN_COVERAGE * len(cells):
             return None
         numbers = sorted(number for number in counts if number is not None)
         fractions = np.array([counts[number] for number in numbers]) / counts.total()
-        return MosaicView(numbers, np.array([self._estimated[number] for number in numbers]), fractions)
+        estimated = np.array([self._estimated[number] for number in numbers])
+        return MosaicView(numbers, estimated, fractions, counts.total() / len(cells))

@@ -8,8 +8,11 @@ from numba import njit
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
+from twin.estimate.vision.two_view_motion import CUTOFF, HUBER
+from twin.surrogate.measured_view import measure_point
 
 MIN_POINTS = 6  # smallest number of points from which a motion is estimated
+_MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are not measured where they are
 
 
 @njit(cache=True, nogil=True)
@@ -25,13 +28,16 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     for i in range(6):
         for k in range(6):
             error[i] += errors.root[i, k] * (normals[k] - errors.anticorrelation * previous_normals[k])
-    return geometry.compose(geometry.compose(geometry.inverse(previous_pose), pose), geometry.exp(error))
+    motion = geometry.compose(geometry.inverse(previous_pose), pose)
+    if errors.gain.size:
+        motion = geometry.exp(errors.gain @ geometry.log(motion))
+    return geometry.compose(motion, geometry.exp(error))
 
 
 @njit(cache=True, nogil=True)
 def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
-    bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation,
+    bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation, noise_share,
 ):  # fmt: skip
     """Samples the motion between two keyframes: estimates it from points with sampled noise.
 
@@ -45,7 +51,8 @@ def sample_link(
         relief_noise: (f, f, 2) standard normal numbers of the errors due to relief; they repeat every f floor cells.
         normals: (n + 1, 3) standard normal numbers of this link alone: n for its points, one for their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
-        camera: focal length, principal point x and y, image width and height, border [px]; baseline [m].
+        camera: focal length, principal point x and y, image width and height, border [px]; baseline [m]; table of the
+            measured positions of true points (`measured_view.ViewTable`).
         cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
         error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
         bias_fraction: `match_bias_fraction` of the `ErrorModel`.
@@ -54,12 +61,13 @@ def sample_link(
         distance_growth: growth of the reported variance with distance / depth.
         common_sigma: reported standard deviation of the common bias.
         inflation: factor on the reported covariance, because matches are correlated.
+        noise_share: variance of the noise of a point, divided by that of a single match that it represents.
 
     Returns:
         Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6).
         Motion and covariance are valid only if at least `MIN_POINTS` points are seen.
     """
-    focal, cx, cy, width, height, margin, baseline = camera
+    focal, cx, cy, width, height, margin, baseline, table = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
     transferred, _, _ = observation_equations.transfer(points, earlier_from_later, baseline)
     inverse_depth = np.mean(points[:, 2]) / baseline
@@ -68,13 +76,15 @@ def sample_link(
     n, independent, growth = 0, np.sqrt(1 - bias_fraction * bias_fraction), distance_growth**2 * np.sum(distance**2)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
-        u, v = transferred[k, 0] * focal + cx, transferred[k, 1] * focal + cy
-        if margin <= u < width - margin and margin <= v < height - margin and u - focal * transferred[k, 2] >= margin:
+        seen = measure_point(table, transferred[k, 0], transferred[k, 1], transferred[k, 2])
+        later = measure_point(table, points[k, 0], points[k, 1], points[k, 2])
+        u, v = seen[0] * focal + cx, seen[1] * focal + cy
+        if margin <= u < width - margin and margin <= v < height - margin and u - focal * seen[2] >= margin:
             pair_bias = earlier_noise[int(v / height * earlier_noise.shape[0]), int(u / width * earlier_noise.shape[1])]
             row, col = _floor_cell(later_pose, points[k], baseline, cell_m, len(relief_noise))
             cross, along = relief_sigma * relief_noise[row, col, 0], relief_sigma * relief_noise[row, col, 1]
             for r in range(3):
-                a[n, r], b[n, r] = transferred[k, r] + bias[r], points[k, r]
+                a[n, r], b[n, r] = seen[r] + bias[r], later[r]
                 for c in range(r + 1):
                     a[n, r] += error_root[r, c] * (bias_fraction * pair_bias[c] + independent * normals[k, c])
                     b[n, r] += error_root[r, c] * later_noise[k, c]
@@ -87,13 +97,36 @@ def sample_link(
         geometry.copy_into(later_covs[k], cov)
         geometry.copy_into(earlier_covs[k], earlier_cov)
     measured = observation_equations.PairMeasurements(a, b, earlier_covs, later_covs)
+    weight = np.ones(n)
     observations = observation_equations.linearise(measured, b, earlier_from_later, baseline)
-    normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, np.ones(n))
+    normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, weight)
     if n < MIN_POINTS:
         return n, earlier_from_later, normal
     inverse = np.linalg.inv(normal)
+    motion = earlier_from_later @ geometry.exp(inverse @ right)
+    for _ in range(_MORE_ITERATIONS if table.values.size else 0):
+        observations = observation_equations.linearise(measured, b, motion, baseline)
+        weight = _robust_weights(observations.normalised_residual, noise_share)
+        normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, weight)
+        if np.count_nonzero(weight) < MIN_POINTS:
+            break
+        inverse = np.linalg.inv(normal)
+        motion = motion @ geometry.exp(inverse @ right)
     common = inverse @ bias_jacobian * common_sigma
-    return n, earlier_from_later @ geometry.exp(inverse @ right), inverse * inflation + common @ common.T
+    return n, motion, inverse * inflation + common @ common.T
+
+
+@njit(cache=True, nogil=True)
+def _robust_weights(normalised_residual, noise_share):
+    """Returns the Huber weights (n,) that single matches would have, as in `two_view_motion.pair_motion`.
+
+    Args:
+        normalised_residual: (n,) residuals relative to the covariance of the points.
+        noise_share: see `sample_link`.
+    """
+    size = np.sqrt(1 + noise_share * normalised_residual**2)
+    scale = np.median(size)
+    return np.minimum(1.0, HUBER * scale / size) * (size < CUTOFF * scale)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -125,19 +158,35 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
 
 
 @njit(cache=True, nogil=True)
-def mosaic_correction(estimated, true, fractions, true_pose, predicted_pose):
+def measured_motion(points, earlier_pose, later_pose, camera, cov):
+    """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`.
+
+    It is the true motion if all points are measured where they are, or if too few of them are in both views.
+    """
+    if not camera[-1].values.size:
+        return geometry.inverse(earlier_pose) @ later_pose
+    noise, cells, normals = np.zeros(points.shape), np.zeros((1, 1, 3)), np.zeros((len(points) + 1, 3))
+    return sample_link(
+        points, noise, cells, np.zeros((1, 1, 2)), normals, earlier_pose, later_pose, camera, cov, np.zeros((3, 3)),
+        0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0,
+    )[1]  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def mosaic_correction(estimated, measured_motions, fractions, predicted_pose):
     """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
 
     Each keyframe in the mosaic is displaced by the error of the pose at which it was added. The correction is the mean
     over the keyframes in view, weighted by `fractions`.
 
     Args:
-        estimated, true: (n, 4, 4) estimated and true poses of the keyframes in view.
+        estimated: (n, 4, 4) estimated poses of the keyframes in view.
+        measured_motions: (n, 4, 4) pose of the frame to register relative to each keyframe, without matching errors.
         fractions: (n,) fraction of the mosaic in view that comes from each keyframe.
-        true_pose, predicted_pose: (4, 4) true and predicted pose of the frame to register.
+        predicted_pose: (4, 4) predicted pose of the frame to register.
     """
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)
     for k in range(len(fractions)):
-        in_mosaic = estimated[k] @ geometry.inverse(true[k]) @ true_pose
+        in_mosaic = estimated[k] @ measured_motions[k]
         correction += fractions[k] * geometry.log(predicted_from_world @ in_mosaic)
     return correction

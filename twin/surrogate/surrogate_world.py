@@ -10,17 +10,20 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.timing import StageTimer
+from twin.errors import ScenarioError, TwinError
 from twin.estimate.pipeline import Navigator
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.surrogate.compiled_loop import compiled_loop
+from twin.surrogate.coverage import Departure, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
+from twin.surrogate.measured_view import measured_view
 from twin.surrogate.vision import SurrogateVision, TrueScene
 from twin.world.coverage import true_heights
 from twin.world.mission import Mission, Step
@@ -40,6 +43,9 @@ class SurrogateWorld(World):
 
     Attributes:
         vision: source of the sampled visual measurements.
+
+    Raises:
+        ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set.
     """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, fitted: FittedErrorModel):
@@ -58,8 +64,7 @@ class SurrogateWorld(World):
         # `vision` must not hold a reference to `self`: the reference cycle would keep the survey in memory
         true_pose = partial(left_camera, vehicle, rig)
         self.vision = surrogate_vision(mission, fitted.model, true_pose, stopwatch)
-        warning = fitted.coverage_warning(*self.vision.bounds_px)
-        self.warnings = (f"The surrogate extrapolates: {warning}.",) if warning else ()
+        self.warnings = _extrapolations(mission, fitted, self.vision.scene.matchability)
 
     def close(self) -> None:
         """Does nothing, as there are no resources to release."""
@@ -81,6 +86,27 @@ class SurrogateWorld(World):
         return self.vision.scene.map_model.seen
 
 
+def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
+    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`."""
+    found = fitted.departures(survey_conditions(mission, matchability))
+    if not found:
+        return ()
+    if not mission.scenario.imaging.extrapolate:
+        source = mission.scenario.source
+        raise ScenarioError([source.describe(_refusal(departure)) for departure in found])
+    texts = [f"{one.value_text} ({one.allowed_text})" for one in found]
+    return (f"The surrogate extrapolates outside the range of its error model: {'; '.join(texts)}.",)
+
+
+def _refusal(departure: Departure) -> TwinError:
+    """Returns the error of a survey outside the range of the fit."""
+    return TwinError(
+        "imaging.fidelity",
+        f"the error model of the surrogate does not hold for a {departure.value_text}",
+        f'{departure.allowed_text}, or imaging.fidelity = "rendered", or --extrapolate',
+    )
+
+
 def surrogate_vision(
     mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer
 ) -> SurrogateVision:
@@ -93,8 +119,11 @@ def surrogate_vision(
         stopwatch: timer of the stages.
     """
     scenario, terrain = mission.scenario, mission.terrain
-    map_model = MapModel(mission.grid, true_heights(mission.grid, terrain.height_at), mission.rig)
     matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)
-    scene = TrueScene(true_pose, FloorRayCaster(terrain), matchability, map_model)
+    view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
+    floor, heights = FloorRayCaster(terrain), true_heights(mission.grid, terrain.height_at)
+    depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))
+    map_model = MapModel(mission.grid, heights, mission.rig, floor.field, depth_m, view.table)
+    scene = TrueScene(true_pose, floor, matchability, map_model, view)
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(mission.rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

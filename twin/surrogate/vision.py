@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.braking import braking_factor
 from twin.core.geometry import Array
+from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings
 from twin.core.timing import StageTimer
@@ -35,12 +37,16 @@ from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import CellErrors, MapModel
 from twin.surrogate.matchability import Matchability
+from twin.surrogate.measured_rows import MeasuredRows
+from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
+#: Largest growth of the squared median residual of a link by relief: matches that relief shifts by more are outliers.
+_RESIDUAL_GROWTH = 2.0
 
 
 class _KeyframeTruth(NamedTuple):
@@ -48,7 +54,7 @@ class _KeyframeTruth(NamedTuple):
 
     Args:
         pose: (4, 4) true pose.
-        points: (n, 3) raster points that show the floor in both images, normalised (x, y, disparity).
+        points: (n, 3) raster points that show the floor in both images: true normalised (x, y, disparity).
         raster_indices: (n,) index of each point in the raster.
         noise: (rows, cols, 3) standard normal numbers of the stereo errors of the raster points.
         bound_px: Cramer-Rao bound of a patch's position [px].
@@ -57,6 +63,9 @@ class _KeyframeTruth(NamedTuple):
         unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
         unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
         cells: (n,) floor cells of the points.
+        measured: (n, 3) positions at which the points are measured without noise; see `measured_view`.
+        clear_share: fraction of the matches that marine snow leaves.
+        noise_ratio: ratio of the scatter of the row differences to that expected from noise (`measured_rows`).
     """
 
     pose: Array
@@ -69,6 +78,9 @@ class _KeyframeTruth(NamedTuple):
     unit_cov: Array
     unit_root: Array
     cells: Cells
+    measured: Array
+    clear_share: float
+    noise_ratio: float
 
 
 class FrameErrors(NamedTuple):
@@ -78,11 +90,13 @@ class FrameErrors(NamedTuple):
         root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
         cov: (6, 6) reported covariance of a motion.
         anticorrelation: fraction of the independent error of a motion that the next motion cancels.
+        gain: (6, 6) matrix from the true motion to the measured one, which calibration errors cause; empty without any.
     """
 
     root: Array
     cov: Array
     anticorrelation: float
+    gain: Array
 
 
 class TrueScene(NamedTuple):
@@ -93,12 +107,14 @@ class TrueScene(NamedTuple):
         floor: ray caster against the true floor.
         matchability: Cramer-Rao bound and unevenness of the floor.
         map_model: true heights on the grid of the map.
+        view: positions at which the estimators measure true points.
     """
 
     left_camera: Callable[[], Array]
     floor: FloorRayCaster
     matchability: Matchability
     map_model: MapModel
+    view: MeasuredView = IDEAL_VIEW
 
 
 class SurrogateVision:
@@ -132,10 +148,14 @@ class SurrogateVision:
         self.scene, self._rng = scene, rng
         margin_px = float(stereo.margin_px(settings.patch_px))
         self._camera = (
-            rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m
+            rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m,
+            scene.view.table,
         )  # fmt: skip
-        self._pixels = _raster(rig)
-        self._rays = rig.normalised(self._pixels)
+        self._pixels = _raster(rig, margin_px)
+        middle = rig.baseline_m / float(np.median(scene.matchability.depths_m))
+        self._rays = scene.view.true_directions(rig.normalised(self._pixels), middle)  # true ones
+        self._true_pixels = self._rays * rig.focal_px + [rig.cx_px, rig.cy_px]
+        self._rows = None if scene.view.is_ideal else MeasuredRows(scene.view, rig, settings.patch_px, rng)
         self.last_pose: Array | None = None
         self.last_normals = np.zeros(6)
         self._poses: dict[int, Array] = {}  # true poses of all keyframes
@@ -143,7 +163,7 @@ class SurrogateVision:
         self._latest: _KeyframeTruth | None = None
         self.stereo_observations: list[StereoObservation] = []
         self._f2f: FrameErrors | None = None
-        self._last_motion = np.eye(4)
+        self._last_motion, self._blind_s = np.eye(4), 0.0  # blind: time without points to track
         self._mosaic = MosaicModel()
         self._link_key, self._link_lock = int(rng.integers(2**63)), Lock()
         self._link_rng = np.random.Generator(np.random.Philox(0))
@@ -178,6 +198,11 @@ class SurrogateVision:
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
+    def parallax_px(self, earlier_pose: Array) -> float:
+        """Returns the parallax of the relief in a patch between the last keyframe and an earlier pose (4, 4) [px]."""
+        assert self._latest is not None
+        return _parallax_px(self._latest, earlier_pose, self.rig.baseline_m)
+
     def distance_in_depths(self, a_from_b: Array) -> float:
         """Returns the length of a motion's translation in units of depth: times the last keyframe's mean inverse depth.
 
@@ -193,7 +218,12 @@ class SurrogateVision:
         if previous is None:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         if self._f2f is None:
+            interval_s = 1 / self.rig.frame_rate_hz
+            factor, self._blind_s = braking_factor(self._blind_s, interval_s), self._blind_s + interval_s
+            if factor < 1:
+                self._last_motion = geometry.exp(factor * geometry.log(self._last_motion))
             return constant_velocity_motion(self._last_motion)
+        self._blind_s = 0.0
         normals = self.draw_normals(1)[0]
         self._last_motion = sampling.sample_f2f_motion(self._f2f, previous, pose, normals, self.last_normals)
         self.last_normals = normals
@@ -209,7 +239,7 @@ class SurrogateVision:
         with self.stopwatch("stereo"):
             pose, model, scene = self.scene.left_camera(), self.model, self.scene
             scene.map_model.mark_seen(pose)
-            depth_m = scene.floor.depth_at(self._pixels, pose, self.rig)
+            depth_m = scene.floor.depth_at(self._true_pixels, pose, self.rig)
             hits = np.flatnonzero(depth_m < np.inf)
             if len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, 0, None))
@@ -217,24 +247,45 @@ class SurrogateVision:
             mean_m = float(depth_m[hits].mean())
             bound_px = scene.matchability.bound_at(mean_m)
             n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.settings.points
-            self.stereo_observations.append(StereoObservation(row, int(n_points), None))
+            clear_share = scene.matchability.clear_share_at(mean_m)
+            n_points *= self._matchable(hits, depth_m) * clear_share
             hits = hits[self._in_both_images(hits, depth_m)]
             if n_points < _MIN_POINTS or len(hits) < sampling.MIN_POINTS:
+                self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
-            depth_m = depth_m[hits]
-            points = np.column_stack([self._rays[hits], self.rig.baseline_m / depth_m])
+            points = self._true_points(hits, depth_m)
+            true_measured = scene.view.measure(points)
             n = len(points)
             sigma_px = model.match_sigma_px(bound_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
-            unit = sampling.unit_motion_cov(points, self.rig.baseline_m, float(F2F_POINTS))
+            unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, float(F2F_POINTS))
             cells = floor_cells(pose, points, self.rig.baseline_m)
             unevenness_px = scene.matchability.unevenness_at(mean_m)
-            self._latest = _KeyframeTruth(pose, points, hits, noise, bound_px, unevenness_px, n_points, *unit, cells)
-            measured = points + noise.reshape(-1, 3)[hits] @ (self._unit_root.T * sigma_px * model.match_error_ratio)
+            observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
+            if self._rows is not None:
+                observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px))
+            self.stereo_observations.append(observation)
+            self._latest = _KeyframeTruth(
+                pose, points, hits, noise, bound_px, unevenness_px, n_points, *unit, cells, true_measured, clear_share,
+                noise_ratio,
+            )  # fmt: skip
+            error_root = self._unit_root.T * sigma_px * model.match_error_ratio
+            measured = true_measured + noise.reshape(-1, 3)[hits] @ error_root
+            sigma_px *= noise_ratio
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * sigma_px**2, (n, 3, 3))
             pixels, around_px = self._pixels[hits].astype(np.float32), self.rig.focal_px * measured[:, 2]
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
+
+    def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
+        """Returns the true (x, y, disparity) (n, 3) of raster points, given the depth of every raster point [m]."""
+        return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
+
+    def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
+        """Returns the fraction of the raster points in the left image that satisfy the epipolar constraint."""
+        if self._rows is None:
+            return 1.0
+        return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the raster points whose patches lie inside both images, with a margin.
@@ -243,18 +294,21 @@ class SurrogateVision:
             indices: (n,) indices of the points in the raster.
             depth_m: depth of every point of the raster [m].
         """
-        shift_px = self.rig.focal_px * self.rig.baseline_m / depth_m[indices]
-        left_px, right_px = self._pixels[indices], self._pixels[indices]
-        right_px[:, 0] -= shift_px
+        points = self._true_points(indices, depth_m)
+        measured = self.scene.view.measure(points)
+        left_px = measured[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
+        right_px = left_px - np.column_stack([self.rig.focal_px * measured[:, 2], np.zeros(len(measured))])
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
-        return in_left & in_right
+        matched = True if self._rows is None else self._rows.are_matched(points)
+        return in_left & in_right & matched
 
     def restart_tracking(self) -> None:
         assert self._latest is not None
         model = self.model
         root, cov = self._motion_errors(model.f2f_sigma_px(self._latest.bound_px))
         independent = model.f2f_error_ratio / np.sqrt(1 + model.f2f_anticorrelation**2)
-        self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation)
+        gain = self.scene.view.motion_gain(self._latest.points, self.rig.baseline_m)
+        self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
         self.last_normals = np.zeros(6)
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
@@ -272,9 +326,14 @@ class SurrogateVision:
         view = self._mosaic.view(self._latest.cells)
         if view is None:
             return None
-        true = np.array([self._poses[number] for number in view.numbers])
-        mean = sampling.mosaic_correction(view.estimated, true, view.fractions, self._latest.pose, world_from_camera)
-        root, cov = self._motion_errors(self.model.mosaic_sigma_px(self._latest.bound_px))
+        points, pose = self._latest.points, self._latest.pose
+        cov = self._unit_cov * self.model.match_sigma_px(self._latest.bound_px) ** 2
+        measured = np.array([
+            sampling.measured_motion(points, self._poses[number], pose, self._camera, cov)
+            for number in view.numbers
+        ])  # fmt: skip
+        mean = sampling.mosaic_correction(view.estimated, measured, view.fractions, world_from_camera)
+        root, cov = self._motion_errors(self.model.mosaic_sigma_px(self._latest.bound_px) / np.sqrt(view.coverage))
         error = root @ self.draw_normals(1)[0] * self.model.mosaic_error_ratio
         correction = Motion(geometry.exp(mean + error), cov, len(self._latest.points), 1.0)
         return Registration(correction, view.numbers[int(np.searchsorted(np.cumsum(view.fractions), 0.5))])
@@ -293,8 +352,8 @@ class SurrogateVision:
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
         return self.sample_links(node, others, self.model)
 
-    def epipolar_error(self) -> None:
-        return None
+    def epipolar_error(self) -> EpipolarError | None:
+        return None if self._rows is None else self._rows.report()
 
     def discard(self, numbers: range) -> None:
         for number in numbers:
@@ -328,26 +387,40 @@ class SurrogateVision:
         """
         bound_px = max(later.bound_px, earlier.bound_px)
         n = len(later.points)
-        noise_scale = np.sqrt(n / (later.n_points * model.match_fraction(bound_px)))
+        match_fraction = self._match_fraction(later, earlier, model)
+        noise_scale = np.sqrt(n / (later.n_points * match_fraction))
         sigma_px = model.match_sigma_px(bound_px) * noise_scale
         error_ratio = model.match_error_ratio * np.hypot(1, model.lamp_error_growth * self.lamp_share)
         normals = self._link_normals(number, other, n + 1)
         in_view, motion, cov = sampling.sample_link(
             later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise, normals,
-            earlier.pose, later.pose, self._camera, self._unit_cov * sigma_px**2,
+            earlier.pose, later.pose, self._camera, self._unit_cov * (sigma_px * later.noise_ratio) ** 2,
             self._unit_root * (sigma_px * error_ratio), model.match_bias_fraction,
             model.relief_gain * later.unevenness_px / self.rig.focal_px * noise_scale,
             model.common_bias_px / self.rig.focal_px, model.distance_growth,
-            COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation,
+            COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation, noise_scale**2,
         )  # fmt: skip
-        n_matched = int(in_view / n * later.n_points * model.match_fraction(bound_px))
-        if (
-            in_view < sampling.MIN_POINTS
-            or n_matched < _MIN_POINTS
-            or model.match_fraction(bound_px) < MIN_INLIER_SHARE
-        ):
+        n_matched = int(in_view / n * later.n_points * match_fraction)
+        if in_view < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
             return None
-        return Motion(motion, cov, n_matched, 1.0)
+        growth = self._relief_growth(later, earlier, model)
+        residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
+        return Motion(motion, cov * growth, n_matched, float(residual))
+
+    def _relief_growth(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
+        """Returns the factor on the reported covariance of a link by which the residuals grow due to relief.
+
+        It is the variance of a match with relief, divided by that without: two image positions without relief.
+        """
+        bound_px = max(later.bound_px, earlier.bound_px)
+        relief_px = model.relief_gain * _parallax_px(later, earlier.pose, self.rig.baseline_m)
+        return 1 + relief_px**2 / (2 * model.match_sigma_px(bound_px) ** 2)
+
+    def _match_fraction(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
+        """Returns the fraction of the points of a keyframe in view of an earlier one that are matched there."""
+        parallax = _parallax_px(later, earlier.pose, self.rig.baseline_m) / model.match_parallax_px
+        clear_share = min(later.clear_share, earlier.clear_share)
+        return clear_share * model.match_fraction(max(later.bound_px, earlier.bound_px)) / (1 + parallax**2)
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns the standard normal numbers (n, 3) of a link, which depend only on its two keyframe numbers."""
@@ -361,14 +434,16 @@ class SurrogateVision:
     ) -> ElevationMap:
         model, mapper, shape = self.model, elevation.ElevationMapper(grid), (grid.rows, grid.cols)
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
+        edge_noise = self._rng.standard_normal(shape, np.float32)
         estimated = result.final.world_from_camera[result.keyframe_rows]
         true = [self._poses[k] for k in range(len(estimated))]
         depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
         sigma_px = np.array([model.depth_sigma_px(b) for b in bounds_px])
         completeness = np.array([model.map_completeness(b) for b in bounds_px])
         errors = CellErrors(
-            lateral_noise, dropout, model.lateral_sigma_px, depths_m, sigma_px * model.depth_error_ratio, sigma_px,
-            completeness,
+            lateral_noise, edge_noise, dropout, model.lateral_sigma_px, depths_m, sigma_px * model.depth_error_ratio,
+            sigma_px, completeness, model.depth_error_views, model.depth_sigma_views, model.edge_error_gain,
+            model.edge_sigma_gain, model.edge_half_px,
         )  # fmt: skip
         for k, (pose, next_pose) in enumerate(zip(true, [*true[1:], None], strict=True)):
             node_cov, map_model = result.node_cov[k], self.scene.map_model
@@ -387,8 +462,22 @@ class SurrogateVision:
         return self._normals[self._n_used - n : self._n_used]
 
 
-def _raster(rig: StereoRig) -> Array:
-    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the image."""
-    rows, cols = ((np.arange(n) + 0.5) / n for n in _RASTER)
-    v, u = (a.ravel() for a in np.meshgrid(rows * rig.height_px, cols * rig.width_px, indexing="ij"))
+def _parallax_px(keyframe: _KeyframeTruth, earlier_pose: Array, baseline_m: float) -> float:
+    """Returns the RMS parallax of the relief within a patch between a keyframe and an earlier pose (4, 4) [px]."""
+    distance_m = float(np.linalg.norm(keyframe.pose[:3, 3] - earlier_pose[:3, 3]))
+    return keyframe.unevenness_px * distance_m * float(np.mean(keyframe.points[:, 2])) / baseline_m
+
+
+def _raster(rig: StereoRig, margin_px: float) -> Array:
+    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the part of the image with matches.
+
+    Args:
+        rig: calibration, for the image size.
+        margin_px: smallest distance of a matched patch from the image border.
+    """
+    sides = (rig.height_px, rig.width_px)
+    rows, cols = (
+        margin_px + (np.arange(n) + 0.5) / n * (side - 2 * margin_px) for n, side in zip(_RASTER, sides, strict=True)
+    )
+    v, u = (a.ravel() for a in np.meshgrid(rows, cols, indexing="ij"))
     return np.column_stack([u, v]) - 0.5

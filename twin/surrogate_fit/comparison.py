@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -23,10 +25,15 @@ from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate.error_model import ErrorModel, SigmaLaw
+from twin.surrogate.map_model import EDGE_PX
 from twin.surrogate.vision import SurrogateVision
 
 _MIN_CELLS = 300  # a map statistic needs more cells than this
 _LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # rise over run: level cells have less than the first, steep more than the second
+_FEW_VIEWS, _MANY_VIEWS = 2, 4  # most and fewest views of the level cells of the classes "few" and "many"
+_ROUGHNESS_BINS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
+_VIEW_QUANTILES = (np.arange(20) + 0.5) / 20  # of the number of views of the cells of a class
+_P90 = 1.645  # 90th percentile of the absolute value of a standard normal variable
 _NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
 #: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
@@ -61,6 +68,7 @@ class ComparisonVision:
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         (measured, status), (sampled, _) = self.images.track_frame(frame), self.surrogate.track_frame(frame)
         last, self._last_pose = self._last_pose, self._true_pose()
+        self.statistics["frame_lost"].append(float(status != "ok"))
         if last is not None and status == "ok" and measured.n_points:
             true = geometry.inverse(last) @ self._last_pose
             self.statistics["f2f_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
@@ -144,6 +152,12 @@ class ComparisonVision:
             true: (4, 4) true motion from i to j.
         """
         measured, sampled = links["images"], links["all"]
+        self.statistics["link_failed_images"].append(float(measured is None))
+        self.statistics["link_failed_surrogate"].append(float(sampled is None))
+        if sampled is not None:
+            self.statistics["link_parallax_px"].append(self.surrogate.parallax_px(self._poses[i]))
+            n_points = 0 if measured is None else measured.n_points
+            self.statistics["link_matched"].append(n_points / sampled.n_points)
         if measured is None or sampled is None:
             return
         self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
@@ -164,28 +178,31 @@ class ComparisonVision:
     ) -> ElevationMap:
         """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
-        There are three sampled maps: with pose errors alone, with pose and depth errors, and with pose and lateral
-        errors.
+        There are four sampled maps: with pose errors alone, and with pose errors and one of depth errors, lateral
+        errors and errors due to roughness.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
+        none = model._replace(
+            depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0, edge_error_gain=0.0, edge_sigma_gain=0.0
+        )
         models = {
-            "pose": model._replace(depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0),
-            "depth": model._replace(lateral_sigma_px=0.0),
-            "lateral": model._replace(depth_sigma_px=_NEGLIGIBLE),
+            "pose": none,
+            "depth": none._replace(depth_sigma_px=model.depth_sigma_px),
+            "lateral": none._replace(lateral_sigma_px=model.lateral_sigma_px),
+            "edge": none._replace(edge_error_gain=1.0, edge_sigma_gain=1.0),
         }
-        seen = self.surrogate.scene.map_model.seen
-        self.statistics["map_completeness"].append(float(np.isfinite(elevation.height_m[seen]).mean()))
         for name, single_error in models.items():
             self.surrogate.model = single_error
             self._compare_map(name, self.surrogate.build_map(result, grid, step_cov, lambda _: None))
         self.surrogate.model = model
         self._compare_map("images", elevation)
+        self._count_holes(elevation)
         return elevation
 
     def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds the robust variance (NMAD squared) of a map's height errors and its median reported variance [m^2].
+        """Adds the robust variance of a map's height errors and its median reported variance [m^2], by class of cells.
 
-        Both are computed for level and for steep cells separately.
+        The robust variance is that of a normal distribution with the same 90th percentile of the absolute error.
 
         Args:
             source: name of the map in the statistics.
@@ -193,13 +210,43 @@ class ComparisonVision:
         """
         map_model = self.surrogate.scene.map_model
         error = elevation.height_m - map_model.height_m
-        level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE
-        for name, cells in (("level", level), ("steep", steep)):
+        for name, cells in self._cell_classes().items():
             known = cells & map_model.seen & np.isfinite(error)
             if known.sum() > _MIN_CELLS:
                 residual = error[known] - np.median(error[known])
-                self.statistics[f"map_error_{name}_{source}"].append(float((1.4826 * np.median(np.abs(residual))) ** 2))
+                robust = float(np.percentile(np.abs(residual), 90) / _P90) ** 2
+                self.statistics[f"map_error_{name}_{source}"].append(robust)
                 self.statistics[f"map_sigma_{name}_{source}"].append(float(np.median(elevation.sigma_m[known]) ** 2))
+                views = np.quantile(np.maximum(map_model.views[known], 1), _VIEW_QUANTILES, method="nearest")
+                self.statistics[f"map_views_{name}_{source}"] = views.tolist()
+
+    def _cell_classes(self) -> dict[str, np.ndarray]:
+        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
+
+        "few" and "many" are level cells that few and many consecutive keyframes observed; "edge" are the rough cells.
+        Cells within a matching window of an edge belong to no other class.
+        """
+        map_model = self.surrogate.scene.map_model
+        edge = self._roughness_px() > EDGE_PX
+        level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE
+        margin = np.asarray(maximum_filter(edge, 2 * map_model.window_cells + 1), np.bool_)
+        few, many = map_model.views <= _FEW_VIEWS, map_model.views >= _MANY_VIEWS
+        return {"few": level & few & ~margin, "many": level & many & ~margin, "steep": steep & ~margin, "edge": edge}
+
+    def _roughness_px(self) -> np.ndarray:
+        """Returns the roughness of the map cells (rows, cols) at the typical depth of the floor [px of disparity]."""
+        rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
+        return map_model.roughness_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
+
+    def _count_holes(self, elevation: ElevationMap) -> None:
+        """Adds the number of observed cells, the fraction with a height and the roughness, by bins of roughness."""
+        seen, roughness = self.surrogate.scene.map_model.seen, self._roughness_px()
+        for low, high in pairwise(_ROUGHNESS_BINS_PX):
+            cells = seen & (roughness >= low) & (roughness < high)
+            if cells.sum() > _MIN_CELLS / 10:
+                self.statistics["hole_cells"].append(float(cells.sum()))
+                self.statistics["hole_known"].append(float(np.isfinite(elevation.height_m[cells]).mean()))
+                self.statistics["hole_roughness_px"].append(float(np.median(roughness[cells])))
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:

@@ -13,9 +13,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw, ViewsLaw
 from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN
 
+_CELL_CLASSES = ("few", "many", "steep", "edge")  # see `ComparisonVision`
+_NOTICEABLE = 0.1  # smallest fraction of the variance of a class of cells that determines a factor
+_SMOOTH_PX = 0.25  # roughness [px of disparity] that no class of cells of a smooth floor reaches
 _SOURCES = ("images", "patches", "relief")
 _RELATIVE_SIGMA = 0.1  # assumed relative standard error of the mean squared error over a third of a survey's links
 
@@ -47,9 +50,14 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     match_error_ratio, lamp_error_growth = _fit_lamp_growth(
         patch_ratios / median("match_sigma_ratio"), median("lamp_share")
     )
-    depth, lateral = (np.sqrt(x) for x in zip(*(_fit_map_variances(s, "error") for s in surveys), strict=True))
-    reported = [np.sqrt(_fit_map_variances(s, "sigma")[0]) for s in surveys]
-    depth_sigmas_px = [compared.depth_sigma_px(b) * ratio for b, ratio in zip(bounds, reported, strict=True)]
+    error_views, errors = _fit_map_variances(surveys, "error", compared.depth_error_views)
+    sigma_views, reported = _fit_map_variances(surveys, "sigma", compared.depth_sigma_views)
+    smooth = _is_smooth(surveys)
+    depth_sigmas_px = np.array([compared.depth_sigma_px(b) for b in bounds]) * np.sqrt(reported[:, 0])
+    depth_sigmas_px = np.maximum(depth_sigmas_px, np.median(depth_sigmas_px[smooth]) / 10)
+    depth_ratios = np.sqrt(errors[:, 0] / np.maximum(reported[:, 0], 1e-6))
+    known_fractions = np.array([s["hole_known"][0] for s in surveys])
+    match_fractions = [compared.match_fraction(b) for b in bounds]
     mosaic_chi2 = median("mosaic_difference_nees") - compared.mosaic_error_ratio**2
     return compared._replace(
         bound_range_px=(float(bounds.min()), float(bounds.max())),
@@ -57,9 +65,8 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         match_sigma_px=match_sigma_px,
         match_error_ratio=match_error_ratio,
         lamp_error_growth=lamp_error_growth,
-        match_fraction=_fit_fraction_law(
-            bounds, np.minimum(median("link_point_ratio") * [compared.match_fraction(b) for b in bounds], 1.0)
-        ),
+        match_fraction=_fit_fraction_law(bounds, np.minimum(_matched_without_relief(surveys) * match_fractions, 1.0)),
+        match_parallax_px=compared.match_parallax_px,
         match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
         match_bias_fraction=bias_fraction,
         distance_growth=distance_growth,
@@ -68,10 +75,15 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         f2f_error_ratio=compared.f2f_error_ratio * float(np.median(f2f_ratios)),
         f2f_anticorrelation=float(np.median([_fit_anticorrelation(s) for s in surveys])),
         mosaic_sigma_px=mosaic_sigma_px,
-        depth_sigma_px=_fit_sigma_law(bounds, np.array(depth_sigmas_px)),
-        depth_error_ratio=compared.depth_error_ratio * float(np.median(depth / reported)),
-        lateral_sigma_px=compared.lateral_sigma_px * float(np.sqrt(np.mean(lateral**2))),
-        map_completeness=_fit_fraction_law(bounds, median("map_completeness")),
+        depth_sigma_px=_fit_sigma_law(bounds[smooth], depth_sigmas_px[smooth]),
+        depth_error_ratio=compared.depth_error_ratio * float(np.median(depth_ratios[smooth])),
+        depth_error_views=error_views,
+        depth_sigma_views=sigma_views,
+        lateral_sigma_px=compared.lateral_sigma_px * _root_median(errors[:, 1], 1.0),
+        map_completeness=_fit_fraction_law(bounds[smooth], known_fractions[smooth]),
+        edge_error_gain=_root_median(errors[:, 2], compared.edge_error_gain),
+        edge_sigma_gain=_root_median(reported[:, 2], compared.edge_sigma_gain),
+        edge_half_px=_fit_edge_holes(surveys, compared.edge_half_px),
         mosaic_error_ratio=float(np.sqrt(np.median(np.maximum(mosaic_chi2, 0.01) / median("mosaic_sigma_ratio") ** 2))),
     )
 
@@ -227,19 +239,94 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     return float(solution[0]), np.exp([np.median(ratios) / 2 for ratios in log_ratios(solution)])
 
 
-def _fit_map_variances(statistics: SurveyStatistics, quantity: str) -> np.ndarray:
-    """Returns factors (2,) on the surrogate's depth and lateral variances that reproduce the map from images.
+def _matched_without_relief(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
+    """Returns the median ratio (n,) of matched points, images / surrogate, of the links with the least parallax.
 
-    The factors are fitted to the variances of level and of steep cells of that map.
+    These are the links up to the median parallax of the survey.
+    """
+    ratios = []
+    for s in surveys:
+        parallax, matched = np.array(s["link_parallax_px"]), np.array(s["link_matched"])
+        ratios.append(np.median(matched[parallax <= np.median(parallax)]))
+    return np.array(ratios)
+
+
+def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> float:
+    """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey.
+
+    Returns the value of the compared model if no survey has rough cells.
+    """
+    roughness, fractions, weights = [], [], []
+    for s in surveys:
+        known = np.array(s["hole_known"]) / max(s["hole_known"][0], 1e-6)
+        roughness.append(np.array(s["hole_roughness_px"])[1:])
+        fractions.append(np.minimum(known[1:], 1.0))
+        weights.append(np.sqrt(np.array(s["hole_cells"])[1:] / np.sum(s["hole_cells"])))
+    r, known, weight = (np.concatenate(part) for part in (roughness, fractions, weights))
+    if len(r) == 0:
+        return compared_px
+    half = np.geomspace(0.3, 100.0, 400)
+    misfit = [np.sum((weight * (1 / (1 + (r / h) ** 2) - known)) ** 2) for h in half]
+    return float(half[np.argmin(misfit)])
+
+
+def _fit_map_variances(
+    surveys: Sequence[SurveyStatistics], quantity: str, compared: ViewsLaw
+) -> tuple[ViewsLaw, np.ndarray]:
+    """Fits the variances of the maps from images, in all classes of cells, by those of the sampled maps.
+
+    The decrease of the variance due to depth with the number of keyframes is common to all surveys and found by a grid
+    search; for each `ViewsLaw`, the other variances of each survey follow by non-negative least squares of relative
+    residuals.
 
     Args:
-        statistics: statistics of one survey.
+        surveys: statistics of n surveys.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
+        compared: the law of the error model with which the surveys were compared.
+
+    Returns:
+        The law; and factors (n, 3) on the variances of one keyframe's depth, of the lateral shift and, for a gain of 1,
+        of roughness. A factor on the lateral shift or on roughness that a survey does not determine, because its cells
+        have no such error, is NaN.
     """
-    names = [name for name in ("level", "steep") if f"map_{quantity}_{name}_images" in statistics]
-    images, pose, depth, lateral = (
+    laws = [ViewsLaw(float(r), float(g)) for r in np.linspace(0.0, 0.9, 19) for g in np.geomspace(0.1, 20.0, 24)]
+    smooth = [s for s, is_smooth in zip(surveys, _is_smooth(surveys), strict=True) if is_smooth]
+    misfits = [sum(_fit_survey(s, quantity, compared, law)[1] for s in smooth) for law in laws]
+    best = laws[int(np.argmin(misfits))]
+    return best, np.array([_fit_survey(s, quantity, compared, best)[0] for s in surveys])
+
+
+def _is_smooth(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
+    """Returns the mask (n,) of the surveys without edges, to which the depth of smooth cells is fitted.
+
+    Next to walls, the cells with few views are those that a wall hid from the other keyframes: their errors are not
+    those of cells with few views elsewhere. If all surveys have edges, the mask is True for all.
+    """
+    rough_px = [max(s.get("hole_roughness_px", (0.0,))) for s in surveys]
+    smooth = np.array(rough_px) < _SMOOTH_PX
+    return smooth if smooth.any() else ~smooth
+
+
+def _fit_survey(
+    statistics: SurveyStatistics, quantity: str, compared: ViewsLaw, law: ViewsLaw
+) -> tuple[np.ndarray, float]:
+    """Returns the factors (3,) of `_fit_map_variances` for one survey and a law, and the norm of the residuals."""
+    names = [name for name in _CELL_CLASSES if f"map_{quantity}_{name}_images" in statistics]
+    images, pose, depth, lateral, edge = (
         np.array([statistics[f"map_{quantity}_{name}_{source}"][0] for name in names])
-        for source in ("images", "pose", "depth", "lateral")
+        for source in ("images", "pose", "depth", "lateral", "edge")
     )
-    effects = np.stack([depth - pose, lateral - pose], axis=1) / images[:, None]
-    return nnls(effects, np.maximum(1 - pose / images, 0))[0]
+    views = [np.array(statistics[f"map_views_{name}_images"]) for name in names]
+    factor = np.array([np.mean(law(n)) / np.mean(compared(n)) for n in views])
+    effects = np.stack([(depth - pose) * factor, lateral - pose, edge - pose], axis=1) / images[:, None]
+    effects = np.maximum(effects, 0)
+    factors, misfit = nnls(effects, np.maximum(1 - pose / images, 0))
+    determined = effects.max(axis=0) > _NOTICEABLE
+    determined[0] = True
+    return np.where(determined, factors, np.nan), float(misfit)
+
+
+def _root_median(factors: np.ndarray, default: float) -> float:
+    """Returns the root of the median of the factors (n,) on a variance, without NaN; `default` if all are NaN."""
+    known = factors[np.isfinite(factors)]
+    return float(np.sqrt(np.median(known))) if len(known) else default

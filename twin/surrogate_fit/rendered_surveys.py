@@ -11,6 +11,7 @@ from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted, TwinError
 from twin.scenario.model import Scenario
 from twin.session.assembly import image_vision, navigator_with
+from twin.surrogate.coverage import QUANTITIES, Range, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.surrogate_world import surrogate_vision
@@ -21,6 +22,7 @@ from twin.world.rendered_world import RenderedWorld
 
 _FILE = "surrogate_comparison.json"
 _MIN_SURVEYS = 2
+_CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
 
 
 def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> FittedErrorModel:
@@ -33,11 +35,22 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     Raises:
         TwinError: fewer than two surveys have complete statistics.
     """
-    complete = [s for s in surveys if "consecutive_product_images" in s and "map_error_level_images" in s]
+    complete = [s for s in surveys if "consecutive_product_images" in s and _has_map(s)]
     if len(complete) < _MIN_SURVEYS:
         raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
     fitted = fit_error_model(complete, compared)
-    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted))
+    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted), _fitted_range(complete))
+
+
+def _fitted_range(surveys: Sequence[SurveyStatistics]) -> dict[str, Range]:
+    """Returns the smallest and the largest value of each condition of the surveys, by name of `QUANTITIES`."""
+    values = {name: [x for s in surveys for x in s.get(_CONDITION + name, ())] for name in QUANTITIES}
+    return {name: (min(found), max(found)) for name, found in values.items() if found}
+
+
+def _has_map(statistics: SurveyStatistics) -> bool:
+    """Returns whether the statistics include errors of level cells of the map."""
+    return any(f"map_error_{name}_images" in statistics for name in ("few", "many"))
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
@@ -81,6 +94,8 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
                 navigator.build_map(result, mission.grid, lambda _: None)
             except SurveyAborted:
                 pass
+    conditions = survey_conditions(mission, surrogate.scene.matchability)
+    vision.statistics |= {_CONDITION + name: list(values) for name, values in conditions.items()}
     saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": vision.statistics}
     (folder / _FILE).write_text(json.dumps(saved), encoding="utf-8")
     return vision.statistics

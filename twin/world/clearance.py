@@ -1,4 +1,4 @@
-"""Clearance of a planned path, at constant height or along the floor."""
+"""Clearance of a planned path at constant height or constant altitude above the floor."""
 
 from __future__ import annotations
 

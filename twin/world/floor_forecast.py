@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from twin.core.records import MapGrid, StereoRig
 from twin.judge.overlap import KeyframePoses
 from twin.world.coverage import Coverage
 from twin.world.mission import Mission
-from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs
+from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
 
 #: Approximate number of columns of the depth images from which the coverage is computed, and largest number of grid
 #: cells along the longer side of the terrain.
@@ -72,11 +73,16 @@ class PlannedOverlap(NamedTuple):
     across: float | None
 
 
-def planned_overlap(mission: Mission) -> PlannedOverlap:
-    """Returns the median overlaps forecast for the planned path, to compare with those of the flown survey."""
+def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
+    """Returns the median overlaps forecast for the planned path, to compare with those of the flown survey.
+
+    Args:
+        mission: the survey.
+        most_pairs: largest number of pairs along and across the swaths that are evaluated, chosen at equal intervals.
+    """
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
-    field = floor_of(mission.terrain)
-    return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in planned_pairs(keyframes)))
+    pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(mission.terrain)
+    return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in pairs))
 
 
 def forecast_over_floor(mission: Mission) -> FloorForecast:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,16 +20,18 @@ from twin.imaging.illumination import Illumination, illumination_of
 from twin.imaging.lamps import light_sources_in_camera
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
-from twin.scenario.model import BeaconConfig, CalibrationErrorConfig, Scenario, SensorConfig, Source
+from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, Source
 from twin.simulate.autopilot import top_speed_mps
 from twin.world.clearance import planned_clearance
 from twin.world.limits import check_map_size
+from twin.world.pace import Pace
 from twin.world.planning import plan_survey
 from twin.world.thrust_authority import check_thrust
 
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
 #: number of these points; on longer paths they are farther apart.
 LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
+_SAME_TIME_S = 1e-9  # times that differ by less are equal
 
 
 class Step(NamedTuple):
@@ -54,14 +56,23 @@ class Course:
         reference: planned pose and velocity of the left camera at each frame.
         keyframe: (n,) bool, whether each frame is a keyframe.
         holding: whether the vehicle keeps station.
+        path_times_s: (n,) time of each frame on the planned path, since the start of the track [s].
+        rate: path time per time; below 1 if the vehicle is slowed.
     """
 
     reference: segments.Reference
     keyframe: NDArray[np.bool_]
     holding: bool
+    path_times_s: Array
+    rate: float = 1.0
 
     def __len__(self) -> int:
         return len(self.keyframe)
+
+    def first(self, n: int) -> Course:
+        """Returns the first n frames."""
+        reference = segments.Reference(*(np.asarray(part)[:n] for part in self.reference))
+        return replace(self, reference=reference, keyframe=self.keyframe[:n], path_times_s=self.path_times_s[:n])
 
     def __getitem__(self, k: int) -> Step:
         return Step(self.reference.row(k), bool(self.keyframe[k]), self.holding)
@@ -103,16 +114,35 @@ class Mission:
     def fly(self, track: int) -> Course:
         """Returns the planned frames of a track (numbered from 1), without the station keeping after it."""
         times_s, keyframes = self.plan.frames_of_track(track)
-        return Course(self.plan.references(track, times_s), keyframes, holding=False)
+        return Course(self.plan.references(track, times_s), keyframes, False, times_s)
 
     def hold(self, track: int) -> Course:
-        """Returns the planned frames of half the station keeping after a track (numbered from 1).
+        """Returns the planned frames of the first or the second half of the station keeping after a track.
 
-        The survey flies them twice: before and after the global alignment.
+        Both halves are the same; the global alignment runs between them. Tracks are numbered from 1.
         """
         n = self._n_holding
-        end = self.plan.references(track, np.full(n, self.plan.track_duration_s(track)))
-        return Course(end, np.zeros(n, np.bool_), holding=True)
+        times_s = np.full(n, self.plan.track_duration_s(track))
+        return Course(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s)
+
+    def fly_on(self, track: int, path_time_s: float, pace: Pace) -> Course:
+        """Returns the next frames of a track at a pace: one frame, or all that remain at full pace.
+
+        Every planned keyframe is flown, at the first frame at or after its path time.
+
+        Args:
+            track: number of the track, from 1.
+            path_time_s: path time of the last frame flown [s].
+            pace: pace of the vehicle along the path.
+
+        Returns:
+            The frames; none if the last frame of the track has been flown.
+        """
+        planned_s, planned_keyframes = self.plan.frames_of_track(track)
+        times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.frame_rate_hz)
+        reference = pace.scaled(self.plan.references(track, times_s))
+        passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + _SAME_TIME_S, "right")
+        return Course(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, pace.rate)
 
     @property
     def _n_holding(self) -> int:
@@ -147,7 +177,6 @@ def prepare(scenario: Scenario) -> Mission:
             _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, errors)
     true_cameras = _attempt(lambda: make_true_cameras(scenario), source, errors)
     illumination = _attempt(lambda: _illumination(scenario), source, errors)
-    _attempt(lambda: _check_surrogate(scenario), source, errors)
     _attempt(lambda: check_require(scenario.require), source, errors)
     _attempt(lambda: _check_beacons_listed(scenario), source, errors)
     if terrain is not None:
@@ -211,17 +240,6 @@ def _check_speed(scenario: Scenario) -> None:
         raise TwinError(
             "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
         )
-
-
-def _check_surrogate(scenario: Scenario) -> None:
-    """Raises TwinError if a surrogate survey has a port, calibration errors or marine snow, which are not modelled."""
-    if scenario.imaging.fidelity == "rendered":
-        return
-    plain = scenario.port.kind == "none" and scenario.calibration_error == CalibrationErrorConfig()
-    absent = {"port, calibration_error": not plain, "snow": scenario.snow.density_per_m3 > 0}
-    for section, given in absent.items():
-        if given:
-            raise TwinError("imaging.fidelity", f"'surrogate' does not model [{section}]", '"rendered"')
 
 
 def _check_beacons_listed(scenario: Scenario) -> None:

@@ -94,9 +94,15 @@ class World(ABC):
     def start_course(self, course: Course, track: int) -> None:
         """Starts the next course (sequence of planned frames) of a track.
 
-        The caller must simulate all frames of a course before it starts another one, unless the survey is aborted.
+        The caller must simulate all frames of a course before it starts another one, unless it ends the course early
+        (`end_course`) or the survey is aborted.
         """
         self._courses.append((course, track))
+
+    def end_course(self, n: int) -> None:
+        """Ends the course after its first n frames."""
+        course, track = self._courses[-1]
+        self._courses[-1] = course.first(n), track
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""

@@ -358,7 +358,7 @@ def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
     columns = Links.from_sequence(links)
-    measured, information = columns.i_from_j, columns.information
+    measured, information = (np.ascontiguousarray(column) for column in (columns.i_from_j, columns.information))
     i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
 
     def residuals(i_from_j: Array, _: float) -> Array:

@@ -182,7 +182,7 @@ def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances
 
 @njit(cache=True, nogil=True)
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
-    """Adds the interpolated image colour of each known cell, times its weight, to `colour` (grid rows, grid cols, 4).
+    """Adds the weighted image colour of each cell with a height to `colour` (grid rows, grid cols, 4).
 
     The last channel of `colour` is the sum of the weights. `colour` is modified in place.
     """

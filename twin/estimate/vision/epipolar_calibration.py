@@ -26,7 +26,7 @@ from twin.estimate.vision.stereo import StereoPoints
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times a poor calibration's errors.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
 _SIGNIFICANT = 4.0  # the correction is updated if it changes a row at a corner by more than this many sigma ...
-_NOTICEABLE_PX = 0.02  # ... and by more than this
+NOTICEABLE_PX = 0.02  # ... and by more than this
 _HUBER = 1.5
 _ITERATIONS = 5
 _MAD_TO_SIGMA = 1.4826
@@ -86,7 +86,7 @@ class EpipolarCalibration:
         cov = np.linalg.inv(self._information)
         shift_sigma = np.sqrt(np.einsum("ni,ij,nj->n", shift, cov, shift))
         size = np.abs(shift @ change)
-        if not np.any((size > _SIGNIFICANT * shift_sigma) & (size * rig.focal_px > _NOTICEABLE_PX)):
+        if not np.any((size > _SIGNIFICANT * shift_sigma) & (size * rig.focal_px > NOTICEABLE_PX)):
             return False
         self.removed = self.removed + change
         return True

@@ -10,11 +10,14 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.estimate.vision import matching, observation_equations, two_view_motion
+from twin.estimate.vision.motion_filter import MotionFilter
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.stereo import StereoPoints
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
+_MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; noise matches up to a tenth
+_MIN_INLIERS = 0.5  # smallest fraction of the tracked points that must agree with a motion
 _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
 
@@ -39,6 +42,22 @@ class _Reference(NamedTuple):
         return np.column_stack([x, y, np.ones_like(x)]) * (baseline_m / disparity[:, None])
 
 
+class _Located(NamedTuple):
+    """Pose of an image relative to the reference, from tracked points.
+
+    Args:
+        motion: pose of the image in the reference camera, its covariance and the number of inliers.
+        inlier_share: fraction of the tracked points that are inliers, 0 to 1.
+        tracked_share: fraction of the points of the reference that were tracked, 0 to 1.
+        as_reference: the image with the tracked points, which can replace the reference.
+    """
+
+    motion: two_view_motion.Motion
+    inlier_share: float
+    tracked_share: float
+    as_reference: _Reference
+
+
 class FrameToFrame:
     """Frame-to-frame motion by tracking the points of the last keyframe.
 
@@ -49,7 +68,10 @@ class FrameToFrame:
     of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is
     noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
 
-    If a step fails, the last motion is returned again, with a large covariance and the reason for the failure.
+    A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because a vehicle
+    cannot jump from frame to frame, but a pose from few and noisy pixels can. A step fails if too few points are
+    tracked or agree, or if the measured pose contradicts the prediction. The predicted motion is then returned, with a
+    large covariance and the reason for the failure.
 
     Args:
         rig: calibration at the scale of the images.
@@ -58,16 +80,14 @@ class FrameToFrame:
     Attributes:
         reference: image with which frames are matched, and its points; None before the first keyframe.
         started: whether a frame has been processed.
-        reference_from_current: (4, 4) pose of the last frame in the reference camera.
-        last_motion: (4, 4) motion of the last step.
+        filter: pose of the last frame in the reference camera, and velocity.
     """
 
     def __init__(self, rig: StereoRig, patch_px: int):
         self.rig, self.patch_px = rig, patch_px
         self.reference: _Reference | None = None
         self.started = False
-        self.reference_from_current = np.eye(4)
-        self.last_motion = np.eye(4)
+        self.filter = MotionFilter()
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
         """Makes a new keyframe the reference, with the strongest of its points; `points` are sorted by strength."""
@@ -75,12 +95,12 @@ class FrameToFrame:
         measured, cov = _at_left_pixels(points, self.rig)
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
-    def step(self, image: matching.Image, interval_ratio: float = 1.0) -> tuple[two_view_motion.Motion, str]:
+    def step(self, image: matching.Image, interval_s: float | None = None) -> tuple[two_view_motion.Motion, str]:
         """Estimates the motion from the last frame to this one.
 
         Args:
             image: (height, width) normalised frame.
-            interval_ratio: time since the last frame divided by the time between the two frames before.
+            interval_s: time since the last frame [s]; by default that of the frame rate.
 
         Returns:
             The motion, and "ok" or the reason for a failure. The covariance of the motion is that of the pose of this
@@ -90,26 +110,37 @@ class FrameToFrame:
         if not self.started:
             self.started = True
             return two_view_motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
-        if interval_ratio != 1:
-            self.last_motion = geometry.exp(interval_ratio * geometry.log(self.last_motion))
-        previous, predicted = self.reference_from_current, self.reference_from_current @ self.last_motion
-        located = None if self.reference is None else self._locate(image, self.reference, predicted)
-        if located is None:
-            self.reference_from_current = predicted
-            return constant_velocity_motion(self.last_motion)
-        self.last_motion = geometry.inverse(previous) @ located.a_from_b
-        return located._replace(a_from_b=self.last_motion), "ok"
+        last_from_reference = geometry.inverse(self.filter.pose)
+        self.filter.predict(1 / self.rig.frame_rate_hz if interval_s is None else interval_s)
+        located = None if self.reference is None else self._locate(image, self.reference, self.filter.pose)
+        status = self._fuse(located)
+        motion = last_from_reference @ self.filter.pose
+        if located is None or status != "ok":
+            return constant_velocity_motion(motion, status)
+        cov = self.filter.cov.copy()
+        if located.tracked_share < _MIN_TRACKED:
+            self._set_reference(located.as_reference)
+        return located.motion._replace(a_from_b=motion, cov=cov), status
+
+    def _fuse(self, located: _Located | None) -> str:
+        """Fuses a measured pose with the prediction; returns "ok", or the reason why it was not used."""
+        if located is None or located.tracked_share < _MIN_MATCHED:
+            return "too few points matched"
+        if located.inlier_share < _MIN_INLIERS:
+            return "too few points agree"
+        used = self.filter.correct(located.motion.a_from_b, located.motion.cov)
+        return "ok" if used else "motion contradicts the prediction"
 
     def _set_reference(self, reference: _Reference) -> None:
-        self.reference, self.reference_from_current = reference, np.eye(4)
+        """Makes the current frame, with these points, the reference."""
+        self.reference = reference
+        self.filter.restart()
 
-    def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> two_view_motion.Motion | None:
+    def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> _Located | None:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
-        If fewer than 70 % of the points are tracked, the image becomes the new reference, with the tracked points.
-
         Returns:
-            The motion from the reference to the image, or None if there are too few inliers.
+            The pose with its points, or None if there are too few inliers.
         """
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
@@ -120,7 +151,7 @@ class FrameToFrame:
         current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
         current_cov[:, 2, 2] = _UNKNOWN_VARIANCE
         settings = two_view_motion.PairMotionSettings(
-            variance_inflation=matching.variance_inflation(pixels, self.patch_px), n_measured=2
+            variance_inflation=matching.variance_inflation(pixels, self.patch_px), n_measured=2, measured_scatter=True
         )
         pair = PairMeasurements(current, measured, current_cov, cov)
         motion = two_view_motion.pair_motion(pair, self.rig.baseline_m, current_from_reference, settings)
@@ -128,13 +159,14 @@ class FrameToFrame:
             return None
         adjoint = geometry.adjoint(motion.a_from_b)
         # without orthogonalisation, rounding errors would double with every frame
-        self.reference_from_current = geometry.nearest_rigid(geometry.inverse(motion.a_from_b))
-        located = motion._replace(a_from_b=self.reference_from_current, cov=adjoint @ motion.cov @ adjoint.T)
-        if ok.mean() < _MIN_TRACKED:
-            transferred, _, _ = observation_equations.transfer(measured, motion.a_from_b, self.rig.baseline_m)
-            current[:, 2] = transferred[:, 2]
-            self._set_reference(_Reference(image, pixels, current, cov))
-        return located
+        pose = geometry.nearest_rigid(geometry.inverse(motion.a_from_b))
+        current[:, 2] = observation_equations.transfer(measured, motion.a_from_b, self.rig.baseline_m)[0][:, 2]
+        return _Located(
+            motion._replace(a_from_b=pose, cov=adjoint @ motion.cov @ adjoint.T),
+            inlier_share=motion.n_points / len(pixels),
+            tracked_share=float(ok.mean()),
+            as_reference=_Reference(image, pixels, current, cov),
+        )
 
 
 def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
@@ -153,10 +185,10 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     return measured, cov
 
 
-def constant_velocity_motion(last_motion: Array) -> tuple[two_view_motion.Motion, str]:
-    """Returns the last motion (4, 4) as a prediction, with a large covariance, and the status of a failed step."""
-    twist = geometry.log(last_motion)
+def constant_velocity_motion(
+    motion: Array, status: str = "too few points matched"
+) -> tuple[two_view_motion.Motion, str]:
+    """Returns a motion (4, 4) that was predicted at constant velocity, with a large covariance, and a status."""
+    twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
-    return two_view_motion.Motion(
-        last_motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf
-    ), "too few points matched"
+    return two_view_motion.Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status

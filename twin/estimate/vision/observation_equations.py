@@ -220,7 +220,7 @@ def motion_normal_equations(observations, weight):
 
 @njit(cache=True, nogil=True)
 def adjust_structure(observations, measured, update):
-    """Returns the adjusted points (n, 3) in b, normalised (x, y, disparity), after an update of the unknowns.
+    """Returns the adjusted points (n, 3) of stereo pair b, normalised (x, y, disparity), after an update of the motion.
 
     Args:
         observations: `LinearisedObservations`.

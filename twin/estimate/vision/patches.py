@@ -130,7 +130,7 @@ def match_templates(
         guess: (n, 2) expected positions in the target [px]; accurate to about two pixels of the coarsest level.
         warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
     """
-    points = guess.astype(np.float64)
+    points, warp = guess.astype(np.float64), np.ascontiguousarray(warp)  # one memory layout: `_match` is compiled once
     correlation, cov = np.full(len(guess), -1.0), np.zeros((len(guess), 2, 2))
     for level in reversed(range(min(len(templates), len(target)))):
         scale, tolerance = 2.0**level, _COARSE_CONVERGED_PX if level else _CONVERGED_PX

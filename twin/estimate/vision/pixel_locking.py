@@ -27,6 +27,7 @@ from twin.core.geometry import Array
 #: Prior standard deviation of the amplitude [px]: the root mean square of 0.010, 0.006, 0.004 and 0, the amplitudes
 #: measured against the truth over two generated reefs, a flat floor and gravel.
 SIGMA_PX = 0.006
+MAX_AMPLITUDE_PX = 3 * SIGMA_PX  #: largest plausible estimate of the amplitude
 
 
 class PixelLocking(NamedTuple):

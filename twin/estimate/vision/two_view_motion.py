@@ -24,9 +24,9 @@ from twin.estimate.vision.observation_equations import (
 )
 from twin.estimate.vision.pixel_locking import PixelLocking
 
-_HUBER = 1.5
+HUBER = 1.5
 _MIN_POINTS = 12
-_CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
+CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
 _PRIOR_POINTS = 50  # weight of the expected covariance of the scores in `_scatter_cov`, as a number of points
 _MIN_SCALE = 0.3  # smallest factor on reported standard deviations, for noise-free data
 _MEDIAN_NORMALISED = {2: 0.680, 3: 0.888}  # sqrt(median of chi2 / 3) by degrees of freedom
@@ -149,7 +149,7 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
     """Returns the Huber weights (n,) for residuals of magnitude `size` (n,); 0 beyond `cutoff` times `sigma`."""
-    return np.minimum(1.0, _HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
+    return np.minimum(1.0, HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
 
 
 def pair_motion(
@@ -161,6 +161,10 @@ def pair_motion(
     G = dg/dz_b and A = dg/dmotion, the structure is eliminated: the cost is e' (C_a + G C_b G')^-1 e, linearised at the
     adjusted structure (mixed adjustment model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003).
     Residuals have Huber weights.
+
+    If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
+    estimated without it: over a level floor all points have nearly the same phase, and an amplitude of 1 / (2 pi) px
+    would then explain the noise of all measurements.
 
     Args:
         measured: points in the earlier pair a and the later pair b.
@@ -185,6 +189,8 @@ def pair_motion(
         structure = adjust_structure(observations, measured, update)
         a_from_b = a_from_b @ geometry.exp(update[:6])
         amplitude_px += float(update[6:].sum())
+    if abs(amplitude_px) > pixel_locking.MAX_AMPLITUDE_PX:
+        return pair_motion(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
     return Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
@@ -233,7 +239,7 @@ def _weighted_normals(
     """Returns the normal equations with Huber weights, and with the prior of the pixel-locking amplitude."""
     size = observations.normalised_residual
     scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
-    weight = _huber_weights(size, scale, _CUTOFF)
+    weight = _huber_weights(size, scale, CUTOFF)
     normal, right, bias_jacobian = motion_normal_equations(observations, weight)
     prior = np.zeros_like(normal)
     if settings.locking is not None:
@@ -246,33 +252,38 @@ def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
     """Returns the covariance (6, 6) of the motion due to the noise of the points and the bias that they share."""
     bias_root = np.linalg.solve(normals.normal, normals.bias_jacobian) * settings.common_sigma
     if settings.measured_scatter:
-        noise_cov = _scatter_cov(normals)
+        noise_cov = _scatter_cov(normals, settings.n_measured)
     else:
         noise_cov = np.linalg.inv(normals.normal) * max(normals.scale, _MIN_SCALE) ** 2
     cov = noise_cov * settings.variance_inflation + bias_root @ bias_root.T
     return np.asarray(cov[:6, :6], np.float64)
 
 
-def _scatter_cov(normals: _WeightedNormals) -> Array:
+def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     """Returns the covariance (p, p) of the unknowns from the residuals of the individual points.
 
     It is the sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, Robust Statistics, section
     7.6; White 1980). S is the sum of the outer products of the points' scores w J' C^-1 e, with w the weight of a
     point, J its Jacobian, C the covariance of its residual e. S therefore includes errors that C does not account for,
     such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function: a
-    point in its linear part contributes its weight times 2/3, the mean over the three coordinates of its residual. S is
-    scaled by 3 n / (3 n - p) for n points and p unknowns. Because few points determine S poorly, it is averaged with
-    its expectation for covariances C times a common factor; the expectation counts as 50 points.
+    point in its linear part contributes its weight times (k - 1) / k, the mean over the k measured coordinates of its
+    residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points determine S poorly, it is
+    averaged with its expectation for covariances C times a common factor; the expectation counts as 50 points.
+
+    Args:
+        normals: normal equations at the last iteration.
+        n_measured: number of measured coordinates k per point in pair a: 3, or 2 without disparity.
     """
     observations, weight, scale = normals.observations, normals.weight, normals.scale
     size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)
     information = normals.normal - normals.prior
     score = np.einsum("nrp,nrc,nc->np", observations.jacobian_motion, observations.information, observations.residual)
     score *= weight[:, None]
-    freedom = 3 * n / max(3 * n - p, 1)
-    variance = max(float(np.sum((weight * size) ** 2) / np.sum(weight)), _MIN_SCALE**2)
+    freedom = n_measured * n / max(n_measured * n - p, 1)
+    mean_square = float(np.sum((weight * size) ** 2) / np.sum(weight))  # expected: n_measured / 3
+    variance = max(mean_square * 3 / n_measured, _MIN_SCALE**2)
     scatter = freedom * (n * (score.T @ score) + _PRIOR_POINTS * variance * information) / (n + _PRIOR_POINTS)
-    core = size < _HUBER * scale
-    efficiency = float(np.sum(weight * np.where(core, 1.0, 2 / 3)) / np.sum(weight))
+    core = size < HUBER * scale
+    efficiency = float(np.sum(weight * np.where(core, 1.0, 1 - 1 / n_measured)) / np.sum(weight))
     bread = np.linalg.inv(information * efficiency + normals.prior)
     return np.asarray(bread @ (scatter + normals.prior * scale**2) @ bread, np.float64)

@@ -1,0 +1,181 @@
+"""Hostile and ordinary missions: none may end "complete" with a wrong path, and ordinary ones must not be degraded.
+
+usage: python tests/hostile_missions.py OUT.jsonl [MISSION...] [--seeds 3] [--jobs 2] [--ordinary]
+
+Flies each mission rendered over 2 m x 1 m (one track, two legs) with several seeds and appends one line per survey to
+OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each mission and the wrong ones:
+
+hostile: status "complete" although the largest position error of a frame exceeds 4 times its standard deviation (of
+    the worst keyframe and the motion since the last keyframe), or less than 90 % of the asked area is mapped;
+ordinary: status other than "complete".
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import twin
+from twin import survey
+from twin.errors import TwinError
+
+MAX_SIGMAS, MIN_COMPLETENESS, N_ORDINARY = 4.0, 0.9, 60
+SHORT = ("plan.area_m=[2.0,1.0]", "plan.tracks=1")
+#: Faults that no image shows: scaling baseline, path and floor together leaves all images unchanged.
+UNOBSERVABLE = ("baseline error 5 %",)
+FLOOR_FILE = ("terrain.kind=file", "terrain.height_file={folder}/floor.npy", "terrain.height_spacing_m=0.04")
+SUN = ("lamps=[]", "sun.illuminance_lx=20000", "sun.depth_m=5")
+
+
+def lamps(intensity_cd):
+    """Returns the override for two lamps of the given intensity [cd]."""
+    at = "{position_m=[0.25,%s,-0.05],pan_deg=%s,intensity_cd=%s}"
+    return f"lamps=[{at % (0.35, -8, intensity_cd)},{at % (-0.35, 8, intensity_cd)}]"
+
+
+HOSTILE = {
+    **{
+        f"{water} x{turbidity}": (f"water.jerlov={water}", f"water.turbidity={turbidity}")
+        for water, levels in {"5C": (1, 2, 5, 10), "7C": (1, 2, 5), "9C": (1, 2, 10)}.items()
+        for turbidity in levels
+    },
+    "lamps of 0.01 cd": (lamps(0.01),),
+    "lamps of 1 cd, physical sensor": (lamps(1), "sensor.read_noise_e=2.4"),
+    "no light": ("lamps=[]", "sun.illuminance_lx=0.001", "sensor.read_noise_e=2.4"),
+    **{
+        f"{name} floor": (*FLOOR_FILE, f"terrain.texture_file={{folder}}/{name}.png", "terrain.texture_px_m=0.002")
+        for name in ("constant", "black", "white", "stripes", "dots", "chequerboard", "faint")
+    },
+    "strong caustics": (*SUN, "sun.caustics=1.0"),
+    "5 frames a second": ("rig.frame_rate_hz=5",),
+    "snow 1500": ("snow.density_per_m3=1500",),
+    "snow 5000": ("snow.density_per_m3=5000",),
+    "focal length error 10 %": ("calibration_error.focal_error=0.1",),
+    "baseline error 5 %": ("calibration_error.baseline_error=0.05",),
+    "yaw error 0.1 deg": ("calibration_error.right_yaw_deg=0.1",),
+    "yaw error 2 deg": ("calibration_error.right_yaw_deg=2",),
+    "pitch error 1 deg": ("calibration_error.right_pitch_deg=1",),
+    "roll error 1 deg": ("calibration_error.right_roll_deg=1",),
+    "left principal point error 5 px": ("calibration_error.left_principal_point_error_px=[5,0]",),
+    "right principal point error 2 px": ("calibration_error.right_principal_point_error_px=[2,0]",),
+    "right principal point error 2 px down": ("calibration_error.right_principal_point_error_px=[0,2]",),
+    "k1 error 0.1": ("calibration_error.k1_error=0.1",),
+    "flat port, not calibrated": ("port.kind=flat",),
+    "current 0.5 m/s across": ("current.velocity_mps=[0,0.5,0]",),
+    "current 0.8 m/s across": ("current.velocity_mps=[0,0.8,0]",),
+    "current 0.7 m/s diagonal": ("current.velocity_mps=[0.5,0.5,0]",),
+    "current 1.04 m/s": ("current.velocity_mps=[0.8,0.66,0]",),
+    "current 0.3 m/s upward": ("current.velocity_mps=[0,0,0.3]",),
+}
+
+
+def ordinary_missions():
+    """Returns `N_ORDINARY` missions by name: waters, light, floors, rigs and plans of everyday surveys."""
+    missions, rng = {}, np.random.default_rng(2026)
+    for k in range(N_ORDINARY):
+        water = str(rng.choice(["clear", "I", "IA", "IB", "II", "1C"]))
+        altitude_m = rng.uniform(1.5, 2.3)
+        overrides = [
+            f"water.jerlov={water}",
+            f"plan.altitude_m={altitude_m:.2f}",
+            f"plan.overlap_along={rng.uniform(0.6, 0.88):.2f}",
+            f"plan.overlap_across={rng.uniform(0.4, 0.75):.2f}",
+            f"plan.speed_mps={rng.uniform(0.2, 0.4):.2f}",
+            f"terrain.kind={rng.choice(['reef', 'fractal', 'ripples'])}",
+            f"terrain.relief_m={rng.uniform(0.05, 0.6):.2f}",
+            f"current.velocity_mps=[{rng.uniform(-0.2, 0.2):.2f},{rng.uniform(-0.2, 0.2):.2f},0]",
+        ]
+        variant = int(rng.integers(4))
+        overrides += ((), SUN, ("sensor.read_noise_e=2.4",), ("snow.density_per_m3=50",))[variant]
+        missions[f"ordinary {k} {water} {('', 'sun', 'sensor', 'snow')[variant]}".strip()] = tuple(overrides)
+    return missions
+
+
+def write_floors(folder):
+    """Writes a floor of 7 m x 6 m with 0.5 m of relief, and textures without usable detail."""
+    rng, row, col = np.random.default_rng(0), *np.indices((512, 512))
+    images = {
+        "constant": np.full((512, 512), 128),
+        "black": np.zeros((512, 512)),
+        "white": np.full((512, 512), 255),
+        "stripes": 128 + 80 * np.sign(np.sin(2 * np.pi * col / 32)),
+        "dots": 60 + 150 * (np.hypot(row % 64 - 32, col % 64 - 32) < 14),
+        "chequerboard": 60 + 130 * ((row // 32 + col // 32) % 2),
+        "faint": 128 + cv2.GaussianBlur(rng.standard_normal((512, 512)), (0, 0), 3) * 12,
+    }
+    height_m = cv2.GaussianBlur(rng.standard_normal((150, 175)), (0, 0), 12)
+    np.save(folder / "floor.npy", 0.5 * (height_m - height_m.min()) / np.ptp(height_m))
+    for name, image in images.items():
+        cv2.imwrite(str(folder / f"{name}.png"), np.clip(image, 0, 255).astype(np.uint8))
+
+
+def fly(name, overrides, seed):
+    """Returns the row of one survey: how it ended, its largest error and standard deviation, and what it mapped."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_floors(Path(folder))
+        texts = [text.replace("{folder}", folder) for text in (*SHORT, *overrides)]
+        row = {"mission": name, "seed": seed}
+        try:
+            scenario = twin.load_scenario("quickstart", [*texts, f"seed={seed}"])
+            metrics = survey.run(scenario, Path(folder) / "run", outputs=None).metrics
+        except TwinError as error:
+            return row | {"status": "refused", "reason": str(error)[:200]}
+        final, check = metrics["trajectory"].get("final") or {}, metrics.get("self_check") or {}
+        row |= {"status": metrics["status"], "reason": metrics.get("reason", "")}
+        sigma_m = np.hypot(check.get("sigma_max_m") or 0.0, check.get("frame_sigma_m") or 0.0)  # between keyframes
+        row |= {"error_m": final.get("ate_max_m"), "sigma_m": float(sigma_m)}
+        row |= {"nees": (metrics.get("consistency") or {}).get("nees_position_mean")}
+        return row | {"completeness": (metrics.get("map") or {}).get("completeness_area")}
+
+
+def is_wrong(row):
+    """Returns whether a survey ended with the wrong status."""
+    if row["mission"].startswith("ordinary"):
+        return row["status"] != "complete"
+    if row["status"] != "complete" or row["mission"] in UNOBSERVABLE:
+        return False
+    return row["error_m"] > MAX_SIGMAS * row["sigma_m"] or row["completeness"] < MIN_COMPLETENESS
+
+
+def line(row):
+    """Returns a survey as a line of the table."""
+    figures = ""
+    if row.get("error_m") is not None and row.get("sigma_m"):
+        figures = f"error {1e3 * row['error_m']:.1f} mm, sigma {1e3 * row['sigma_m']:.1f} mm"
+        figures += f", {row['completeness']:.0%} mapped" if row.get("completeness") is not None else ""
+    mark = "WRONG" if is_wrong(row) else "ok"
+    return f"{mark:5} {row['mission']:36} {row['seed']:3} {row['status']:9} {figures:48} {row['reason'][:150]}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("missions", nargs="*")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--ordinary", action="store_true", help="fly the ordinary missions, one seed each")
+    given = parser.parse_args()
+    missions = ordinary_missions() if given.ordinary else HOSTILE
+    chosen = {name: missions[name] for name in given.missions or missions}
+    rows = [json.loads(text) for text in given.out.read_text().splitlines()] if given.out.exists() else []
+    flown = {(row["mission"], row["seed"]) for row in rows}
+    seeds = range(101, 102) if given.ordinary else range(1, given.seeds + 1)
+    waiting = [(name, chosen[name], seed) for seed in seeds for name in chosen if (name, seed) not in flown]
+    with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool, given.out.open("a") as file:
+        for done in as_completed([pool.submit(fly, *survey) for survey in waiting]):
+            rows.append(done.result())
+            print(json.dumps(rows[-1]), file=file, flush=True)
+            print(line(rows[-1]), flush=True)
+    wrong = [row for row in rows if row["mission"] in missions and is_wrong(row)]
+    print(f"\n{len(wrong)} of {len(rows)} surveys ended with the wrong status", *map(line, wrong), sep="\n")
+    return len(wrong) > (1 if given.ordinary else 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,258 @@
+"""Surrogate: calibration errors, ports and marine snow, and the refusal of surveys outside the range of the fit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from twin import survey
+from twin.app import study_command
+from twin.core.records import StereoObservation
+from twin.core.timing import Stopwatch
+from twin.errors import ScenarioError, TwinError
+from twin.imaging.true_cameras import make_true_cameras
+from twin.scenario.file import load_scenario
+from twin.study.flight import fly
+from twin.study.surveys import Survey, surveys
+from twin.surrogate import error_model_file
+from twin.surrogate.coverage import QUANTITIES, departures
+from twin.surrogate.error_model import ErrorModel
+from twin.surrogate.matchability import precision
+from twin.surrogate.measured_rows import MeasuredRows
+from twin.surrogate.measured_view import IDEAL_VIEW, measured_view
+from twin.surrogate.snow_noise import snow_effect
+from twin.surrogate.surrogate_world import SurrogateWorld
+from twin.world.mission import prepare
+
+SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=1", "plan.area_m=[1.6,1.0]", "control.hold_s=0.5"]
+DEPTHS_M = np.linspace(1.2, 2.4, 5)
+#: Scenarios in which every kind of error is present.
+ERRORS = {
+    "baseline": ["calibration_error.baseline_error=0.02"],
+    "focal": ["calibration_error.focal_error=0.01"],
+    "distortion": ["calibration_error.k1_error=0.02", "calibration_error.k2_error=-0.01"],
+    "rotation": ["calibration_error.right_yaw_deg=0.02", "calibration_error.right_roll_deg=0.1"],
+    "flat port": ['port.kind="flat"', "port.calibrated_at_m=1.0"],
+    "dome": ['port.kind="dome"', "port.offset_m=[0.002,0.0,0.003]"],
+}
+
+
+def scenario(*sets):
+    return load_scenario("quickstart", [*SHORT, *sets])
+
+
+def view_of(*sets):
+    """Returns the measured view of a scenario, its true cameras and the believed rig."""
+    given = scenario(*sets)
+    rig, cameras = given.believed_rig(), make_true_cameras(given)
+    return measured_view(cameras, rig, DEPTHS_M), cameras, rig
+
+
+def floor_points(rig, n=200):
+    """Returns true points (n, 3), normalised (x, y, disparity), spread over the image and the depths."""
+    rng = np.random.default_rng(0)
+    half = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
+    return np.column_stack([rng.uniform(-0.9 * half, 0.9 * half, (n, 2)), rig.baseline_m / rng.uniform(1.2, 2.4, n)])
+
+
+def test_without_errors_all_points_are_measured_where_they_are():
+    view, _, rig = view_of()
+    assert view is IDEAL_VIEW
+    points = floor_points(rig)
+    np.testing.assert_array_equal(view.measure(points), points)
+
+
+@pytest.mark.parametrize(("sets", "scale"), [
+    (ERRORS["baseline"], (1.0, 1.0, 1.02)),  # the right image is 2 % further away
+    (ERRORS["focal"], (1.01, 1.01, 1.01)),  # both images are magnified
+])  # fmt: skip
+def test_errors_of_baseline_and_focal_length_scale_the_measured_positions(sets, scale):
+    view, _, rig = view_of(*sets)
+    points = floor_points(rig)
+    np.testing.assert_allclose(view.measure(points), points * scale, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_the_measured_column_and_disparity_are_those_of_the_rectified_images(name):
+    """Independent of the table: projection of each point by the true cameras; 0.01 px is far below the match noise.
+
+    A roll of the right camera is removed from its image, so that only its columns are compared, to first order.
+    """
+    view, cameras, rig = view_of(*ERRORS[name])
+    points = floor_points(rig)
+    xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * (rig.baseline_m / points[:, 2:])
+    offset = np.array([cameras.rendered_rig.baseline_m, 0.0, 0.0])
+    left, right = cameras.project(xyz, 0), cameras.project(xyz - offset, 1)
+    right_xy = rig.normalised(right)
+    columns_px = right[:, 0] + rig.focal_px * view.removed[2] * right_xy[:, 1]  # cancels the roll
+    columns_px -= rig.focal_px * view.removed[0] * right_xy[:, 0] * right_xy[:, 1]  # and the pitch
+    measured = view.measure(points) * rig.focal_px
+    np.testing.assert_allclose(measured[:, 0], left[:, 0] - rig.cx_px, atol=0.01)
+    np.testing.assert_allclose(measured[:, 2], left[:, 0] - columns_px, atol=0.015)
+
+
+def test_pitch_roll_and_row_offset_are_removed_and_yaw_is_not():
+    sets = [f"calibration_error.right_{name}" for name in ("pitch_deg=0.1", "roll_deg=0.2", "yaw_deg=0.05")]
+    view, _, rig = view_of(*sets, "calibration_error.right_principal_point_error_px=[0.0,0.5]")
+    points = floor_points(rig)
+    without_yaw, _, _ = view_of(*sets[:2], "calibration_error.right_principal_point_error_px=[0.0,0.5]")
+    rows_px = [v.row_difference(points) * rig.focal_px for v in (view, without_yaw)]
+    yaw_rows_px = np.deg2rad(0.05) * points[:, 0] * points[:, 1] * rig.focal_px
+    assert np.abs(rows_px[1]).max() < 0.01
+    assert rows_px[0].std() == pytest.approx(yaw_rows_px.std(), rel=0.2)
+    shift_px = (view.measure(points) - without_yaw.measure(points))[:, 2] * rig.focal_px
+    assert np.abs(shift_px).mean() == pytest.approx(np.deg2rad(0.05) * rig.focal_px * 1.08, rel=0.03)  # 1 + x^2
+
+
+@pytest.mark.parametrize("name", ["focal", "distortion", "flat port"])
+def test_true_directions_are_measured_at_the_given_positions(name):
+    view, _, rig = view_of(*ERRORS[name])
+    wanted, disparity = floor_points(rig)[:, :2], rig.baseline_m / 1.8
+    true = view.true_directions(wanted, disparity)
+    measured = view.measure(np.column_stack([true, np.full(len(true), disparity)]))
+    np.testing.assert_allclose(measured[:, :2], wanted, atol=1e-7)
+
+
+def test_the_motion_gain_scales_translation_as_baseline_and_leaves_it_with_an_error_of_focal_length():
+    """A baseline 2 % longer than believed makes depth and translation 2 % too small.
+
+    With a focal length 1 % longer, depth is 1 % too small; image motion is 1 % too large, and so are rotations.
+    """
+    view, _, rig = view_of(*ERRORS["baseline"])
+    np.testing.assert_allclose(
+        view.motion_gain(floor_points(rig), rig.baseline_m), np.diag([1, 1, 1, 1 / 1.02, 1 / 1.02, 1 / 1.02]), atol=1e-6
+    )
+    view, _, rig = view_of(*ERRORS["focal"])
+    gain = view.motion_gain(floor_points(rig), rig.baseline_m)
+    assert gain[3, 3] == pytest.approx(1.0, abs=0.003)
+    assert gain[5, 5] == pytest.approx(1 / 1.01, abs=0.003)
+    assert gain[2, 2] == pytest.approx(1.0, abs=1e-6)  # rotation about the optical axis
+
+
+def test_the_estimated_yaw_of_the_report_is_that_of_the_rows():
+    view, _, rig = view_of("calibration_error.right_yaw_deg=0.1")
+    rows = MeasuredRows(view, rig, 11, np.random.default_rng(0))
+    pairs = [rows.observe(StereoObservation(0, 400, None), floor_points(rig, 100), 0.03) for _ in range(5)]
+    observation, ratio = pairs[-1]
+    report = rows.report()
+    assert abs(report.estimate[1]) == pytest.approx(np.deg2rad(0.1), abs=4 * report.sigma[1])
+    assert report.sigma[1] < np.deg2rad(0.02)
+    assert observation.row_spread_ratio == pytest.approx(ratio) and ratio > 1.1
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Metrics of short surveys, by name of the errors."""
+    names, folder = ("ideal", "baseline", "focal"), tmp_path_factory.mktemp("runs")
+    return {n: survey.run(scenario(*ERRORS.get(n, ())), folder / n, outputs=()).metrics for n in names}
+
+
+def test_a_survey_with_a_longer_baseline_maps_the_floor_two_percent_too_near(flown):
+    """Heights are too great by 2 % of the depth of about 1.8 m, and the path is too short by 2 %."""
+    errors = {name: metrics["map"]["bias_m"] for name, metrics in flown.items()}
+    assert errors["baseline"] - errors["ideal"] == pytest.approx(0.0353, rel=0.1)
+    assert errors["focal"] - errors["ideal"] == pytest.approx(0.0175, rel=0.1)
+    path = {name: metrics["trajectory"]["final"]["ate_rmse_m"] for name, metrics in flown.items()}
+    assert path["baseline"] > 5 * path["ideal"] and path["focal"] < 3 * path["ideal"]
+    assert flown["baseline"]["status"] == "complete"  # no image shows an error of the baseline
+
+
+TEXTURE = np.random.default_rng(1).normal(120, 20, (120, 160)).astype(np.float32)
+
+
+def test_snow_that_changes_nothing_leaves_the_bound_of_the_noise():
+    effect = snow_effect([TEXTURE] * 3, [TEXTURE] * 3, 2.0, 11)
+    gradient2 = float(np.mean(np.diff(TEXTURE, axis=1) ** 2))
+    assert effect.matched_share == 1.0
+    # patches with more texture than the mean have a larger weight
+    assert effect.variance_px2 == pytest.approx(2 * 4 / (121 * gradient2), rel=0.1)
+
+
+def test_the_share_of_matches_falls_with_the_part_of_the_image_that_flakes_cover():
+    """A bright square in every view is in each of the two images of a match: (side + patch)^2 pixels are lost twice."""
+    snowy = []
+    for k in range(3):
+        image = TEXTURE.copy()
+        image[40:60, 30 + 40 * k : 50 + 40 * k] = 255 * (np.indices((20, 20)).sum(0) % 2)
+        snowy.append(image)
+    effect = snow_effect([TEXTURE] * 3, snowy, 2.0, 11)
+    lost = 2 * (20 + 11) ** 2 / ((120 - 22) * (160 - 22))
+    assert 1 - effect.matched_share == pytest.approx(lost, rel=0.25)
+
+
+def test_more_snow_gives_less_precise_and_fewer_matches():
+    mission = prepare(scenario())
+    bounds_px, clear = np.transpose([
+        precision(scenario(f"snow.density_per_m3={density}"), mission.illumination, mission.terrain, np.array([1.8]))
+        for density in (0, 400, 1600)
+    ])[0]  # fmt: skip
+    assert bounds_px[0] < bounds_px[1] < bounds_px[2]
+    assert clear[0] == 1 > clear[1] > clear[2]
+
+
+MURKY = ['water.jerlov="9C"', "plan.altitude_m=3"]
+
+
+def world(*sets, fitted=None):
+    return SurrogateWorld(prepare(scenario(*sets)), Stopwatch(), fitted or error_model_file.load())
+
+
+def test_a_survey_outside_the_fit_is_refused_with_quantity_value_and_range():
+    with pytest.raises(
+        ScenarioError, match=r"matching precision .* of 0\.\d+ px .allowed: at most 0\.\d+ px.*--extrapolate"
+    ):
+        world(*MURKY)
+
+
+def test_with_extrapolate_it_flies_with_a_warning_that_says_so():
+    warnings = world(*MURKY, "imaging.extrapolate=true").warnings
+    assert len(warnings) == 1 and warnings[0].startswith(
+        "The surrogate extrapolates outside the range of its error model: matching"
+    )
+    assert "matching precision" in warnings[0] and "at most" in warnings[0]
+    assert world().warnings == ()
+
+
+def test_a_survey_of_a_study_outside_the_fit_is_a_refused_row(tmp_path):
+    given = scenario(*MURKY)
+    row = fly(Survey(0, 1, {}, given, given.fingerprint(), tmp_path / "runs" / "0", "none"))
+    assert row["status"] == "refused" and "matching precision" in row["reason"]
+
+
+def test_extrapolate_of_the_command_line_sets_the_key_of_every_survey():
+    for extrapolate in (True, False):
+        study = study_command.load("turbidity", study_command.StudyOptions(extrapolate=extrapolate))
+        assert next(surveys(study, Path("unused"))).scenario.imaging.extrapolate is extrapolate
+
+
+def test_every_range_in_the_file_limits_the_surveys(tmp_path):
+    fitted = error_model_file.FittedErrorModel(ErrorModel(), 3, {}, {"lamp_share": (0.0, 0.5)})
+    error_model_file.save(fitted, tmp_path / "model.toml")
+    assert error_model_file.load(tmp_path / "model.toml") == fitted
+    with pytest.raises(ScenarioError, match="share of the light from the lamps of 1 .allowed: 0 to 0.5"):
+        world(fitted=fitted)
+
+
+def test_a_range_of_an_unknown_quantity_is_rejected(tmp_path):
+    text = error_model_file.DEFAULT_FILE.read_text().replace(
+        "[fitted_range]", "[fitted_range]\nsalinity = [1.0, 2.0]\n#"
+    )
+    (tmp_path / "model.toml").write_text(text)
+    with pytest.raises(TwinError, match="fitted_range.salinity: unknown quantity"):
+        error_model_file.load(tmp_path / "model.toml")
+
+
+def test_a_quantity_may_leave_its_range_by_its_factor():
+    factor = QUANTITIES["bound_px"].factor
+    fitted = {"bound_px": (0.02, 0.1)}
+    assert not departures({"bound_px": (0.001, 0.1 * factor)}, fitted)  # more precise than in the fit
+    (found,) = departures({"bound_px": (0.05, 0.101 * factor)}, fitted)
+    assert found.values == (0.05, 0.101 * factor) and "px" in found.allowed_text
+
+
+def test_points_whose_disparity_would_be_negative_are_not_matched():
+    """A yaw of 5 deg towards the left camera takes 0.087 off all disparities."""
+    view, _, rig = view_of("calibration_error.right_yaw_deg=-5")
+    points = floor_points(rig)
+    matched = MeasuredRows(view, rig, 11, np.random.default_rng(0)).are_matched(points)
+    assert not matched[points[:, 2] < 0.08].any()

@@ -1,0 +1,80 @@
+"""Kalman filter of the pose and velocity of the camera between two keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.braking import braking_factor
+from twin.core.geometry import Array
+
+#: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
+_ACCELERATION = np.array([2.0] * 3 + [2.0] * 3)
+_FIRST_VELOCITY = np.array(
+    [1.0] * 3 + [1.0] * 3
+)  # standard deviation of the velocity before it is measured [rad/s, m/s]
+_GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it, the measurement is rejected
+
+
+class MotionFilter:
+    """Extended Kalman filter of the pose in a reference camera and of the velocity, with white acceleration.
+
+    A vehicle cannot jump from frame to frame. Where the image determines a pose well, the filter follows the measured
+    pose; where it does not (few pixels, noise), the pose follows from the velocity over many frames, and a measurement
+    that contradicts the prediction is rejected. The model is that of constant velocity (Bar-Shalom, Li & Kirubarajan
+    2001, Estimation with Applications to Tracking and Navigation, section 6.3.2). Errors of the pose are motions
+    [rotation, translation] (rad, m) in the axes of the camera: true pose = pose @ exp(error).
+
+    Attributes:
+        pose: (4, 4) pose of the last frame in the reference camera.
+        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    """
+
+    def __init__(self):
+        self.pose, self.velocity = np.eye(4), np.zeros(6)
+        self._blind_s = 0.0  # time since the last measurement
+        self._cov = np.zeros((12, 12))
+        self._cov[6:, 6:] = np.diag(_FIRST_VELOCITY**2)
+
+    @property
+    def cov(self) -> Array:
+        """Returns the covariance (6, 6) of the pose."""
+        return self._cov[:6, :6]
+
+    def restart(self) -> None:
+        """Makes the last frame the reference; the velocity remains."""
+        self.pose = np.eye(4)
+        self._cov[:6], self._cov[:, :6] = 0.0, 0.0
+
+    def predict(self, interval_s: float) -> None:
+        """Moves to the predicted pose of the next frame, `interval_s` later.
+
+        The velocity is constant; after `braking.BLIND_S` without a measurement it decays.
+        """
+        self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
+        self._blind_s += interval_s
+        motion = geometry.exp(self.velocity * interval_s)
+        self.pose = geometry.nearest_rigid(self.pose @ motion)
+        transition = np.eye(12)
+        transition[:6, :6] = geometry.adjoint(geometry.inverse(motion))
+        transition[:6, 6:] = np.eye(6) * interval_s
+        by_acceleration = np.vstack([np.diag(_ACCELERATION) * interval_s**2 / 2, np.diag(_ACCELERATION) * interval_s])
+        self._cov = transition @ self._cov @ transition.T + by_acceleration @ by_acceleration.T
+
+    def correct(self, measured: Array, cov: Array) -> bool:
+        """Fuses a measured pose (4, 4) with its covariance (6, 6).
+
+        Returns:
+            Whether the measurement was used; False if it contradicts the prediction.
+        """
+        innovation = geometry.log(geometry.inverse(self.pose) @ measured)
+        gain = np.linalg.solve(self._cov[:6, :6] + cov, self._cov[:6]).T
+        if innovation @ np.linalg.solve(self._cov[:6, :6] + cov, innovation) > _GATE:
+            return False
+        self._blind_s = 0.0
+        update = gain @ innovation
+        self.pose = geometry.nearest_rigid(self.pose @ geometry.exp(update[:6]))
+        self.velocity = self.velocity + update[6:]
+        updated = self._cov - gain @ self._cov[:6]
+        self._cov = (updated + updated.T) / 2
+        return True

@@ -1,0 +1,279 @@
+"""Radiance of one pixel in one colour band by Monte Carlo, in components, with standard errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.floor_rays import HeightField, height_field
+from twin.core.records import StereoRig
+from twin.errors import TwinError
+from twin.imaging.lamps import LightSources, beam_share
+from twin.imaging.phase_function import PhaseFunction, petzold, tabulate
+from twin.imaging.reference.walk import DIRECT, FIRST_BIN, LAMP_SCATTERED, VEIL_MORE, VEIL_ONCE, trace_pixel
+
+Array = NDArray[np.float64]
+
+BEAM_STEPS = 3600  # steps of 0.025 deg
+LAMP_RADIUS_M = 0.03  # radius of the housing of a lamp, within which there is no water
+BIN_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0, 80.0, 160.0)
+NO_FLOOR = height_field(np.zeros((2, 2)), 1.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class BandWater:
+    """Optical properties of the water in one colour band.
+
+    Args:
+        absorption_per_m: absorption coefficient a [1/m].
+        scattering_per_m: scattering coefficient b [1/m].
+        phase: phase function.
+    """
+
+    absorption_per_m: float
+    scattering_per_m: float
+    phase: PhaseFunction = petzold
+
+
+@dataclass(frozen=True)
+class Sunlight:
+    """Parallel light from above a water surface that neither refracts nor reflects.
+
+    Args:
+        to_sun: (3,) unit direction to the sun under water, in world axes.
+        normal_lx: illuminance just below the surface on a plane that faces the sun [lx].
+        surface_m: height of the surface, z in world axes; light that rises above it is lost.
+    """
+
+    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    normal_lx: float = 0.0
+    surface_m: float = np.inf
+
+
+@dataclass(frozen=True)
+class ReferenceScene:
+    """Water, light and floor of a reference computation for one colour band.
+
+    Args:
+        water: optical properties of the water.
+        lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity on the axis [cd].
+        beams: for each lamp, (m, 2) angle from the axis [deg] and intensity relative to that on the axis.
+        albedo: Lambert albedo of the floor.
+        relief: the floor; None = the plane z = 0.
+        sun: parallel light; by default none, and no surface.
+        lamp_radius_m: distance from a lamp within which there is no water.
+    """
+
+    water: BandWater
+    lamps: Array
+    beams: Sequence[Array]
+    albedo: float = 0.5
+    relief: HeightField | None = None
+    sun: Sunlight = field(default_factory=Sunlight)
+    lamp_radius_m: float = LAMP_RADIUS_M
+
+
+class PixelRay(NamedTuple):
+    """A pixel of a camera: world_from_camera (4, 4), the camera, and (column, row) [px]."""
+
+    world_from_camera: Array
+    rig: StereoRig
+    pixel: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Size of a Monte Carlo computation.
+
+    Args:
+        walks: number of pairs of walks; each pair starts at the floor and in the water.
+        batches: number of batches, from whose spread the standard errors follow.
+        seed: seed of the random numbers; equal seeds give equal results.
+        plain: use the textbook estimator, which connects every vertex straight to the lamps and samples directions from
+            the phase function alone. It has the same mean and a much larger variance: a check of the other.
+    """
+
+    walks: int = 100_000
+    batches: int = 32
+    seed: int = 1
+    plain: bool = False
+
+
+class BatchMean(NamedTuple):
+    """A mean and its standard error."""
+
+    value: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class PixelLight:
+    """Light that reaches a pixel: means of the batches [cd/m2].
+
+    Args:
+        sums: (batches, FIRST_BIN + 2 n) light of each batch, as in `walk.walk`.
+        bin_edges_px: (n,) lower edges of the bins of blurred light.
+    """
+
+    sums: Array
+    bin_edges_px: Array
+
+    @property
+    def total(self) -> BatchMean:
+        """All light."""
+        return _estimate(self.sums.sum(1))
+
+    @property
+    def direct(self) -> BatchMean:
+        """Light of the floor that was scattered neither between lamp and floor nor between floor and camera."""
+        return _estimate(self.sums[:, DIRECT])
+
+    @property
+    def lamp_scattered(self) -> BatchMean:
+        """Light of the floor that arrived unscattered, but reached the floor by scattering or from the floor."""
+        return _estimate(self.sums[:, LAMP_SCATTERED])
+
+    @property
+    def sharp(self) -> BatchMean:
+        """Light of the floor that was not scattered between floor and camera."""
+        return _estimate(self._sharp)
+
+    @property
+    def blurred(self) -> BatchMean:
+        """Light of the floor that was scattered between floor and camera."""
+        return _estimate(self.blurred_by_bin.sum((1, 2)))
+
+    @property
+    def blurred_straight_lamp(self) -> BatchMean:
+        """Light of the floor that was scattered between floor and camera only."""
+        return _estimate(self.blurred_by_bin[:, 0].sum(1))
+
+    @property
+    def veil(self) -> BatchMean:
+        """Light that never touched the floor."""
+        return _estimate(self.sums[:, VEIL_ONCE] + self.sums[:, VEIL_MORE])
+
+    @property
+    def veil_once(self) -> BatchMean:
+        """Light that never touched the floor and was scattered once."""
+        return _estimate(self.sums[:, VEIL_ONCE])
+
+    @property
+    def sharp_share(self) -> BatchMean:
+        """Share of `sharp` in `total`."""
+        return ratio(self._sharp, self.sums.sum(1))
+
+    @property
+    def blurred_by_bin(self) -> Array:
+        """(batches, 2, n) blurred light by the way from the lamps (straight, not straight) and by bin."""
+        return self.sums[:, FIRST_BIN:].reshape(len(self.sums), 2, -1)
+
+    def blurred_share(self, from_px: float, to_px: float = np.inf) -> BatchMean:
+        """Returns the share of the blurred light that arrives between two distances from its straight image [px].
+
+        Both must be edges of bins.
+        """
+        edges = self.bin_edges_px
+        if from_px not in edges or (to_px not in edges and np.isfinite(to_px)):
+            raise ValueError(f"{from_px:g}, {to_px:g}: not among the edges {edges.tolist()}")
+        light = self.blurred_by_bin.sum(1)
+        return ratio(light[:, (edges >= from_px) & (edges < to_px)].sum(1), light.sum(1))
+
+    @property
+    def _sharp(self) -> Array:
+        return self.sums[:, DIRECT] + self.sums[:, LAMP_SCATTERED]
+
+
+class KernelScene(NamedTuple):
+    """A `ReferenceScene` as the compiled kernels take it; lamps without light are left out."""
+
+    absorption: float
+    scattering: float
+    albedo: float
+    density_per_sr: Array
+    cumulative: Array
+    cumulative_angle: Array
+    angle_integral: float
+    beyond: Array
+    lamps: Array
+    beams: Array
+    lamp_radius_m: float
+    to_sun: Array
+    sun_lx: float
+    surface_m: float
+    is_plane: bool
+    field: HeightField
+    plain: bool
+
+
+def pixel_light(
+    scene: ReferenceScene, ray: PixelRay, effort: Effort, bin_edges_px: Sequence[float] = BIN_EDGES_PX
+) -> PixelLight:
+    """Returns the light that reaches a pixel, in components.
+
+    Args:
+        scene: water, light and floor.
+        ray: the pixel.
+        effort: number of walks, and seed.
+        bin_edges_px: lower edges of the bins of blurred light, from 0; the last bin is open.
+    Raises:
+        TwinError: there are fewer than two batches or fewer walks than batches.
+    """
+    if effort.batches < 2 or effort.walks < effort.batches:
+        raise TwinError("effort.batches", f"{effort.batches} for {effort.walks} walks", "2 or more, one walk in each")
+    kernel, view, edges = _kernel_scene(scene, effort.plain), _view(ray), np.array(bin_edges_px, np.float64)
+    rngs = [np.random.default_rng(s) for s in np.random.SeedSequence(effort.seed).spawn(effort.batches)]
+    n_walks = effort.walks // effort.batches
+    return PixelLight(np.array([trace_pixel(kernel, view, edges, n_walks, rng) for rng in rngs]), edges)
+
+
+def lamps_in_world(sources: LightSources, world_from_camera: Array, band: int) -> Array:
+    """Returns the lamps (n, 7) of a `ReferenceScene` from the lamps in the axes of a camera.
+
+    Args:
+        sources: lamps in the axes of the camera.
+        world_from_camera: (4, 4) pose of that camera.
+        band: 0 red, 1 green, 2 blue.
+    """
+    rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
+    light_cd = sources.intensity_cd * sources.colour[:, band]
+    return np.column_stack([sources.position_m @ rotation.T + origin, sources.axis @ rotation.T, light_cd])
+
+
+def ratio(part: Array, whole: Array) -> BatchMean:
+    """Returns the ratio of two means over batches; its error is that of the linearised ratio (delta method)."""
+    if whole.mean() == 0:
+        return BatchMean(np.nan, np.nan)
+    value = part.mean() / whole.mean()
+    return BatchMean(float(value), _estimate((part - value * whole) / whole.mean()).standard_error)
+
+
+def _estimate(batches: Array) -> BatchMean:
+    return BatchMean(float(batches.mean()), float(batches.std(ddof=1) / np.sqrt(len(batches))))
+
+
+def _kernel_scene(scene: ReferenceScene, plain: bool) -> KernelScene:
+    table = tabulate(scene.water.phase)
+    angles = np.linspace(0.0, 90.0, BEAM_STEPS + 1)
+    beams = np.array([beam_share(np.cos(np.deg2rad(angles)), beam) for beam in scene.beams])
+    lamps = np.ascontiguousarray(np.reshape(scene.lamps, (-1, 7)), np.float64)
+    lit = lamps[:, 6] > 0
+    sun, floor = scene.sun, scene.relief
+    return KernelScene(
+        float(scene.water.absorption_per_m), float(scene.water.scattering_per_m), float(scene.albedo),
+        table.density_per_sr, table.cumulative, table.cumulative_angle, table.angle_integral, table.beyond,
+        np.ascontiguousarray(lamps[lit]), np.ascontiguousarray(beams.reshape(-1, BEAM_STEPS + 1)[lit]),
+        float(scene.lamp_radius_m), np.array(sun.to_sun, np.float64), float(sun.normal_lx), float(sun.surface_m),
+        floor is None, NO_FLOOR if floor is None else floor, plain,
+    )  # fmt: skip
+
+
+def _view(ray: PixelRay) -> Array:
+    """Returns the camera and the pixel as `walk.bin_of` takes them: (5, 3)."""
+    pose, rig = ray.world_from_camera, ray.rig
+    pixel = ray.pixel[0] - rig.cx_px, ray.pixel[1] - rig.cy_px, rig.focal_px
+    return np.vstack([pose[:3, :3].T, pose[:3, 3], pixel])

@@ -1,0 +1,105 @@
+"""Compiled sampling of directions: phase function table, hemisphere above a floor, lobe around a lamp."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+GUIDE_G = 0.9  # mean cosine of the lobe around a lamp
+
+
+@njit(cache=True, nogil=True, inline="always")
+def density_at(density_per_sr, cosine):
+    """Returns the value of a phase function table [1/sr] at the cosine of the scattering angle."""
+    cells = density_per_sr.shape[0]
+    x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 0.0)))
+    return density_per_sr[min(int(x * cells), cells - 1)]
+
+
+@njit(cache=True, nogil=True)
+def cell_of(cumulative, u):
+    """Returns the cell i of a table for which cumulative[i] <= u < cumulative[i + 1]."""
+    low, high = 0, cumulative.shape[0] - 1
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if cumulative[middle] <= u:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True)
+def sample_cosine(cumulative, rng):
+    """Returns a cosine of the scattering angle, distributed as the light that the phase function scatters."""
+    cells = cumulative.shape[0] - 1
+    k = cell_of(cumulative, rng.random())
+    low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4
+    return 1 - 2 * (low + (high - low) * rng.random())
+
+
+@njit(cache=True, nogil=True)
+def sample_angle(cumulative_angle, rng):
+    """Returns a scattering angle [rad], distributed as the phase function times the angle."""
+    cells = cumulative_angle.shape[0] - 1
+    k = cell_of(cumulative_angle, rng.random())
+    low, high = 2 * np.arcsin((k / cells) ** 2), 2 * np.arcsin(((k + 1) / cells) ** 2)
+    return np.sqrt(low**2 + (high**2 - low**2) * rng.random())
+
+
+@njit(cache=True, nogil=True)
+def turn(x, y, z, cosine, sine, azimuth):
+    """Returns the unit vector at a polar angle and an azimuth around the unit vector (x, y, z).
+
+    The frame around the axis is that of Duff et al. (2017, J. Comput. Graph. Tech. 6, 1).
+    """
+    sign = 1.0 if z >= 0 else -1.0
+    a = -1 / (sign + z)
+    b = x * y * a
+    e, f = sine * np.cos(azimuth), sine * np.sin(azimuth)
+    return (
+        cosine * x + e * (1 + sign * x * x * a) + f * b,
+        cosine * y + e * sign * b + f * (sign + y * y * a),
+        cosine * z - e * sign * x - f * y,
+    )
+
+
+@njit(cache=True, nogil=True)
+def turn_by_cosine(x, y, z, cosine, rng):
+    """Returns the unit vector at an angle of given cosine from (x, y, z), with a random azimuth."""
+    sine = np.sqrt(max(1 - cosine * cosine, 0.0))
+    return turn(x, y, z, cosine, sine, 2 * np.pi * rng.random())
+
+
+@njit(cache=True, nogil=True)
+def sample_guide(cumulative_angle, rng):
+    """Returns the cosine of the angle from a lamp, for directions that are sampled around the lamp.
+
+    One half follows the angle at a point under which light arrives that was scattered once on its way from the lamp:
+    evenly between 0 and the scattering angle, which has the density p(angle) angle. The other half is wider, for light
+    that was scattered more often: a Henyey-Greenstein lobe of mean cosine `GUIDE_G`, by inversion.
+    """
+    if rng.random() < 0.5:
+        return np.cos(sample_angle(cumulative_angle, rng) * rng.random())
+    g = GUIDE_G
+    part = (1 - g * g) / (1 - g + 2 * g * rng.random())
+    return min((1 + g * g - part * part) / (2 * g), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def guide_density(density_per_sr, beyond, angle_integral, cosine):
+    """Returns the density [1/sr] of `sample_guide` at the cosine of the angle from the lamp.
+
+    Args:
+        density_per_sr: (n,) phase function table.
+        beyond: (n + 1,) integral of the phase function over the angle, from each cell boundary to pi [rad/sr].
+        angle_integral: integral of phase function times angle.
+        cosine: cosine of the angle from the lamp.
+    """
+    g, cells = GUIDE_G, density_per_sr.shape[0]
+    x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 1e-18)))
+    k = min(int(x * cells), cells - 1)
+    angle, end = 2 * np.arcsin(min(x * x, 1.0)), 2 * np.arcsin(((k + 1) / cells) ** 2)
+    once = (beyond[k + 1] + density_per_sr[k] * (end - angle)) / angle_integral
+    once /= 2 * np.pi * max(2 * x * x * np.sqrt(max(1 - x**4, 0.0)), 1e-12)
+    return 0.5 * once + 0.5 * (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)

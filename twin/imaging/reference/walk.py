@@ -1,0 +1,332 @@
+"""Compiled random walks of light, traced backwards from a pixel: the kernel of the reference.
+
+The radiance of a pixel is the integral over all paths from lamps and sun that end in its ray (Veach 1997, the path
+integral; Mobley 1994 for the quantities). A walk starts in two ways: at the floor point that the pixel shows, with the
+share exp(-c r) that arrives unscattered, and at a first scattering between camera and floor, sampled from the truncated
+exponential distribution. At each vertex the lamps are connected:
+
+* each vertex straight: rho/pi cos I/d^2 exp(-c d) at the floor, or p I/d^2 exp(-c d) in the water;
+* each vertex also by one more scattering between vertex and lamp. With the scattering angle t = alpha + beta, where
+  alpha and beta are the angles of the triangle at vertex and lamp, and D their distance, the volume element divided by
+  both squared distances is (1/D) d(alpha) d(t) d(azimuth). If t is sampled in proportion to p(t) t, and alpha evenly
+  between 0 and t, the weight has neither the peak of p nor the poles 1/d^2 (compare Georgiev et al. 2013).
+
+Light that is scattered last at a point of the water is found both ways, which `share_of_walk` weights.
+
+The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), and
+lobes around the lamps. Absorption is a weight. Russian roulette ends weak walks; nothing is clamped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from twin.imaging.reference.floor import LIFT_M, floor_distance, floor_normal, sees
+from twin.imaging.reference.sampling import (
+    density_at,
+    guide_density,
+    sample_angle,
+    sample_cosine,
+    sample_guide,
+    turn,
+    turn_by_cosine,
+)
+
+#: Sums that a walk adds to, before the bins of the blurred light.
+DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
+GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around the lamps
+WEAK, STEPS = 0.002, 10000  # relative weight at which the roulette starts; largest number of vertices
+
+
+@njit(cache=True, nogil=True)
+def beam_at(beam, cosine):
+    """Returns the relative intensity of a lamp, from its values at even steps of the angle from 0 to 90 deg."""
+    if cosine <= 0:
+        return 0.0
+    at = np.arccos(min(cosine, 1.0)) / (np.pi / 2) * (beam.shape[0] - 1)
+    k = min(int(at), beam.shape[0] - 2)
+    return beam[k] + (at - k) * (beam[k + 1] - beam[k])
+
+
+@njit(cache=True, nogil=True)
+def response(scene, kind, normal, direction, ox, oy, oz):
+    """Returns the light that a vertex sends back along its path per unit of light from a direction [1/sr].
+
+    Args:
+        kind: 0 floor (albedo / pi times the cosine), 1 water (phase function).
+        normal: unit normal of the floor.
+        direction: unit direction in which the backward path arrived.
+        ox, oy, oz: unit direction from the vertex towards the light.
+    """
+    if kind == 0:
+        return scene.albedo / np.pi * max(normal[0] * ox + normal[1] * oy + normal[2] * oz, 0.0)
+    return density_at(scene.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
+
+
+@njit(cache=True, nogil=True)
+def straight(scene, kind, point, normal, direction, before, density, step_m):
+    """Returns the light of all lamps that reaches a vertex without scattering, times its response.
+
+    Args:
+        before: the vertex before it.
+        density: density of the direction between both [1/sr]; 0 for the full light, else it is `share_of_walk`.
+        step_m: distance between both.
+    """
+    total, attenuation = 0.0, scene.absorption + scene.scattering
+    for k in range(scene.lamps.shape[0]):
+        lamp = scene.lamps[k]
+        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
+        d = np.sqrt(x * x + y * y + z * z)
+        if d <= scene.lamp_radius_m:
+            continue
+        x, y, z = x / d, y / d, z / d
+        light = lamp[6] * beam_at(scene.beams[k], -(x * lamp[3] + y * lamp[4] + z * lamp[5]))
+        light *= response(scene, kind, normal, direction, x, y, z)
+        if light > 0 and sees(scene.is_plane, scene.field, point[0], point[1], point[2], lamp[0], lamp[1], lamp[2]):
+            light *= np.exp(-attenuation * d) / (d * d)
+            if density > 0:
+                a, b, c = lamp[0] - before[0], lamp[1] - before[1], lamp[2] - before[2]
+                phase = density_at(scene.density_per_sr, direction[0] * x + direction[1] * y + direction[2] * z)
+                light *= share_of_walk(scene, np.sqrt(a * a + b * b + c * c), phase, d, density, step_m)
+            total += light
+    return total
+
+
+@njit(cache=True, nogil=True)
+def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
+    """Returns an estimate of the light of all lamps that reaches a vertex scattered once, times its response.
+
+    It is weighted by the complement of `share_of_walk`; `guided` is the share of guided directions at the vertex.
+    """
+    total, attenuation = 0.0, scene.absorption + scene.scattering
+    for k in range(scene.lamps.shape[0]):
+        lamp = scene.lamps[k]
+        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
+        d = np.sqrt(x * x + y * y + z * z)
+        if d <= scene.lamp_radius_m:
+            continue
+        angle = sample_angle(scene.cumulative_angle, rng)
+        alpha = angle * rng.random()
+        sine = np.sin(angle)
+        if sine <= 0:
+            continue
+        from_point, from_lamp = d * np.sin(angle - alpha) / sine, d * np.sin(alpha) / sine
+        if from_lamp <= scene.lamp_radius_m:
+            continue
+        ox, oy, oz = turn(x / d, y / d, z / d, np.cos(alpha), np.sin(alpha), 2 * np.pi * rng.random())
+        own = response(scene, kind, normal, direction, ox, oy, oz)
+        if own <= 0:
+            continue
+        px, py, pz = point[0] + from_point * ox, point[1] + from_point * oy, point[2] + from_point * oz
+        if pz >= scene.surface_m:
+            continue
+        bx, by, bz = (px - lamp[0]) / from_lamp, (py - lamp[1]) / from_lamp, (pz - lamp[2]) / from_lamp
+        light = own * lamp[6] * beam_at(scene.beams[k], bx * lamp[3] + by * lamp[4] + bz * lamp[5])
+        if light <= 0 or not sees(scene.is_plane, scene.field, point[0], point[1], point[2], px, py, pz):
+            continue
+        if sees(scene.is_plane, scene.field, px, py, pz, lamp[0], lamp[1], lamp[2]):
+            scale = 2 * np.pi * scene.angle_integral * scene.scattering / d
+            scale *= np.exp(-attenuation * (from_point + from_lamp))
+            density = direction_density(scene, kind, point, guided, own, ox, oy, oz)
+            phase = density_at(scene.density_per_sr, np.cos(angle))
+            total += scale * light * (1 - share_of_walk(scene, d, phase, from_lamp, density, from_point))
+    return total
+
+
+@njit(cache=True, nogil=True)
+def sunlight(scene, kind, point, normal, direction):
+    """Returns the sunlight that reaches a vertex without scattering, times its response."""
+    sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
+    if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
+        return 0.0
+    if floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], sx, sy, sz) < np.inf:
+        return 0.0
+    path = (scene.surface_m - point[2]) / sz
+    light = scene.sun_lx * np.exp(-(scene.absorption + scene.scattering) * path)
+    return light * response(scene, kind, normal, direction, sx, sy, sz)
+
+
+@njit(cache=True, nogil=True)
+def next_direction(scene, kind, point, normal, direction, guided, rng):
+    """Returns the next direction of a walk, sampled from the mixture whose density `direction_density` returns."""
+    n = scene.lamps.shape[0]
+    if n > 0 and rng.random() < guided:
+        lamp = scene.lamps[min(int(n * rng.random()), n - 1)]
+        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
+        d = np.sqrt(x * x + y * y + z * z)
+        x, y, z = turn_by_cosine(x / d, y / d, z / d, sample_guide(scene.cumulative_angle, rng), rng)
+    elif kind == 0:
+        x, y, z = turn_by_cosine(normal[0], normal[1], normal[2], np.sqrt(rng.random()), rng)
+    else:
+        cosine = sample_cosine(scene.cumulative, rng)
+        x, y, z = turn_by_cosine(direction[0], direction[1], direction[2], cosine, rng)
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+@njit(cache=True, nogil=True)
+def direction_density(scene, kind, point, guided, own, x, y, z):
+    """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
+
+    Args:
+        kind: 0 floor, 1 water.
+        guided: share of the directions that are sampled around the lamps.
+        own: response of the vertex to that direction; per unit of albedo it is the density of the other directions.
+    """
+    own = own / scene.albedo if kind == 0 else own
+    n = scene.lamps.shape[0]
+    if n == 0 or guided == 0:
+        return own
+    lobes = 0.0
+    for k in range(n):
+        a, b, c = scene.lamps[k, 0] - point[0], scene.lamps[k, 1] - point[1], scene.lamps[k, 2] - point[2]
+        cosine = (a * x + b * y + c * z) / np.sqrt(a * a + b * b + c * c)
+        lobes += guide_density(scene.density_per_sr, scene.beyond, scene.angle_integral, cosine) / n
+    return (1 - guided) * own + guided * lobes
+
+
+@njit(cache=True, nogil=True)
+def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
+    """Returns the share of the walk's estimate of the light of a lamp that is scattered last at a point.
+
+    The walk and `by_one_scattering` sample the same point with the densities per volume w and s; their estimates
+    are weighted by w / (w + s) and s / (w + s) (the balance heuristic of Veach 1997, section 9.2.2).
+
+    Args:
+        lamp_m: distance of the lamp from the vertex before the point.
+        phase: value of the phase function for the scattering at the point [1/sr].
+        to_lamp_m: distance of the lamp from the point.
+        density: density of the direction from that vertex to the point [1/sr].
+        step_m: distance of the point from that vertex.
+    """
+    by_walk = density * scene.scattering * np.exp(-scene.scattering * step_m)
+    by_connection = phase * lamp_m / (2 * np.pi * scene.angle_integral * to_lamp_m * to_lamp_m)
+    return by_walk / (by_walk + by_connection)
+
+
+@njit(cache=True, nogil=True)
+def bin_of(view, bin_edges_px, x, y, z):
+    """Returns the bin of the distance between a pixel and the straight image of a point; the last bin is open.
+
+    Args:
+        view: (5, 3) axes of the camera as rows, its position, and (column, row) of the pixel from the principal point
+            and the focal length [px].
+    """
+    a, b, c = x - view[3, 0], y - view[3, 1], z - view[3, 2]
+    depth = a * view[2, 0] + b * view[2, 1] + c * view[2, 2]
+    last = bin_edges_px.shape[0] - 1
+    if depth <= 0:
+        return last
+    u = view[4, 2] * (a * view[0, 0] + b * view[0, 1] + c * view[0, 2]) / depth - view[4, 0]
+    v = view[4, 2] * (a * view[1, 0] + b * view[1, 1] + c * view[1, 2]) / depth - view[4, 1]
+    away = np.sqrt(u * u + v * v)
+    k = last
+    while k > 0 and bin_edges_px[k] > away:
+        k -= 1
+    return k
+
+
+@njit(cache=True, nogil=True)
+def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
+    """Adds the light of one walk to `sums`.
+
+    Args:
+        scene: `pixel_light.KernelScene`.
+        kind: 0 if the first vertex is the floor point of the pixel, 1 if it is a scattering on the pixel's ray.
+        point: (3,) first vertex.
+        direction: (3,) unit direction in which the backward path arrives there.
+        weight: weight of the first vertex.
+        sums: (FIRST_BIN + 2 n,) sums of light [cd/m2]: after FIRST_BIN, n bins of blurred light of the floor whose way
+            from the lamps was straight, and n bins of that whose way was not.
+    """
+    unscattered, before_floor, at_first_floor = kind == 0, kind == 1, False
+    n_bins, at_bin, start = bin_edges_px.shape[0], 0, weight
+    before, density, step_m = point, 0.0, 0.0
+    normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
+    for order in range(STEPS):
+        first = order == 0
+        shared = 0.0 if scene.plain or kind == 0 else density  # density is 0 at the first vertex
+        once = weight * sunlight(scene, kind, point, normal, direction)
+        once += weight * straight(scene, kind, point, normal, direction, before, shared, step_m)
+        guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == 0 else GUIDED_IN_WATER)
+        more = 0.0
+        if not scene.plain and scene.scattering > 0:
+            more = weight * by_one_scattering(scene, kind, point, normal, direction, guided, rng)
+        if before_floor:
+            sums[VEIL_ONCE if first else VEIL_MORE] += once
+            sums[VEIL_MORE] += more
+        elif unscattered:
+            if not first:  # the light that is scattered nowhere is computed once, without sampling
+                sums[LAMP_SCATTERED] += once
+            sums[LAMP_SCATTERED] += more
+        else:
+            sums[FIRST_BIN + at_bin + (0 if at_first_floor else n_bins)] += once
+            sums[FIRST_BIN + at_bin + n_bins] += more
+            at_first_floor = False
+        if scene.scattering <= 0:
+            return
+        x, y, z = next_direction(scene, kind, point, normal, direction, guided, rng)
+        own = response(scene, kind, normal, direction, x, y, z)
+        if own <= 0:
+            return
+        density = direction_density(scene, kind, point, guided, own, x, y, z)
+        weight *= own / density
+        if weight < WEAK * start:
+            survival = weight / (WEAK * start)
+            if rng.random() >= survival:
+                return
+            weight = WEAK * start
+        direction = (x, y, z)
+        floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
+        surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
+        step_m = -np.log(1 - rng.random()) / scene.scattering
+        if step_m >= surface_m and surface_m <= floor_m:
+            return
+        kind = 1 if step_m < floor_m else 0
+        step_m = min(step_m, floor_m)
+        weight *= np.exp(-scene.absorption * step_m)
+        before = point
+        point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
+        if kind == 0:
+            normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
+            point = (point[0] + LIFT_M * normal[0], point[1] + LIFT_M * normal[1], point[2] + LIFT_M * normal[2])
+            if normal[0] * x + normal[1] * y + normal[2] * z >= 0 or scene.albedo <= 0:
+                return
+            if before_floor:
+                before_floor, at_first_floor = False, True
+                at_bin = bin_of(view, bin_edges_px, point[0], point[1], point[2])
+
+
+@njit(cache=True, nogil=True)
+def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
+    """Returns the mean sums (FIRST_BIN + 2 n,) of `walk` over `n_walks` pairs of walks of a pixel, with n bins."""
+    sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
+    eye = (view[3, 0], view[3, 1], view[3, 2])
+    a, b, f = view[4, 0], view[4, 1], view[4, 2]
+    length = np.sqrt(a * a + b * b + f * f)
+    x = (a * view[0, 0] + b * view[1, 0] + f * view[2, 0]) / length
+    y = (a * view[0, 1] + b * view[1, 1] + f * view[2, 1]) / length
+    z = (a * view[0, 2] + b * view[1, 2] + f * view[2, 2]) / length
+    ray = (x, y, z)
+    floor_m = floor_distance(scene.is_plane, scene.field, eye[0], eye[1], eye[2], x, y, z)
+    end_m = min(floor_m, (scene.surface_m - eye[2]) / z if z > 0 else np.inf)
+    seen = floor_m < np.inf and floor_m <= end_m and scene.albedo > 0
+    share = 1 - np.exp(-scene.scattering * end_m) if scene.scattering > 0 else 0.0
+    arrives, shown, up = 0.0, eye, (0.0, 0.0, 1.0)
+    if seen:
+        arrives = np.exp(-(scene.absorption + scene.scattering) * floor_m)
+        shown = (eye[0] + floor_m * x, eye[1] + floor_m * y, eye[2] + floor_m * z)
+        up = floor_normal(scene.is_plane, scene.field, shown[0], shown[1])
+        shown = (shown[0] + LIFT_M * up[0], shown[1] + LIFT_M * up[1], shown[2] + LIFT_M * up[2])
+        direct = straight(scene, 0, shown, up, ray, shown, 0.0, 0.0) + sunlight(scene, 0, shown, up, ray)
+        sums[DIRECT] = n_walks * arrives * direct
+    for k in range(n_walks):
+        if seen and scene.scattering > 0:
+            walk(scene, view, bin_edges_px, 0, shown, ray, arrives, rng, sums)
+        if share > 0:
+            at_m = -np.log(1 - share * (k + rng.random()) / n_walks) / scene.scattering
+            weight = share * np.exp(-scene.absorption * at_m)
+            point = (eye[0] + at_m * x, eye[1] + at_m * y, eye[2] + at_m * z)
+            walk(scene, view, bin_edges_px, 1, point, ray, weight, rng, sums)
+    return sums / n_walks

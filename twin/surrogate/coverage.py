@@ -1,0 +1,116 @@
+"""Conditions of a survey compared with the conditions of the surveys to which the error model was fitted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from twin.surrogate.matchability import Matchability
+from twin.world.floor_forecast import planned_overlap
+from twin.world.mission import Mission
+
+Range = tuple[float, float]
+_OVERLAP_PAIRS = 40  # number of pairs of images whose overlap is computed along and across the legs
+
+
+class Quantity(NamedTuple):
+    """Condition of a survey on which the error model depends.
+
+    Args:
+        label: name in messages.
+        unit: unit in messages, with a leading space; "" for a ratio.
+        factor: factor by which a value may lie outside the fitted range.
+        limits: sides of the fitted range on which a survey may not leave it. On the other side, the functions of the
+            error model approach a limit that the surveys of the fit determine, e.g. that of noise-free images.
+    """
+
+    label: str
+    unit: str
+    factor: float = 1.0
+    limits: Literal["both", "lower", "upper"] = "both"
+
+
+#: Quantities that an error model may be limited in, by name. A name in the table [fitted_range] of the file must be one
+#: of these, and `survey_conditions` must return it.
+QUANTITIES = {
+    "bound_px": Quantity("matching precision at medium depth (Cramer-Rao bound)", " px", 1.5, "upper"),
+    "unevenness_px": Quantity(
+        "unevenness of the floor under a patch", " px per unit of baseline / depth", 1.5, "upper"
+    ),
+    "lamp_share": Quantity("share of the light from the lamps", ""),
+    "overlap_along": Quantity("median overlap along the legs", "", limits="lower"),
+    "overlap_across": Quantity("median overlap across the legs", "", limits="lower"),
+}
+
+
+def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str, Range]:
+    """Returns the smallest and the largest value of each quantity in a survey, by name.
+
+    Args:
+        mission: the survey.
+        matchability: precision of matching on its floor.
+    """
+    bound_px = matchability.bound_at(float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1])))
+    overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
+    overlaps = {f"overlap_{name}": (value, value) for name, value in overlap.items() if value is not None}
+    unevenness_px = matchability.unevenness_px
+    return {
+        "bound_px": (bound_px, bound_px),
+        "unevenness_px": (float(unevenness_px.min()), float(unevenness_px.max())),
+        "lamp_share": (matchability.lamp_share, matchability.lamp_share),
+        **overlaps,
+    }
+
+
+class Departure(NamedTuple):
+    """Quantity whose values in a survey lie outside the range that the error model may be used in.
+
+    Args:
+        quantity: the quantity.
+        values: smallest and largest value in the survey.
+        allowed: smallest and largest allowed value.
+    """
+
+    quantity: Quantity
+    values: Range
+    allowed: Range
+
+    @property
+    def value_text(self) -> str:
+        """Returns the quantity and its values in the survey."""
+        return f"{self.quantity.label} of {_text(self.values)}{self.quantity.unit}"
+
+    @property
+    def allowed_text(self) -> str:
+        """Returns the allowed range."""
+        if self.quantity.limits == "both":
+            return f"{_text(self.allowed)}{self.quantity.unit}"
+        side = "at most" if self.quantity.limits == "upper" else "at least"
+        return f"{side} {self.allowed[self.quantity.limits == 'upper']:.3g}{self.quantity.unit}"
+
+
+def departures(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[Departure]:
+    """Returns the quantities of a survey that lie outside the fitted range by more than their factor.
+
+    Args:
+        conditions: smallest and largest value of each quantity in the survey, by name.
+        fitted: smallest and largest value of each limited quantity in the surveys of the fit, by name.
+    """
+    found = []
+    for name in [name for name in fitted if name in conditions]:
+        quantity, (low, high), (smallest, largest) = QUANTITIES[name], conditions[name], fitted[name]
+        lowest = -math.inf if quantity.limits == "upper" else smallest / quantity.factor
+        highest = math.inf if quantity.limits == "lower" else largest * quantity.factor
+        allowed = lowest, highest
+        if not allowed[0] <= low <= high <= allowed[1]:
+            found.append(Departure(quantity, (low, high), allowed))
+    return found
+
+
+def _text(values: Range) -> str:
+    """Returns a range as text, or its only value."""
+    low, high = (f"{value:.3g}" for value in values)
+    return low if low == high else f"{low} to {high}"

@@ -1,0 +1,241 @@
+"""Positions that the estimators measure with a wrong calibration or an approximated port, instead of the true ones.
+
+A true point is imaged by the true cameras (lens, port, calibration errors) and the image is rectified with the believed
+calibration (`imaging.true_cameras`). The estimators then remove the pitch, the roll and the row offset of the right
+image that they estimate from row differences (`estimate.vision.epipolar_calibration`). What remains is a deterministic
+map from the true (x, y, disparity) of a point to the measured one. It is tabulated once per survey, on a regular grid
+over the image and disparity, and interpolated linearly.
+
+All positions are normalised: (x, y) = (X, Y) / Z, and disparity = believed baseline / Z for a true point (X, Y, Z).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import StereoRig
+from twin.estimate.vision.epipolar_calibration import NOTICEABLE_PX
+from twin.imaging.true_cameras import TrueCameras
+
+_SHAPE = (5, 31, 41)  # grid points along disparity, y and x
+_MARGIN = 1.3  # extent of the grid, in units of the image
+_STEP_DEPTHS = 0.01  # displacement of the camera for the Jacobian of the image motion, in depths and radians
+_FIT_ITERATIONS = 3
+_INVERSE_ITERATIONS = 8
+_COLUMNS = np.array([True, False, True, True])  # pitch, roll and row offset are removed, yaw is not
+
+
+class ViewTable(NamedTuple):
+    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x).
+
+    Args:
+        values: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are
+            measured where they are.
+        first: (3,) true disparity, y and x of the first grid point.
+        step: (3,) spacing of the grid.
+    """
+
+    values: Array
+    first: Array
+    step: Array
+
+
+IDEAL_TABLE = ViewTable(np.zeros((0, 0, 0, 3)), np.zeros(3), np.ones(3))
+
+
+class MeasuredView(NamedTuple):
+    """Measured positions of true points, and the rectification errors that cause them.
+
+    Args:
+        table: measured positions after the removal of rectification errors.
+        row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, on the grid of `table`.
+        removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove.
+    """
+
+    table: ViewTable
+    row_table: Array
+    removed: Array
+
+    @property
+    def is_ideal(self) -> bool:
+        """Returns whether all points are measured where they are."""
+        return not self.table.values.size
+
+    def measure(self, points: Array) -> Array:
+        """Returns the measured positions (n, 3) of true points (n, 3); NaN for points that are not imaged."""
+        return measure_all(self.table, points)
+
+    def row_difference(self, points: Array) -> Array:
+        """Returns the row differences (n,) after rectification, right minus left, of true points (n, 3)."""
+        rows = ViewTable(np.repeat(self.row_table[..., None], 3, axis=-1), self.table.first, self.table.step)
+        return measure_all(rows, points)[:, 0]
+
+    def true_directions(self, measured_xy: Array, disparity: float) -> Array:
+        """Returns the true (x, y) (n, 2) of points at the given true disparity that are measured at `measured_xy`."""
+        if self.is_ideal:
+            return measured_xy
+        true = measured_xy.copy()
+        for _ in range(_INVERSE_ITERATIONS):
+            measured = self.measure(np.column_stack([true, np.full(len(true), disparity)]))
+            true = true + np.nan_to_num(measured_xy - measured[:, :2])
+        return true
+
+    def motion_gain(self, points: Array, baseline_m: float) -> Array:
+        """Returns the (6, 6) matrix from the true small motion to the one estimated from image motion and stereo depth.
+
+        The motion of the left image is estimated by least squares from the measured points; see
+        `sampling.unit_motion_cov`. Empty if all points are measured where they are.
+
+        Args:
+            points: (n, 3) true points.
+            baseline_m: believed baseline [m].
+        """
+        if self.is_ideal:
+            return np.zeros((0, 0))
+        measured = self.measure(points)
+        true_flow = _flow(points, baseline_m, lambda moved: self.measure(moved)[:, :2])
+        model_flow = _flow(measured, baseline_m, lambda moved: moved[:, :2])
+        known = np.isfinite(true_flow).all(axis=1)
+        return np.asarray(np.linalg.lstsq(model_flow[known], true_flow[known], rcond=None)[0], np.float64)
+
+
+IDEAL_VIEW = MeasuredView(IDEAL_TABLE, np.zeros((0, 0, 0)), np.zeros(4))
+
+
+def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> MeasuredView:
+    """Returns the view of a stereo camera.
+
+    Args:
+        cameras: geometry of the true cameras.
+        rig: believed calibration.
+        depths_m: (m,) ascending depths of the floor [m].
+    """
+    if cameras.sampling is None and cameras.rendered_rig.baseline_m == rig.baseline_m:
+        return IDEAL_VIEW
+    axes = _axes(rig, depths_m)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1)  # x, y, disparity
+    left, right = _images(cameras, rig, grid)
+    removed = _removed(left, right, grid, rig)
+    right = _without(right, removed)
+    values = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, left[..., 0] - right[..., 0]], axis=-1)
+    first, step = np.array([axis[0] for axis in axes]), np.array([axis[1] - axis[0] for axis in axes])
+    return MeasuredView(ViewTable(values, first, step), right[..., 1] - left[..., 1], removed)
+
+
+def _axes(rig: StereoRig, depths_m: Array) -> tuple[Array, Array, Array]:
+    """Returns the grid's values of disparity, y and x."""
+    disparity = np.linspace(rig.baseline_m / (1.5 * depths_m[-1]), rig.baseline_m / (0.7 * depths_m[0]), _SHAPE[0])
+    sides = ((rig.height_px, rig.cy_px), (rig.width_px, rig.cx_px))
+    y, x = (
+        ((np.linspace(-_MARGIN, _MARGIN, n) + 1) * side / 2 - 0.5 - centre) / rig.focal_px
+        for n, (side, centre) in zip(_SHAPE[1:], sides, strict=True)
+    )
+    return disparity, y, x
+
+
+def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, Array]:
+    """Returns the normalised positions (..., 2) of points (..., 3) in the rectified left and right image."""
+    depth_m = rig.baseline_m / grid[..., 2:]
+    points_m = (np.concatenate([grid[..., :2], np.ones_like(depth_m)], axis=-1) * depth_m).reshape(-1, 3)
+    to_right_m = np.array([cameras.rendered_rig.baseline_m, 0.0, 0.0])
+    left, right = (
+        rig.normalised(cameras.project(points_m - offset, camera)).reshape(*grid.shape[:-1], 2)
+        for camera, offset in enumerate((np.zeros(3), to_right_m))
+    )
+    return left, right
+
+
+def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
+    """Returns the errors (4,) of the right image that the estimators remove, in the order of `EpipolarCalibration`.
+
+    They are fitted to the row differences of points within both images at the middle of the disparities; none if they
+    change no row by a noticeable amount.
+    """
+    middle = _SHAPE[0] // 2
+    left, right = left[middle].reshape(-1, 2), right[middle].reshape(-1, 2)
+    half = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
+    inside = np.all((np.abs(left) < half) & (np.abs(right) < half), axis=1)  # NaN is outside
+    left, right = left[inside], right[inside]
+    if len(left) < 4 * _FIT_ITERATIONS:
+        return np.zeros(4)
+    removed = np.zeros(4)
+    for _ in range(_FIT_ITERATIONS):
+        corrected = _without(right, removed)
+        x, y = corrected.T
+        jacobian = np.column_stack([-(1 + y**2), x * y, x, np.ones_like(x)])
+        change = np.linalg.lstsq(jacobian, corrected[:, 1] - left[:, 1], rcond=None)[0] * _COLUMNS
+        removed = removed + change
+    shift = np.abs(_without(right, removed)[:, 1] - right[:, 1]).max()
+    return removed if shift * rig.focal_px > NOTICEABLE_PX else np.zeros(4)
+
+
+def _without(right: Array, removed: Array) -> Array:
+    """Returns the normalised positions (..., 2) in the right image after `EpipolarCalibration.rectify`."""
+    rotation = geometry.so3_exp(removed[:3])
+    rays = np.concatenate([right - [0.0, removed[3]], np.ones_like(right[..., :1])], axis=-1) @ rotation
+    return rays[..., :2] / rays[..., 2:]
+
+
+def _flow(points: Array, baseline_m: float, image_of) -> Array:
+    """Returns the derivative (2 n, 6) of the image positions of points (n, 3) with respect to the camera's motion.
+
+    Args:
+        points: (n, 3) points (x, y, disparity).
+        baseline_m: baseline that defines their depth [m].
+        image_of: returns the image positions (n, 2) of points (n, 3).
+    """
+    depth_m = baseline_m / points[:, 2:]
+    xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * depth_m
+    scale = _STEP_DEPTHS * np.append(np.ones(3), np.full(3, float(np.median(depth_m))))
+    columns = []
+    for step in np.diag(scale):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = geometry.transform(geometry.inverse(geometry.exp(sign * step)), xyz)
+            ends.append(image_of(np.column_stack([moved[:, :2] / moved[:, 2:], baseline_m / moved[:, 2]])))
+        columns.append((ends[0] - ends[1]).ravel() / (2 * step.sum()))
+    return np.column_stack(columns)
+
+
+@njit(cache=True, nogil=True)
+def measure_point(table, x, y, disparity):
+    """Returns the measured (x, y, disparity) of a true point; outside the grid, the table is extrapolated linearly."""
+    values = table.values
+    if values.size == 0:
+        return x, y, disparity
+    n, rows, cols, _ = values.shape
+    c, a = _interval((disparity - table.first[0]) / table.step[0], n)
+    r, b = _interval((y - table.first[1]) / table.step[1], rows)
+    k, e = _interval((x - table.first[2]) / table.step[2], cols)
+    m0 = m1 = m2 = 0.0
+    for i in range(2):
+        wi = a if i else 1 - a
+        for j in range(2):
+            wj = wi * (b if j else 1 - b)
+            for h in range(2):
+                w = wj * (e if h else 1 - e)
+                m0 += w * values[c + i, r + j, k + h, 0]
+                m1 += w * values[c + i, r + j, k + h, 1]
+                m2 += w * values[c + i, r + j, k + h, 2]
+    return m0, m1, m2
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _interval(position, n):
+    """Returns the index of the interval of a grid of n points that contains a position, and the position within it."""
+    k = min(max(int(np.floor(position)), 0), n - 2)
+    return k, position - k
+
+
+@njit(cache=True, nogil=True)
+def measure_all(table, points):
+    """Returns the measured positions (n, 3) of true points (n, 3)."""
+    measured = np.empty_like(points)
+    for k in range(len(points)):
+        measured[k, 0], measured[k, 1], measured[k, 2] = measure_point(table, points[k, 0], points[k, 1], points[k, 2])
+    return measured

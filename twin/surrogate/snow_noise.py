@@ -1,0 +1,114 @@
+"""Effect of marine snow on matching, from images of a level floor with and without snow.
+
+A flake changes the grey levels n of a patch with gradient g along the rows. Least-squares matching then shifts the
+patch by sum(g n) / sum(g^2), summed over its pixels, and sees a larger residual, which reduces its weight in proportion
+to 1 / variance. A patch that flakes change too much is not matched: its correlation with the same floor without these
+flakes is too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.geometry import Array
+from twin.imaging.image_formation import StampedPose
+from twin.imaging.snow import BOX_M
+
+Gray = NDArray[np.float32]
+
+_MIN_CORRELATION = 0.7  # of a match, as in `estimate.vision.patches`
+_VIEWS = 3  # number of views with different flakes
+
+
+class SnowEffect(NamedTuple):
+    """Effect of marine snow on the matching of patches between two images.
+
+    Args:
+        variance_px2: mean variance of a weighted match, noise included [px^2].
+        matched_share: fraction of the patches that are matched in spite of the snow.
+    """
+
+    variance_px2: float
+    matched_share: float
+
+
+def snow_poses(pose: StampedPose) -> list[StampedPose]:
+    """Returns poses of the camera that show different flakes: shifted by fractions of the box that repeats."""
+    poses = []
+    for k in range(_VIEWS):
+        shifted = pose.world_from_left.copy()
+        shifted[0, 3] += k * BOX_M / _VIEWS
+        poses.append(StampedPose(shifted, pose.time_s))
+    return poses
+
+
+def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patch_px: int) -> SnowEffect:
+    """Returns the effect of snow on matches between images with different flakes.
+
+    Args:
+        clean: noise-free images of the same floor without snow, one for each view [grey levels].
+        snowy: the same with snow.
+        noise: standard deviation of the image noise [grey levels].
+        patch_px: side of the matched patches.
+    """
+    weights, errors, n_patches = [], [], 0
+    for k in range(len(clean)):
+        other = (k + 1) % len(clean)
+        first, second = snowy[k] - clean[k], snowy[other] - clean[other]
+        variance_px2, error_px, matched = _patches(clean[k], (first, second), noise, patch_px)
+        n_patches += matched.size
+        weights.append(1 / variance_px2[matched])
+        errors.append(error_px[matched])
+    weight, error = np.concatenate(weights), np.concatenate(errors)
+    if not len(weight):
+        return SnowEffect(np.inf, 0.0)
+    noise_px2 = 2 * noise**2 / _information(clean[0], patch_px)
+    mean = float(np.mean(weight**2 * (noise_px2 + error**2)) / np.mean(weight) ** 2)
+    return SnowEffect(mean, len(weight) / n_patches)
+
+
+def _patches(
+    clean: Gray, snow: tuple[Gray, Gray], noise: float, patch_px: int
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Returns variance [px^2], error due to snow [px] and match mask of all patches of an image.
+
+    Args:
+        clean: noise-free image without snow.
+        snow: change of the grey levels by snow in each of the two images.
+        noise: standard deviation of the image noise.
+        patch_px: side of the patches.
+    """
+    n = patch_px**2
+    gradient = np.gradient(clean, axis=1)
+    information = np.maximum(n * _mean(gradient**2, patch_px), _information(clean, patch_px))
+    change = snow[1] - snow[0]
+    change = change - _mean(change, patch_px)  # a match allows for a difference of brightness
+    error_px = n * _mean(gradient * change, patch_px) / information
+    spread = [_variance(part, patch_px) for part in snow]
+    texture = _variance(clean, patch_px)
+    correlation = texture / np.sqrt((texture + spread[0]) * (texture + spread[1]) + 1e-9)
+    variance_px2 = (2 * noise**2 + spread[0] + spread[1]) / information
+    inside = np.zeros(clean.shape, np.bool_)
+    inside[patch_px : -patch_px or None : 2, patch_px : -patch_px or None : 2] = True
+    return variance_px2[inside], error_px[inside], correlation[inside] > _MIN_CORRELATION
+
+
+def _information(clean: Gray, patch_px: int) -> float:
+    """Returns the mean over the image of the sum of squared gradients along the rows over a patch."""
+    return max(patch_px**2 * float(np.mean(np.diff(clean, axis=1) ** 2)), 1e-12)
+
+
+def _mean(image: NDArray[np.floating], side_px: int) -> Array:
+    """Returns the mean of an image over a square around each pixel."""
+    return np.asarray(cv2.boxFilter(image.astype(np.float64), -1, (side_px, side_px)), np.float64)
+
+
+def _variance(image: NDArray[np.floating], side_px: int) -> Array:
+    """Returns the variance of an image over a square around each pixel."""
+    values = image.astype(np.float64)
+    return np.maximum(_mean(values**2, side_px) - _mean(values, side_px) ** 2, 0.0)
