@@ -60,7 +60,8 @@ def surface_above_floor(
 
     The floor is averaged twice over the footprint, along x and y (a triangular window, twice as long as the footprint),
     and sampled at nodes about 1/8 of the shorter side of the footprint apart. Around steep parts it is raised, by as
-    little as possible, until its slope is at most `max_slope`; a Gaussian filter of one node then rounds the edges.
+    little as possible, until its slope is at most `max_slope`; a Gaussian filter with a standard deviation of one node
+    then rounds the edges.
 
     Args:
         height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
@@ -91,7 +92,8 @@ def surface_above_floor(
 def _limit_slope(height_m, step_m, max_slope):
     """Returns heights raised as little as possible, so that the slope to each of 8 neighbours is at most `max_slope`.
 
-    Two sweeps in opposite directions propagate the limit over the whole grid (chamfer transform, Borgefors 1986).
+    Two sweeps in opposite directions propagate the limit over the whole grid (chamfer distance transform, Borgefors
+    1986).
     """
     result = height_m.copy()
     rows, cols = result.shape

@@ -92,7 +92,7 @@ class Clearance(NamedTuple):
         least_m: least height of the camera above the highest floor near it; infinite if no floor was found.
         x_m, y_m: where the clearance is least: the floor point for a level path, the camera for a path that follows the
             floor.
-        inside: whether the whole path lies above the terrain.
+        inside: whether every point (x, y) of the path lies within the extent of the terrain.
     """
 
     least_m: float

@@ -33,9 +33,9 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     The legs run along the heading of the area. Their distance is at most (1 - overlap_across) ImgSize Altitude /
     FocalLength (ImgSize is the image width), times `across_scale` of the request. The extent of the area is divided
     into an even number of strips of equal width, with a leg along the centre line of each; the first leg is the
-    rightmost as seen along the heading. In a polygon, a leg spans the extent of the polygon within its strip. Of two
-    neighbouring legs, the shorter is extended at the end where they are joined, so that the segment between them is
-    perpendicular to both.
+    rightmost as seen along the heading. In a polygon, a leg spans the extent of the polygon within its strip. Where
+    two neighbouring legs are joined, the one that ends first is extended to the end of the other, so that the segment
+    between them is perpendicular to both.
 
     Args:
         request: requirements of the survey.
@@ -80,7 +80,7 @@ def _leg_extents(area: SurveyArea, spacing_m: float, n_legs: int) -> list[tuple[
 def _corners(
     area: SurveyArea, legs: list[tuple[float, float]], spacing_m: float, track: int, last: bool
 ) -> list[tuple[float, float]]:
-    """Returns the corners (u, v) of a track (from 1) in the axes of the legs [m].
+    """Returns the corners (u, v) of a track (numbered from 1) in the axes of the legs [m].
 
     They are the two ends of the first leg, the two ends of the return leg and, except for the last track, the start of
     the next track.
@@ -95,7 +95,10 @@ def _corners(
 
 
 def _track(request: SurveyRequest, area: SurveyArea, corners: list[tuple[float, float]]) -> tuple[Segment, ...]:
-    """Returns the segments of a track between its corners (u, v) in the axes of the legs [m], with turns if asked."""
+    """Returns the segments of a track between its corners (u, v) in the axes of the legs [m].
+
+    With `turns` = "bow_first", they include the turns on the spot at the ends of the legs.
+    """
     scene = [area.to_scene(u, v) for u, v in corners]
     points: list[Point] = [(float(x), float(y), request.altitude_m) for x, y in scene]
     turning = request.turns == "bow_first"

@@ -145,7 +145,7 @@ def line(start: Point, end: Point, cruise_mps: float, acceleration_mps2: float, 
 
 
 def circle(start: Point, centre: Point, cruise_mps: float, acceleration_mps2: float, yaw: float = 0.0) -> Circle:
-    """Returns the circle from a start point about a centre [m], flown within a limit of the total acceleration.
+    """Returns the circle from a start point about a centre [m], flown with at most `acceleration_mps2` in total.
 
     The cruise speed is limited to `max_circle_speed_mps`. The tangential acceleration is chosen so that the total
     acceleration equals the limit when the cruise speed is reached.

@@ -96,7 +96,8 @@ def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
         corners_m: (n, 2) corners x, y in the scene, in either sense of rotation; the first may be repeated at the end.
         heading: direction of the legs [rad, counter-clockwise from east].
     Raises:
-        TwinError: the polygon has fewer than three corners, intersects itself or has no extent.
+        TwinError: the polygon has fewer than three or more than MAX_CORNERS corners, a coordinate is not finite, two
+            edges intersect, or the extent along or across the legs is less than MIN_SIZE_M.
     """
     corners = np.asarray(corners_m, np.float64).reshape(-1, 2)
     if len(corners) > 1 and np.array_equal(corners[0], corners[-1]):

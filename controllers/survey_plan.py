@@ -73,7 +73,7 @@ class SurveyPlan:
     """Planned path and heading of the left camera. The vehicle keeps station after each track.
 
     Args:
-        paths: segments of each track; every segment starts and ends at rest.
+        paths: segments of each track, the first of which has the number 1; every segment starts and ends at rest.
         area: area to cover; the legs, and the bow on the first leg, point along its heading.
         altitude_m: height of the camera above the reference plane z = 0.
         speed_mps: cruise speed along the swaths.
@@ -142,7 +142,7 @@ class SurveyPlan:
         return len(self.paths)
 
     def waypoints(self, track: int) -> Array:
-        """Returns the outline of a track (from 1): end points of lines and points along circles, (n, 3) [m]."""
+        """Returns the waypoints (n, 3) of a track [m]: end points of its lines and points along its circles."""
         first, *others = self.paths[track - 1]
         points = np.concatenate([first.points(), *(segment.points()[1:] for segment in others)])
         if self.surface is not None:
@@ -162,18 +162,18 @@ class SurveyPlan:
         return near
 
     def track_length_m(self, track: int) -> float:
-        """Returns the path length of a track (from 1) [m]."""
+        """Returns the path length of a track [m]."""
         return sum(segment.length_m for segment in self.paths[track - 1])
 
     def track_duration_s(self, track: int) -> float:
-        """Returns the duration of a track (from 1) [s], without the station keeping after it."""
+        """Returns the duration of a track [s], without the station keeping after it."""
         return sum(segment.profile.duration_s for segment in self.paths[track - 1])
 
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Returns the times (n,) of the frames of a track (from 1) since its start [s], and whether each is a keyframe.
+        """Returns the times (n,) of the frames of a track since its start [s], and whether each is a keyframe.
 
-        Every N-th frame and the last one are keyframes. While the vehicle turns, keyframes are closer if it would turn
-        by more than TURN_PER_KEYFRAME in N frames.
+        Every N-th frame and the last one are keyframes. While the vehicle turns, there are more keyframes if it would
+        otherwise turn by more than TURN_PER_KEYFRAME between them.
         """
         frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
         times_s, n = frames / self.frame_rate_hz, self.n_frames_per_keyframe
@@ -191,14 +191,14 @@ class SurveyPlan:
         return np.array([isinstance(segment, Turn) for segment in path])[current]
 
     def reference(self, track: int, time_s: float) -> Reference:
-        """Returns the reference of the left camera at a time since the start of a track (from 1).
+        """Returns the reference of the left camera at a time since the start of a track.
 
         The velocity is 0 before the start and after the end of the track.
         """
         return self.references(track, np.array([time_s])).row(0)
 
     def references(self, track: int, times_s: Array) -> Reference:
-        """Returns the references of the left camera at increasing times (n,) since the start of a track (from 1)."""
+        """Returns the references of the left camera at increasing times (n,) since the start of a track."""
         *others, last = self.paths[track - 1]
         parts, remaining_s = [], times_s
         for segment in others:
@@ -256,7 +256,7 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
 
 
 def check_request(request: SurveyRequest) -> None:
-    """Raises TwinError if a requirement is invalid, whatever the pattern."""
+    """Raises TwinError if a requirement is invalid; checks only what does not depend on the survey pattern."""
     positive = {
         "plan.altitude_m": request.altitude_m,
         "plan.speed_mps": request.speed_mps,

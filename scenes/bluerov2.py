@@ -33,7 +33,7 @@ def _thruster_positions_m() -> Array:
 
 
 def _thruster_directions() -> Array:
-    """Returns the default thruster directions (8, 3)."""
+    """Returns the default thruster directions (8, 3), unit vectors in body axes."""
     c = np.sqrt(0.5)  # vectored at 45 deg, the front pair inwards, the rear pair outwards
     horizontal = [[c, c, 0.0], [c, -c, 0.0], [c, -c, 0.0], [c, c, 0.0]]
     return _array(*horizontal, *([[0.0, 0.0, 1.0]] * 4))

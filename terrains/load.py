@@ -54,7 +54,7 @@ def load(
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.
         seed: seed of the texture if it is generated.
-        z: direction in which the values of the file increase; None: recognised from the file.
+        z: direction in which the values of the file increase; None: determined from the file.
     Raises:
         TwinError: a file is missing, invalid or too large, or the direction of its values is not clear.
     """

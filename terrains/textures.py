@@ -60,9 +60,9 @@ def generate_texture(
 def _material_level(
     height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the weight (rows, cols) that blends the floor materials, in patches of up to 1 m.
+    """Returns the level (rows, cols), 0 to 255, that selects the material of each texel before the tone is added.
 
-    It is 0 on low, flat ground and 255 on high, steep ground.
+    It increases with height and slope, and varies at random in patches of up to 1 m.
     """
     north_up = np.ascontiguousarray(height_m[::-1])
     relief_m = max(float(np.ptp(north_up)), 1e-6)

@@ -34,7 +34,7 @@ class VerticalAxis(NamedTuple):
     """Vertical axis of the values of a file, as the file describes it.
 
     Args:
-        direction: direction of the axis of the vertical CRS or of the CF attributes; None if the file states none.
+        direction: direction of the axis of the vertical CRS or of the CF attributes; None if the file has neither.
         metres_per_unit: length of the unit; 1 if the file does not name one.
         band_name: description or long name of the band.
         texts: file name, names and tags that may name the quantity of the values.
@@ -59,7 +59,7 @@ def unit_length_m(name: str, file: Path) -> float:
 
 
 def cf_direction(tags: dict[str, str]) -> Direction | None:
-    """Returns the direction that the CF attributes `positive` and `standard_name` of a band state, if any."""
+    """Returns the direction given by the CF attributes `positive` and `standard_name` of a band; None if not given."""
     positive = tags.get("positive", "").lower()
     if positive == "up" or positive == "down":
         return positive
@@ -72,7 +72,7 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
     Args:
         values: (rows, cols) values of the file, NaN in holes.
         axis: vertical axis as the file describes it.
-        asked: `terrain.z` of the scenario, which takes precedence; None: recognised from the file.
+        asked: `terrain.z` of the scenario, which takes precedence; None: determined from the file.
         file: the file, for the error message.
     Raises:
         TwinError: the file does not make clear which way its values increase.
@@ -94,5 +94,5 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
 
 
 def _ambiguous(problem: str) -> TwinError:
-    """Returns the error for an ambiguous vertical axis, whose message tells the user to set `terrain.z`."""
+    """Returns the error for an ambiguous vertical axis, whose message names `terrain.z`."""
     return TwinError("terrain.z", f"missing: {problem}", '"up" for elevations, "down" for depths')

@@ -91,7 +91,7 @@ KEYS = dict(keys_of(Scenario))
 
 
 def near_values(key: str) -> list[str]:
-    """Returns the literals of a key, its bounds and the values beside them, as TOML; vectors repeat the value."""
+    """Returns the literals of a key, its bounds and the values next to them, as TOML; vectors repeat the value."""
     field = KEYS[key]
     bounds = [getattr(m, name) for m in field.metadata for name in ("ge", "gt", "le", "lt") if hasattr(m, name)]
     numbers = [repr(type(b)(b * f)) for b in bounds for f in (1, 0.999, 1.001)]
@@ -117,7 +117,7 @@ def mutations() -> st.SearchStrategy[list[tuple[str, str]]]:
 
 
 def draw(n_cases: int, seed: int = 0) -> list[list[tuple[str, str]]]:
-    """Returns random mutated scenarios: 40 % with values in or beside their range, 45 % with odd ones, 15 % loose."""
+    """Returns random mutated scenarios: 40 % with values in or next to their range, 45 % with odd ones, 15 % loose."""
     rng = random.Random(seed)
     keys, sizes = sorted(KEYS), [key for key in KEYS if key.startswith(("plan.", "terrain.", "map.", "rig."))]
 

@@ -1,6 +1,6 @@
 """Ten odd studies: their file, how their surveys end, and whether they are interrupted.
 
-`python tests/odd_studies.py` prints a table of what `twin study` says about each.
+`python tests/odd_studies.py` prints a table of the answers of `twin study`.
 """
 
 import tempfile
@@ -93,7 +93,7 @@ def run(name, folder):
     return runner.run_study(study, folder / "out", False, engine, StudyProgress(), fly(odd.passes))
 
 
-def says(name, folder):
+def answer_of(name, folder):
     """Returns the exit status and the sentences that `twin study` prints about an odd study."""
     try:
         result = run(name, folder)
@@ -105,8 +105,8 @@ def says(name, folder):
 
 if __name__ == "__main__":
     runner.write_report = lambda study, analysis, page: None
-    print("| study | exit status | what it says |\n|---|---|---|")
+    print("| study | exit status | answer |\n|---|---|---|")
     for name in ODD_STUDIES:
         with tempfile.TemporaryDirectory() as folder:
-            status, lines = says(name, Path(folder))
+            status, lines = answer_of(name, Path(folder))
         print(f"| {name} | {status} | {' '.join(lines)} |")

@@ -1,6 +1,7 @@
 """Summary of a plan: expected errors, requirements, warnings, cost, JSON."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.special import ndtri
 from twin.app import plan_summary
 from twin.app.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
+from twin.surrogate import error_model_file
 from twin.world.mission import prepare
 
 SMALL = ["terrain.texture_px_m=0.02", "plan.tracks=1", "plan.area_m=[2.0, 1.6]"]
@@ -50,8 +52,17 @@ def test_requirements_that_cannot_be_predicted_are_left_out():
     assert summary_of('require={"trajectory.final.ate_rmse_m"=0.001}').require == {}
 
 
-def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2_over_f_b():
-    flat = ("terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.0")
+def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2_over_f_b(tmp_path):
+    """With an error model in which further keyframes add nothing: those depend on their distance in baselines."""
+    fitted = error_model_file.load()
+    model = fitted.model._replace(depth_error=fitted.model.depth_error._replace(gain=0.0))
+    error_model_file.save(replace(fitted, model=model), tmp_path / "one.toml")
+    flat = (
+        "terrain.kind=flat",
+        "terrain.relief_m=0.0",
+        "terrain.base_m=0.0",
+        f"imaging.error_model={tmp_path}/one.toml",
+    )
     narrow, wide = (summary_of(*flat, f"rig.baseline_m={b}") for b in (0.15, 0.3))
     per_px = 2.0**2 / (narrow.mission.rig.focal_px * 0.15)
     sigma_px = narrow.error.sigma_m / per_px
@@ -89,6 +100,7 @@ def test_the_cost_grows_with_frames_keyframes_and_pixels(summary):
 def test_the_summary_is_json(summary):
     tree = json.loads(json.dumps(plan_summary.as_json(summary, "plan.png"), allow_nan=False))
     assert tree["schema"] == "twin.plan/1" and tree["picture"] == "plan.png"
+    assert tree["water"].startswith("Jerlov IB (Solonenko & Mobley 2015), turbidity 1; b at 550 nm is 2.3 times as")
     assert set(tree["floor"]) == set(plan_summary._PROPERTIES)
     assert set(tree["floor"]["overlap_along"]) == {"minimum", "p05", "median", "maximum"}
     assert tree["plan"]["n_frames"] == summary.mission.n_frames

@@ -27,7 +27,7 @@ def matched(rotation, offset_px, seed=0, n=400):
     disparity = RIG.baseline_m / rng.uniform(1.5, 2.5, n)
     left = RIG.normalised(pixels)
     right = np.column_stack([left[:, 0] - disparity, left[:, 1], np.ones(n)])
-    turned = right @ geometry.exp(np.append(rotation, np.zeros(3)))[:3, :3].T
+    turned = right @ geometry.so3_exp(np.asarray(rotation, float))  # directions in the axes of the camera
     rows = (turned[:, 1] / turned[:, 2] - left[:, 1]) * RIG.focal_px + offset_px + NOISE_PX * rng.standard_normal(n)
     measured = np.column_stack([left, disparity])
     cov = np.tile(np.diag([1.0, 0.5, 2.0]) * (NOISE_PX / RIG.focal_px) ** 2 / 2, (n, 1, 1))
@@ -49,7 +49,7 @@ def test_row_differences_give_pitch_yaw_and_roll_of_the_right_camera(rotation):
     assert np.all(report.sigma[:3] < 2e-4)
 
 
-def test_an_offset_of_the_principal_point_is_told_from_a_pitch_by_the_curvature_of_the_rows():
+def test_an_offset_of_the_principal_point_is_distinguished_from_a_pitch_by_the_curvature_of_the_rows():
     report = calibrated(np.zeros(3), 0.5, n_pairs=40).report()
     assert report.estimate[3] * RIG.focal_px == pytest.approx(0.5, abs=0.03)
     assert abs(report.estimate[0]) * RIG.focal_px < 0.03
@@ -68,7 +68,7 @@ def test_the_rectified_image_is_the_image_of_a_camera_without_the_error():
     levels = (smooth - smooth.min()) / np.ptp(smooth) * 220 + 15
     v, u = np.mgrid[:240, :320].astype(float)
     rays = np.stack([(u - RIG.cx_px) / RIG.focal_px, (v - RIG.cy_px) / RIG.focal_px, np.ones_like(u)], axis=-1)
-    turned = rays @ geometry.exp(np.append(-rotation, np.zeros(3)))[:3, :3].T
+    turned = rays @ geometry.so3_exp(rotation).T
     x, y = turned[..., 0] / turned[..., 2], turned[..., 1] / turned[..., 2]
     seen = map_coordinates(
         levels, [y * RIG.focal_px + RIG.cy_px, x * RIG.focal_px + RIG.cx_px], order=3, mode="nearest"
@@ -86,7 +86,7 @@ def texture(seed=0):
     return matching.normalise((128 + 300 * fine).astype(np.float32))
 
 
-def test_repetition_tells_a_tiled_texture_from_a_random_one():
+def test_repetition_distinguishes_a_tiled_from_a_random_texture():
     tile = texture()[:24, :32]
     assert repetition(texture(), 11) < 0.35
     assert repetition(np.tile(tile, (10, 10)), 11) > 0.9

@@ -150,7 +150,7 @@ def test_isolated_undefined_and_separate_nodes_are_named_with_their_lines(tmp_pa
     isolated, undefined, separate = (warning.partition("graph.g2o:")[2] for warning in graph.warnings)
     assert isolated == "4: node 7 is in no edge"
     assert undefined == "7: nodes 5, 6 are in an edge, but without a vertex"
-    assert separate == "7: 2 nodes, the first of them 5, have no edge to the part of node 0"
+    assert separate == "7: 2 nodes, the first of them 5, have no edge to the component of node 0"
     assert len(graph.poses) == 4 and len(graph.links) == 3
 
 

@@ -15,7 +15,7 @@ from twin.world.rendered_world import RenderedWorld
 
 LARGE = ("rig.image_width_px=640", "rig.image_height_px=480")
 EFFECTS = (
-    "imaging.shadows=true", "imaging.forward_scatter=true", "water.jerlov=II", "sun.illuminance_lx=50.0",
+    "imaging.shadows=true", "water.jerlov=II", "sun.illuminance_lx=50.0",
     "sun.depth_m=8.0", "sun.caustics=0.7",
 )  # fmt: skip
 CASES = {

@@ -1,96 +1,172 @@
-"""Forward scatter: energy is conserved, and the point spread function has the width of small-angle theory."""
+"""Multiple scattering: energy, the kernels against closed forms and a random walk, and the image that is blurred."""
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.forward_scatter import FORWARD_DEG, ForwardScatter, forward_scattering
-from twin.imaging.water import medium, phase_function
-from twin.scenario.model import Scenario, WaterConfig
+from twin.imaging.forward_scatter import ForwardScatter, level_sigma_px, place_of
+from twin.imaging.illumination import Illumination, daylight_at
+from twin.imaging.lamp_light import LampLight
+from twin.imaging.lamps import light_sources_in_camera
+from twin.imaging.optics import FloorView, Optics
+from twin.imaging.phase_function import Scatterer, phase_of, table_of
+from twin.imaging.spread import LAMP_SIGMA_RAD, Absorbed, camera_mixture, lamp_mixture
+from twin.imaging.water import Medium, medium
+from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 
-RIG = Scenario.model_validate({"rig": {"image_width_px": 320, "image_height_px": 240}}).believed_rig()
+RIG = Scenario.model_validate({"rig": {"image_width_px": 160, "image_height_px": 120}}).believed_rig()
 SHAPE = (RIG.height_px, RIG.width_px)
+HG, PETZOLD = Scatterer("henyey_greenstein", 0.0, (0.924,)), Scatterer("petzold")
+LAMP = LampConfig(position_m=(0.2, 0.4, 0.0), pan_deg=-10.0, intensity_cd=1000.0)
 
 
-def forward_scattering_per_m(water):
-    return forward_scattering().share * medium(water).scattering_per_m
+def sea(absorption, scattering, scatterer=PETZOLD):
+    return Medium(np.full(3, absorption), np.full(3, scattering), (scatterer,) * 3)
 
 
-def ranges(depth):
-    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
-    return depth * np.sqrt(1 + ((u - RIG.cx_px) ** 2 + (v - RIG.cy_px) ** 2) / RIG.focal_px**2)
+@pytest.mark.parametrize("scatterer", [HG, PETZOLD])
+def test_light_of_an_even_floor_is_lost_only_by_scattering_backwards(scatterer):
+    """Without absorption, light scattered by less than 90 deg reaches the camera: exp(-b_b r) of it arrives."""
+    sigmas = tuple(level_sigma_px(level) / 277 for level in range(9))
+    ranges_m = (0.3, 1.0, 3.0)
+    backwards = table_of(scatterer).backscatter_fraction
+    for b in (0.05, 1.0):
+        thickness = b * np.array(ranges_m)
+        arrives = np.exp(-thickness) + camera_mixture(Absorbed(0.0, b, scatterer), ranges_m, sigmas).sum(1)
+        np.testing.assert_allclose(arrives, np.exp(-backwards * thickness), rtol=3e-3)
 
 
-@pytest.mark.parametrize("jerlov", ["I", "II", "3C"])
-def test_forward_scatter_conserves_energy(jerlov):
-    """For a textured, stepped floor: sum = direct exp(b_f r), which is L exp(-(c - b_f) r), within 0.1 %."""
-    rng, water = np.random.default_rng(0), WaterConfig(jerlov=jerlov)
-    direct = rng.uniform(0, 50, (*SHAPE, 3)).astype(np.float32)
-    direct[:, 200:] *= 0.1
-    depth = np.full(SHAPE, 2.0, np.float32)
-    depth[:100, :150] = 0.8
-    depth[200:] = np.inf  # no floor, hence no light to scatter
-    direct[200:] = 0
-    after = (direct + ForwardScatter(RIG, medium(water)).spread(direct, depth)).sum((0, 1), dtype=np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        thickness = forward_scattering_per_m(water) * ranges(depth)[..., None]
-        growth = np.where(np.isfinite(depth)[..., None], np.exp(thickness), 0)
-    np.testing.assert_allclose(after, (direct * growth).sum((0, 1)), rtol=1e-3)
+@pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")  # Petzold's table has kinks
+@pytest.mark.parametrize("scatterer", [HG, PETZOLD])
+def test_light_scattered_once_from_an_even_lamp_agrees_with_quadrature(scatterer):
+    """On a floor, light scattered by t adds the integral of cos(alpha) for alpha below t and 90 deg: sin(t), then 1."""
+    phase, thickness = phase_of(scatterer), 1e-3
+    cuts = np.deg2rad([1e-6, 1e-4, 1e-2, 1, 10, 90, 180])
+    density = lambda t: 2 * np.pi * float(phase(np.array(t)))  # noqa: E731
+    pieces = [(low, high) for low, high in zip(cuts, cuts[1:], strict=False)]
+    floor = sum(quad(lambda t: density(t) * np.sin(min(t, np.pi / 2)), *piece)[0] for piece in pieces)
+    # on a particle: the integral of 1 over alpha below t
+    particle = sum(quad(lambda t: density(t) * t, *piece)[0] for piece in pieces)
+    water = Absorbed(0.0, thickness, scatterer)
+    for receiver, expected in (("floor", floor), ("particle", particle)):
+        found = lamp_mixture(water, (1.0,), receiver).sum() / thickness
+        assert found == pytest.approx(expected, rel=5e-3)
 
 
-def test_a_uniform_floor_is_attenuated_by_c_minus_b_f():
-    """Forward scatter never makes the floor brighter than in water without scattering."""
-    water = WaterConfig(jerlov="III")
-    scattering = medium(water).scattering_per_m
-    depth, direct = np.full(SHAPE, 2.0, np.float32), np.ones((*SHAPE, 3), np.float32)
-    direct *= np.exp(-scattering * ranges(depth)[..., None])
-    total = direct + ForwardScatter(RIG, medium(water)).spread(direct, depth)
-    assert (total > direct).all() and (total < 1).all()
-    centre = total[SHAPE[0] // 2, SHAPE[1] // 2]
-    # the blur mixes in ranges up to 3 % longer than at the centre
-    np.testing.assert_allclose(centre, np.exp(-(scattering - forward_scattering_per_m(water)) * 2.0), rtol=0.03)
+def walk_px(scatterer, thickness, focal_px, n=60_000):
+    """Returns displacements [px] of rays that are scattered at least once between floor and camera, by small angles."""
+    rng = np.random.default_rng(1)
+    counts = rng.poisson(thickness, n)
+    table, place, ahead = table_of(scatterer), np.zeros((n, 2)), np.ones(n, bool)
+    edges = 2 * np.arcsin(np.linspace(0, 1, len(table.cumulative)) ** 2)
+    for k in range(counts.max()):
+        on = np.flatnonzero(counts > k)
+        angle, turn = np.interp(rng.random(len(on)), table.cumulative, edges), 2 * np.pi * rng.random(len(on))
+        place[on] += (np.tan(np.minimum(angle, 1.55)) * rng.random(len(on)))[:, None] * np.stack(
+            [np.cos(turn), np.sin(turn)], 1
+        )
+        ahead[on[angle > np.pi / 2]] = False
+    return np.hypot(*place[(counts > 0) & ahead].T) * focal_px
 
 
-@pytest.mark.parametrize(("jerlov", "depth_m"), [("II", 1.0), ("II", 3.0), ("3C", 2.0)])
-def test_a_spot_spreads_by_the_variance_of_small_angle_theory(jerlov, depth_m):
-    direct, depth = np.zeros((*SHAPE, 3), np.float32), np.full(SHAPE, depth_m, np.float32)
-    direct[113:127, 151:169] = 10.0  # wider than a bin, to whose centre light is moved
-    spread = ForwardScatter(RIG, medium(WaterConfig(jerlov=jerlov))).spread(direct, depth)
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    thickness = forward_scattering_per_m(WaterConfig(jerlov=jerlov)) * depth_m
-    for band in range(3):
-        weight = spread[..., band] / spread[..., band].sum()
-        mean_u = (weight * u).sum()
-        assert abs(mean_u - 159.5) < 1 and abs((weight * v).sum() - 119.5) < 1
-        scatterings = thickness[band] / (1 - np.exp(-thickness[band]))
-        expected = RIG.focal_px**2 * forward_scattering().variance_rad2 / 3 * scatterings
-        # minus the variance of the spot itself, which is moved by up to half a bin
-        assert (weight * (u - mean_u) ** 2).sum() - (18**2 - 1) / 12 == pytest.approx(expected, rel=0.05)
+@pytest.mark.parametrize(("scatterer", "thickness"), [(HG, 0.5), (PETZOLD, 0.5), (PETZOLD, 3.0)])
+def test_the_kernel_has_the_core_and_the_tail_of_a_random_walk(scatterer, thickness):
+    """Shares within 2, 8 and 40 px; the standard error of the walk is 0.003, the Gaussians fit within 0.02."""
+    away = walk_px(scatterer, thickness, 277.0)
+    levels = range(9)
+    weights = camera_mixture(
+        Absorbed(0.0, thickness, scatterer), (1.0,), tuple(level_sigma_px(k) / 277 for k in levels)
+    )
+    for radius in (2.0, 8.0, 40.0):
+        within = [1 - np.exp(-(radius**2) / (2 * level_sigma_px(k) ** 2)) if k else 1.0 for k in levels]
+        assert weights[0] @ within / weights.sum() == pytest.approx((away < radius).mean(), abs=0.02)
 
 
-def test_the_forward_lobe_agrees_with_quadrature_of_the_phase_function():
-    limit = np.deg2rad(FORWARD_DEG)
-    share, _ = quad(lambda a: 2 * np.pi * np.sin(a) * phase_function(np.cos(a)), 0, limit)
-    moment, _ = quad(lambda a: 2 * np.pi * np.sin(a) * phase_function(np.cos(a)) * a**2 / 2, 0, limit)
-    assert forward_scattering().share == pytest.approx(share, rel=1e-5) and 0.7 < share < 0.78
-    assert forward_scattering().variance_rad2 == pytest.approx(moment / share, rel=1e-5)
+def spread_of(floor, depth_m, water):
+    blur = ForwardScatter(RIG, water)
+    around = np.zeros((*blur.surroundings.shape, 3), np.float32), np.full(blur.surroundings.shape, 0.0, np.float32)
+    range_m = np.full(SHAPE, depth_m)
+    around[1][:] = place_of(np.float64(depth_m))
+    return blur.spread(floor, range_m, around), blur
 
 
-def test_water_without_scattering_adds_no_forward_scatter():
-    direct = np.random.default_rng(0).uniform(0, 1, (*SHAPE, 3)).astype(np.float32)
-    forward_scatter = ForwardScatter(RIG, medium(WaterConfig(jerlov="clear")))
-    assert not forward_scatter.spread(direct, np.full(SHAPE, 2.0, np.float32)).any()
+def test_the_image_of_a_point_has_the_kernel_and_its_energy():
+    floor, water = np.zeros((*SHAPE, 3), np.float32), sea(0.0, 0.4)
+    floor[60, 80] = 1000.0
+    image = spread_of(floor, 2.0, water)[0][..., 1].astype(float)
+    v, u = np.indices(SHAPE)
+    away = np.hypot(v - 60, u - 80)
+    radii = np.array([3.5, 7.5, 15.5, 30.5])
+    levels = 6  # of the image of this test and its surroundings
+    sigmas = [level_sigma_px(k) for k in range(levels + 2)]
+    weights = camera_mixture(water.bands[1], (2.0,), tuple(s / RIG.focal_px for s in sigmas))[0]
+    for radius in radii:
+        within = [1 - np.exp(-(radius**2) / (2 * s**2)) if s else 1.0 for s in sigmas]
+        assert image[away < radius].sum() / 1000 == pytest.approx(weights @ within, rel=0.06)
+    # an even floor, also around the image: nothing is lost but what scatters backwards
+    blur = ForwardScatter(RIG, water)
+    ones = np.ones((*blur.surroundings.shape, 3), np.float32)
+    place = np.full(blur.surroundings.shape, place_of(np.float64(2.0)), np.float32)
+    even = blur.spread(np.ones((*SHAPE, 3), np.float32), np.full(SHAPE, 2.0), (ones, place)) + np.exp(-0.8)
+    np.testing.assert_allclose(even, np.exp(-0.8 * table_of(PETZOLD).backscatter_fraction), rtol=0.01)
 
 
-@pytest.mark.parametrize(("width", "height"), [(321, 243), (64, 48), (330, 250)])
-def test_energy_is_conserved_for_any_image_size(width, height):
-    rig = Scenario.model_validate({"rig": {"image_width_px": width, "image_height_px": height}}).believed_rig()
-    direct = np.random.default_rng(0).uniform(0, 9, (height, width, 3)).astype(np.float32)
-    depth = np.full((height, width), 1.5, np.float32)
-    water = medium(WaterConfig(jerlov="II"))
-    v, u = np.mgrid[:height, :width]
-    range_m = 1.5 * np.sqrt(1 + ((u - rig.cx_px) ** 2 + (v - rig.cy_px) ** 2) / rig.focal_px**2)
-    expected = (direct * np.expm1(forward_scattering_per_m(WaterConfig(jerlov="II")) * range_m[..., None])).sum((0, 1))
-    got = ForwardScatter(rig, water).spread(direct, depth).sum((0, 1), dtype=np.float64)
-    # scattered part only: 1 % of it is 0.3 % of the total; ranges are quantized to 1 cm of 1.5 m
-    np.testing.assert_allclose(got, expected, rtol=5e-3)
+def test_a_ray_that_ends_near_collects_less_scattered_light_than_one_that_ends_far():
+    blur = ForwardScatter(RIG, sea(0.0, 0.4))
+    range_m = np.full(SHAPE, 4.0)
+    range_m[:, :80] = 1.0
+    around = np.ones((*blur.surroundings.shape, 3), np.float32), np.full(blur.surroundings.shape, 300.0, np.float32)
+    light = blur.spread(np.ones((*SHAPE, 3), np.float32), range_m, around)[60, :, 1]
+    near, far = -np.expm1(-0.4 * np.array([1.0, 4.0])) - 0.02
+    # the widest levels take the weights of the mean range within their width, so the near part is up to 30 % too bright
+    assert near < light[10] < 1.3 * near and light[150] == pytest.approx(far, rel=0.1)
+    assert (np.diff(light[20:140]) > -1e-3).all()
+
+
+def optics(water):
+    return Optics(RIG, Illumination(water, daylight_at(SunConfig(illuminance_lx=0), water, 0.0)), (LAMP,))
+
+
+@pytest.mark.parametrize("scattering", ["full", "none"])
+def test_water_that_does_not_scatter_gives_the_image_of_single_scattering(scattering):
+    albedo = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    depth, settings = np.full(SHAPE, 1.5, np.float32), WaterConfig(jerlov="II", turbidity=0.0)
+    single, other = (optics(medium(settings, model)).radiance(albedo, depth, 0) for model in ("single", scattering))
+    np.testing.assert_array_equal(other, single)
+    if scattering == "none":  # whatever the turbidity
+        murky = WaterConfig(jerlov="II", turbidity=3.0)
+        np.testing.assert_array_equal(optics(medium(murky, "none")).radiance(albedo, depth, 0), single)
+
+
+def test_radiance_is_the_sum_of_its_parts_also_without_floor_and_in_shadow():
+    albedo = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    depth = np.random.default_rng(1).uniform(1.4, 1.5, SHAPE).astype(np.float32)
+    depth[80:, 100:] = np.inf
+    lit = np.ones((1, *SHAPE), np.uint8)
+    lit[0, 20:60, 20:60] = 0
+    model = optics(medium(WaterConfig(jerlov="III")))
+    for shadow in (None, FloorView(lit=lit)):
+        direct, forward, backscatter = model.parts(albedo, depth, 0, shadow)
+        np.testing.assert_allclose(model.radiance(albedo, depth, 0, shadow), direct + forward + backscatter, rtol=2e-3)
+        assert not direct[80:, 100:].any() and (forward[80:, 100:] > 0).all()
+    open_sky, shaded = (
+        model.parts(albedo, depth, 0, shadow).direct[20:60, 20:60] for shadow in (None, FloorView(lit=lit))
+    )
+    assert (shaded <= open_sky).all() and (shaded[open_sky > 0] > 0).all()  # scattered light reaches the shadow
+
+
+def test_a_softened_beam_lights_beyond_its_edge_and_loses_on_its_axis():
+    water, still = sea(0.05, 1.0), sea(0.05, 0.0)
+    spot = LAMP.model_copy(update={"pan_deg": 0.0, "beam": ((0.0, 1.0), (9.0, 1.0), (10.0, 0.0))})
+    sources = light_sources_in_camera(RIG, (spot,), daylight_at(SunConfig(illuminance_lx=0), still, 0.0), 0)
+    angle = np.deg2rad([0.0, 5.0, 15.0, 30.0])
+    points = sources.position_m[0] + 2.0 * np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1)
+    clear, murky = (LampLight(sources, one).lux(0, points)[0][:, 1] for one in (still, water))
+    assert (murky[:2] < clear[:2]).all() and (murky[:2] > np.exp(-2.0) * clear[:2]).all()
+    assert (clear[2:] == 0).all() and (murky[2:] > 0).all() and (np.diff(murky) < 0).all()
+
+
+def test_mixtures_are_narrow_and_wide_enough_for_the_kernels():
+    """The light within the narrowest and beyond half of the widest Gaussian of a lamp is below 10 %."""
+    weights = lamp_mixture(Absorbed(0.06, 1.0, PETZOLD), (2.0,), "floor")[0]
+    assert weights[0] < 0.1 * weights.sum() and weights[LAMP_SIGMA_RAD > 0.6].sum() < 0.2 * weights.sum()

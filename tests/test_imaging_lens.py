@@ -139,12 +139,12 @@ class GreyFloor:
 def test_noise_is_added_before_the_rectification():
     """Interpolation between pixels reduces noise: at the centre of four its variance is (sum of w^2)^2 = 0.6."""
     sections = {"lens": {"k1": 0.1}, "sun": {"illuminance_lx": 500.0}, "imaging": {"noise_sd": 0.03, "shot_noise": 0.0}}
-    here = scenario(**sections)
+    here = scenario(**sections, water={"jerlov": "clear"})
     cameras = make_true_cameras(here)
     left, right = np.random.default_rng(1).spawn(2)
     light = ImageFormation(here, illumination_of(here), None, left, cameras.rendered_rig)
     camera = StereoCamera(GreyFloor(cameras.rendered_rig), light, here, left, right, Stopwatch())
-    frame = camera.capture(np.eye(4), stereo=False).left[..., 1].astype(float)
+    frame = camera.capture(np.diag([1.0, -1.0, -1.0, 1.0]), stereo=False).left[..., 1].astype(float)  # looks down
     assert frame.shape == (240, 320)
     part = cameras.rectification - np.floor(cameras.rectification)
     between = (np.abs(part - 0.5) < 0.15).all(axis=-1)
@@ -176,7 +176,7 @@ def test_interpolation_is_exact_at_pixels_and_agrees_with_scipy():
 BAD_LENSES = [
     ("k1 = 3.0", "lens.k1: 3.0: not allowed (allowed: less than or equal to 2)"),
     ('p1 = "a"', "lens.p1: 'a': not allowed (allowed: a number)"),
-    ("k4 = 0.1", "lens.k4: unknown key (allowed: k1, k2, k3, p1, p2)"),
+    ("k4 = 0.1", "lens.k4: unknown key (allowed: k1, k2, k3, p1, p2, diffraction, blur_px, lateral_colour, focus_m)"),
     ("k1 = -1.2", "lens.k1: the believed lens folds the image back within the frame (allowed: less distortion)"),
 ]
 

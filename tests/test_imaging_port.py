@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq, root
 
 from twin.errors import ScenarioError
-from twin.imaging.port import air_tangents, pinhole, refract, water_rays
+from twin.imaging.port import air_coordinates, pinhole, refract, water_rays
 from twin.imaging.resample import intersect
 from twin.imaging.true_cameras import make_true_cameras
 from twin.scenario.file import load_scenario
@@ -37,8 +37,8 @@ def tangent_of_pane(port: PortConfig, across_m: float, ahead_m: float) -> float:
     return float(np.tan(brentq(lambda angle: across_at(angle) - across_m, 0.0, np.deg2rad(89.9), xtol=1e-14)))
 
 
-def tangents_by_fermat(port: PortConfig, point_m: np.ndarray) -> np.ndarray:
-    """Returns the tangents (2,) in air for any port by Fermat's principle: the path of stationary optical length."""
+def coordinates_by_fermat(port: PortConfig, point_m: np.ndarray) -> np.ndarray:
+    """Returns the normalised coordinates (2,) in air for any port by Fermat's principle (stationary optical length)."""
     tilt = np.deg2rad(port.tilt_deg)
     along_pane = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), np.sin(tilt)]])
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
@@ -77,7 +77,7 @@ def test_a_flat_port_agrees_with_snells_law(tangent, depth_m):
     across_m = tangent * depth_m
     point = np.array([[across_m * np.cos(azimuth), across_m * np.sin(azimuth), depth_m]])
     expected = tangent_of_pane(port, across_m, depth_m) * np.array([np.cos(azimuth), np.sin(azimuth)])
-    np.testing.assert_allclose(air_tangents(port, point)[0], expected, atol=1e-4 / 277)
+    np.testing.assert_allclose(air_coordinates(port, point)[0], expected, atol=1e-4 / 277)
 
 
 @pytest.mark.parametrize("depth_m", [0.5, 4.0])
@@ -85,8 +85,8 @@ def test_a_flat_port_agrees_with_snells_law(tangent, depth_m):
 def test_a_port_agrees_with_fermats_principle(port, depth_m):
     here = PortConfig(**port)
     points = np.array([[0.05, 0.0, 1.0], [0.3, -0.2, 1.0], [-0.2, 0.45, 1.0], [-0.5, -0.35, 1.0]]) * depth_m
-    expected = [tangents_by_fermat(here, point) for point in points]
-    np.testing.assert_allclose(air_tangents(here, points), expected, atol=1e-4 / 277)
+    expected = [coordinates_by_fermat(here, point) for point in points]
+    np.testing.assert_allclose(air_coordinates(here, points), expected, atol=1e-4 / 277)
 
 
 def test_refraction_follows_snells_law_in_the_plane_of_incidence():
@@ -110,32 +110,32 @@ def test_total_reflection_beyond_the_critical_angle_is_nan():
 @pytest.mark.parametrize("sections", [FLAT | {"tilt_deg": 12.0}, DOME | {"offset_m": (0.01, -0.004, 0.008)}])
 def test_a_port_of_index_one_has_no_effect(sections):
     port = PortConfig(**sections, glass_index=1.0, water_index=1.0)
-    tangents = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 2))
-    origin, direction = water_rays(port, tangents)
-    np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], tangents, atol=1e-14)
-    np.testing.assert_allclose(origin[:, :2] / origin[:, 2:], tangents, atol=1e-14)
+    normalised = np.random.default_rng(0).uniform(-0.6, 0.6, (20, 2))
+    origin, direction = water_rays(port, normalised)
+    np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], normalised, atol=1e-14)
+    np.testing.assert_allclose(origin[:, :2] / origin[:, 2:], normalised, atol=1e-14)
     assert pinhole(port).focal_ratio == pytest.approx(1, abs=1e-9)
     assert pinhole(port).centre_m == pytest.approx(0, abs=1e-9)
 
 
 def test_a_dome_centred_on_the_pupil_does_not_refract():
     port = PortConfig(**DOME | {"offset_m": (0.0, 0.0, 0.0)})
-    tangents = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 2))
-    origin, direction = water_rays(port, tangents)
-    np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], tangents, atol=1e-13)
+    normalised = np.random.default_rng(0).uniform(-0.9, 0.9, (20, 2))
+    origin, direction = water_rays(port, normalised)
+    np.testing.assert_allclose(direction[:, :2] / direction[:, 2:], normalised, atol=1e-13)
     np.testing.assert_allclose(np.cross(origin, direction), 0, atol=1e-15)  # through the pupil
     assert pinhole(port) == pytest.approx((0, 1), abs=1e-9)
 
 
 def test_the_direction_in_water_does_not_depend_on_the_glass():
     """A pane displaces a ray; a very thin pane does not even do that."""
-    tangents = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 2))
-    _, acrylic = water_rays(PortConfig(**FLAT), tangents)
-    _, flint = water_rays(PortConfig(**FLAT, glass_index=1.9), tangents)
+    normalised = np.random.default_rng(0).uniform(-0.7, 0.7, (20, 2))
+    _, acrylic = water_rays(PortConfig(**FLAT), normalised)
+    _, flint = water_rays(PortConfig(**FLAT, glass_index=1.9), normalised)
     np.testing.assert_allclose(acrylic, flint, atol=1e-14)
-    thin = [water_rays(PortConfig(**FLAT | {"thickness_m": 1e-9, "glass_index": g}), tangents)[0] for g in (1.3, 1.9)]
+    thin = [water_rays(PortConfig(**FLAT | {"thickness_m": 1e-9, "glass_index": g}), normalised)[0] for g in (1.3, 1.9)]
     np.testing.assert_allclose(thin[0], thin[1], atol=1e-8)
-    np.testing.assert_allclose(thin[0], 0.03 * np.column_stack([tangents, np.ones(20)]), atol=1e-8)
+    np.testing.assert_allclose(thin[0], 0.03 * np.column_stack([normalised, np.ones(20)]), atol=1e-8)
 
 
 def test_the_equivalent_pinhole_of_a_pane_follows_gaussian_optics():
@@ -176,7 +176,8 @@ def test_the_error_of_the_equivalent_pinhole_has_the_closed_form():
 
 
 def floor_with_dots(rig, slope: float, dots: np.ndarray, sigma_px: float = 2.0):
-    """Returns radiance of white dots at tangents (n, 2), depth of the plane z = 1.5 + slope x, and the dots in 3D."""
+    """Returns radiance of white dots at normalised coordinates (n, 2), the depth of the plane z = 1.5 + slope x, and
+    the dots in 3D."""
     u, v = np.meshgrid(np.arange(rig.width_px), np.arange(rig.height_px))
     depth = 1.5 / (1 - slope * (u - rig.cx_px) / rig.focal_px)
     light = np.zeros((*u.shape, 3), np.float32)
@@ -210,8 +211,8 @@ def test_images_of_points_agree_with_ray_tracing(port, slope):
     raw = cameras.sample(light, depth, 0)
     off = []
     for point in points:
-        tangents = tangents_by_fermat(here.port, point + [0.0, 0.0, equivalent.centre_m])
-        expected = here.believed_rig().focal_px / equivalent.focal_ratio * tangents + [159.5, 119.5]
+        normalised = coordinates_by_fermat(here.port, point + [0.0, 0.0, equivalent.centre_m])
+        expected = here.believed_rig().focal_px / equivalent.focal_ratio * normalised + [159.5, 119.5]
         off.append(brightest(raw, expected) - expected)
     assert np.abs(off).max() < 0.01
 

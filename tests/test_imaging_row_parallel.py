@@ -16,7 +16,7 @@ SCENARIO = Scenario.model_validate(
         "rig": {"image_width_px": 160, "image_height_px": 120},
         "lamps": [{"position_m": (0.25, y, -0.05), "pan_deg": -15 * np.sign(y)} for y in (0.6, -0.6)],
         "water": {"jerlov": "II"},
-        "imaging": {"shadows": True, "forward_scatter": True},
+        "imaging": {"shadows": True},
     }
 )
 SPIKES = types.SimpleNamespace(
@@ -27,11 +27,11 @@ SPIKES = types.SimpleNamespace(
 )
 
 
-@pytest.mark.parametrize(("n_rows", "pixels", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
-def test_an_image_is_split_where_it_has_enough_rows(monkeypatch, n_rows, pixels, n_bands):
+@pytest.mark.parametrize(("n_rows", "rows_per_row", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
+def test_an_image_is_split_where_it_has_enough_rows(monkeypatch, n_rows, rows_per_row, n_bands):
     monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
     bands = []
-    row_parallel.in_row_bands(lambda *band: bands.append(band), n_rows, pixels)
+    row_parallel.in_row_bands(lambda *band: bands.append(band), n_rows, rows_per_row)
     assert len(bands) == n_bands
 
 
@@ -48,7 +48,7 @@ def test_every_row_is_processed_once(monkeypatch, n_rows):
 
 
 def test_radiance_is_the_same_with_one_and_two_threads(monkeypatch):
-    """To the last bit, with shadows and forward scatter, over a random floor."""
+    """To the last bit, with shadows and multiple scattering, over a random floor."""
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     albedo = np.random.default_rng(1).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     depth = np.random.default_rng(2).uniform(1.7, 2.0, (120, 160)).astype(np.float32)

@@ -95,6 +95,7 @@ class FlatFloor:
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
 
 
+DOWN = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
 MOVING = np.array([0.1, -0.2, 0.3, 0.5, -0.3, 0.1])  # of the body [rad/s, m/s]
 
 
@@ -116,7 +117,7 @@ def camera_of(scenario):
 
 def captures(stereo, sensor=None, twist=AT_REST):
     camera = camera_of(small(sensor))
-    poses = [np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3) for k in range(5)]
+    poses = [DOWN + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3) for k in range(5)]
     return [camera.capture(pose, flag, twist) for pose, flag in zip(poses, stereo, strict=True)]
 
 
@@ -136,7 +137,7 @@ def test_the_plain_sensor_ignores_motion():
     renderer, exposure = FlatFloor(), AutoExposure(0.45, 30.0)
     rng = np.random.default_rng(7).spawn(2)[0]
     for k, capture in enumerate(captures([False] * 5, None, MOVING)):
-        pose = StampedPose(np.eye(4) + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3), k / 30)
+        pose = StampedPose(DOWN + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3), k / 30)
         radiance = light.radiance(*renderer.render(pose.world_from_left), 0, pose)
         np.testing.assert_array_equal(capture.left, expose(radiance, exposure.gain(radiance), scenario.imaging, rng))
 
@@ -160,7 +161,7 @@ def test_both_cameras_have_the_same_exposure():
     settings, expose_image = [], camera._sensor.image
     camera._sensor.image = lambda light, setting, rng: settings.append(setting) or expose_image(light, setting, rng)
     for _ in range(3):
-        camera.capture(np.eye(4), True)
+        camera.capture(DOWN, True)
     assert settings[0::2] == settings[1::2] and all(setting.exposure_s > 0 for setting in settings)
 
 

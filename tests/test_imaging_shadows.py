@@ -13,6 +13,7 @@ from scenes.builder import CameraPair, SceneModel, build
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import mujoco
 from twin.core import geometry
+from twin.core.floor_rays import cast_pixels, height_field
 from twin.imaging import shadows
 from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
@@ -126,7 +127,7 @@ def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> Non
         rng.normal(scale=0.2, size=(3 * BLOCK_CELLS + 2, 2 * BLOCK_CELLS + 1)).astype(np.float32), 0.1, -0.8, -1.2,
         np.zeros((2, 2, 3), np.uint8), 1.0,
     )  # fmt: skip
-    tops, rises = shadows._blocks(floor.height_m)
+    tops = shadows._tops(floor.height_m)
     share = (np.arange(20000) + 0.5) / 20000
     wrong = total = 0
     for _ in range(250):
@@ -140,22 +141,23 @@ def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> Non
             continue
         col, row = (x + 0.8) / 0.1, (y + 1.2) / 0.1
         to = (lamp[0] - x) / 0.1, (lamp[1] - y) / 0.1, lamp[2] - start[2]
-        wrong += shadows._occluded(floor.height_m, tops, rises, col, row, start[2], *to) != (margin > 0)
+        wrong += shadows._occluded(floor.height_m, *tops, col, row, start[2], *to) != (margin > 0)
         total += 1
     assert total > 60 and wrong == 0
 
 
-def test_the_lattice_agrees_with_testing_every_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
-    lamp = geometry.transform(geometry.inverse(pose), np.array([[-1.0, 0.3, 2.0]]))
-    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
-    casting = Shadows(wall(0.5), RIG, [lamp, lamp])
-    lit = casting.lit(depth, pose, 0)
-    scene = *casting._grid, depth, RIG.focal_px, pose, geometry.transform(pose, lamp)
-    dense = np.empty_like(lit)
-    shadows._fill_between(*scene, np.indices((1, 61, 81)).sum(0).astype(np.uint8) % 2, dense, 0, 60)
-    # the tip of a shadow thinner than the lattice may be missed; not in this geometry
-    assert np.mean(lit != dense) < 1e-3
+def test_shadows_agree_with_a_ray_at_every_pixel() -> None:
+    """At 99.8 % of the pixels of a reef, though most pixels are not tested: thin shadows are found as well."""
+    terrain = cliffs()
+    casting = Shadows(terrain, RIG, [lamps_in(0), lamps_in(1)])
+    pixels = np.stack(np.meshgrid(np.arange(RIG.width_px), np.arange(RIG.height_px)), -1).reshape(-1, 2)
+    field = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+    depth = cast_pixels(field, POSES[1][None], RIG, pixels.astype(float))[0].reshape(RIG.height_px, -1)
+    depth = depth.astype(np.float32)
+    lit, lamps = casting.lit(depth, POSES[1], 0), geometry.transform(POSES[1], lamps_in(0))
+    some = pixels[::2]
+    alone = [shadows._cast(casting._grid, depth, RIG.focal_px, POSES[1], lamps[0], v, u) for u, v in some]
+    assert np.mean(np.minimum(alone, 1) != lit[0][some[:, 1], some[:, 0]]) < 2e-3
 
 
 def test_without_floor_there_is_no_shadow() -> None:

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from twin.core import geometry
 from twin.imaging.illumination import daylight_at
+from twin.imaging.lamp_light import LampLight
 from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.snow import APERTURE_M, BOX_M, MarineSnow
+from twin.imaging.lens_psf import Defocus
+from twin.imaging.shutter import ExposureMotion
+from twin.imaging.snow import APERTURE_M, BOX_M, MarineSnow, diameters
 from twin.imaging.water import medium
 from twin.scenario.model import LampConfig, Scenario, SnowConfig, SunConfig, WaterConfig
 
@@ -25,7 +29,8 @@ def light_sources(camera):
 
 
 def marine_snow(density=40.0, diameter_m=0.002, current=(0.0, 0.0, 0.0), water="II", seed=0):
-    properties, sources = medium(WaterConfig(jerlov=water)), [light_sources(camera) for camera in (0, 1)]
+    properties = medium(WaterConfig(jerlov=water), "single")
+    sources = [LampLight(light_sources(camera), properties) for camera in (0, 1)]
     keys = SnowConfig(density_per_m3=density, diameter_m=diameter_m)
     return MarineSnow(keys, np.array(current), RIG, properties, sources, np.random.default_rng(seed))
 
@@ -142,3 +147,121 @@ def test_the_snow_stream_is_last_so_that_other_streams_are_unchanged():
     assert _STREAMS[:7] == ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow")
     seven, six = (np.random.SeedSequence(1).spawn(n) for n in (7, 6))
     assert all((a.generate_state(4) == b.generate_state(4)).all() for a, b in zip(six, seven, strict=False))
+
+
+def distribution(exponent, low_m=0.0005, high_m=0.01, n=40000):
+    keys = SnowConfig(density_per_m3=1.0, junge_exponent=exponent, diameter_min_m=low_m, diameter_max_m=high_m)
+    return diameters(keys, n, np.random.default_rng(3))
+
+
+@pytest.mark.parametrize("exponent", [2.5, 4.0, 5.5])
+def test_the_maximum_likelihood_exponent_of_the_sizes_is_that_of_the_distribution(exponent):
+    sizes, (low, high) = distribution(exponent), (0.0005, 0.01)
+    assert sizes.min() >= low and sizes.max() <= high
+
+    def mean_log(j):
+        """Returns the mean of log(D / low) of a power law of exponent j between the limits, by quadrature."""
+        x = np.linspace(0, np.log(high / low), 20001)
+        weight = np.exp((1 - j) * x)
+        return (x * weight).sum() / weight.sum()
+
+    # the likelihood is largest where the mean logarithm equals that of the sizes
+    found = brentq(lambda j: mean_log(j) - np.log(sizes / low).mean(), 1.01, 9)
+    assert found == pytest.approx(exponent, abs=4 * (exponent - 1) / np.sqrt(len(sizes)))
+
+
+def test_equal_particles_draw_no_random_numbers():
+    rng = np.random.default_rng(3)
+    assert diameters(SnowConfig(diameter_m=0.002), 10, rng).tolist() == [0.002]
+    assert rng.uniform() == np.random.default_rng(3).uniform()
+
+
+def test_large_particles_of_a_distribution_give_more_light():
+    properties = medium(WaterConfig(jerlov="clear"))
+    sources = [LampLight(light_sources(camera), properties) for camera in (0, 1)]
+    keys = SnowConfig(density_per_m3=40, junge_exponent=3, diameter_min_m=0.0005, diameter_max_m=0.01)
+    snow = MarineSnow(keys, np.zeros(3), RIG, properties, sources, np.random.default_rng(1))
+    seen = snow.visible_particles(POSE, 0, 0.0)
+    inside = np.all((seen.pixel > 30) & (seen.pixel < np.array(SHAPE[::-1]) - 30), axis=1)
+    cover_px2 = np.pi / 4 * (RIG.focal_px * seen.diameter_m / seen.depth_m) ** 2
+    assert np.ptp(seen.diameter_m) > 0.002 and inside.sum() > 20
+    for k in np.flatnonzero(inside)[:10]:
+        index = np.argmin(np.linalg.norm(snow.visible_particles(POSE, 0, 0.0).points_m - seen.points_m[k], axis=1))
+        alone = MarineSnow(keys, np.zeros(3), RIG, properties, sources, np.random.default_rng(1))
+        starts, sizes = alone._start_m, alone._diameter_m
+        which = np.argmin(np.abs(sizes - seen.diameter_m[index]))
+        alone._start_m, alone._diameter_m = starts[which : which + 1], sizes[which : which + 1]
+        if cover_px2[k] < 3:
+            np.testing.assert_allclose(draw(alone).sum((0, 1)), cover_px2[k] * seen.radiance[k], rtol=1e-3)
+
+
+def streak(depth_m, twist, exposure_s, readout_s=0.0, current=(0.0, 0.0, 0.0), offset_px=(0.0, 0.0)):
+    """Returns the green image of one particle near the axis of a moving camera."""
+    snow, light = single(depth_m, diameter_m=0.0005, current=current), np.zeros((*SHAPE, 3), np.float32)
+    aside_m = np.array(offset_px) * depth_m / RIG.focal_px
+    snow._start_m = geometry.transform(POSE, np.array([[*aside_m, depth_m]]))
+    motion = ExposureMotion(np.array(twist), exposure_s, readout_s)
+    snow.draw(light, np.full(SHAPE, np.inf, np.float32), POSE, 0, 0.0, motion)
+    return light[..., 1].astype(float)
+
+
+@pytest.mark.parametrize("depth_m", [0.4, 1.0, 2.0])
+@pytest.mark.parametrize("velocity_mps", [(0.8, 0.0), (0.0, 0.8), (-0.6, 0.9)])
+def test_the_length_of_a_streak_is_speed_times_exposure(velocity_mps, depth_m):
+    """By the variance of the light along the path, to which a path of even speed adds length^2 / 12."""
+    exposure_s, direction = 0.02, np.array(velocity_mps) / np.linalg.norm(velocity_mps)
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+
+    def spread(image):
+        along, share = u * direction[0] + v * direction[1], image / image.sum()
+        return (share * along**2).sum() - (share * along).sum() ** 2
+
+    length_px = RIG.focal_px * np.linalg.norm(velocity_mps) * exposure_s / depth_m
+    grown = []
+    for offset_px in np.random.default_rng(2).uniform(-0.5, 0.5, (40, 2)):  # pixels sample small discs coarsely
+        rest, moved = (
+            streak(depth_m, (0, 0, 0, *w, 0), exposure_s, offset_px=offset_px) for w in ((0.0, 0.0), velocity_mps)
+        )
+        grown.append(spread(moved) - spread(rest))
+        assert moved.sum() == pytest.approx(rest.sum(), rel=1e-4) and moved.max() < rest.max()
+    assert np.sqrt(12 * np.mean(grown)) == pytest.approx(length_px, rel=0.02)
+
+
+def test_particles_that_drift_with_the_camera_are_not_streaked():
+    velocity_mps = POSE[:3, :3] @ [0.5, -0.3, 0.0]
+    moved = streak(1.0, (0, 0, 0, 0.5, -0.3, 0.0), 0.02, 0.01, current=tuple(velocity_mps))
+    np.testing.assert_allclose(moved, streak(1.0, np.zeros(6), 0.02), atol=1e-6)
+
+
+def test_a_rolling_shutter_moves_particles_as_it_moves_the_floor():
+    """A particle near the top of the image of a camera that moves to the right is read early: it is displaced right."""
+    snow, light = single(1.0, diameter_m=0.002), np.zeros((*SHAPE, 3), np.float32)
+    snow._start_m = geometry.transform(POSE, np.array([[0.0, -0.3, 1.0]]))
+    at_rest = snow.visible_particles(POSE, 0, 0.0).pixel[0]
+    readout_s, speed_mps = 0.02, 1.0
+    twist = np.array([0, 0, 0, speed_mps, 0, 0])
+    snow.draw(light, np.full(SHAPE, np.inf, np.float32), POSE, 0, 0.0, ExposureMotion(twist, 0.0, readout_s))
+    delay_s = readout_s * (at_rest[1] / (SHAPE[0] - 1) - 0.5)
+    assert delay_s < -0.005
+    moved_px = centroid(light[..., 1]) - at_rest
+    np.testing.assert_allclose(moved_px, [-RIG.focal_px * speed_mps * delay_s, 0], atol=0.2)
+
+
+def test_particles_in_focus_are_smaller_than_those_out_of_focus():
+    widths = []
+    for focus_m in (0.5, 3.0):
+        snow = single(0.5, diameter_m=0.0005)
+        snow._defocus = Defocus(0.01, 1 / focus_m)
+        widths.append((draw(snow)[..., 1] > 0).sum())
+    assert widths[0] < widths[1] / 4
+
+
+def test_drawing_does_not_depend_on_the_number_of_bands(monkeypatch):
+    snow, motion = marine_snow(density=200.0), ExposureMotion(np.array([0, 0.2, 0, 0.5, 0.3, 0]), 0.02, 0.01)
+    images = []
+    for threads in (1, 2):
+        monkeypatch.setattr("twin.imaging.row_parallel._n_processors", lambda n=threads: n)
+        light = np.zeros((*SHAPE, 3), np.float32)
+        snow.draw(light, np.full(SHAPE, 2.0, np.float32), POSE, 0, 0.0, motion)
+        images.append(light)
+    np.testing.assert_array_equal(*images)

@@ -105,7 +105,7 @@ def test_requirements_on_the_area_are_judged():
     assert not missed["map.completeness_area"]["passed"]
 
 
-def test_more_completeness_is_better_and_every_map_statistic_has_one_beside_it():
+def test_more_completeness_is_better_and_every_map_statistic_is_reported_with_one():
     assert more_is_better("map.completeness_area") and not more_is_better("map.le90_area_m")
     assert completeness_metric("map.le90_area_m") == "map.completeness_area"
     assert completeness_metric("map.rmse_m") == "map.completeness"

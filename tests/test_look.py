@@ -9,12 +9,11 @@ import pytest
 
 from twin import cli
 from twin.app import look_sheet
-from twin.app.look import image_quality, noise_image, parse_position, quality_rows, render_view
+from twin.app.look import image_quality, noise_image, parse_position, parse_twist, quality_rows, render_view
 from twin.errors import TwinError
 from twin.imaging.optics import range_of
 from twin.imaging.photo_sensor import PhotoSensor
 from twin.imaging.photons import electrons_per_cd
-from twin.imaging.water import medium
 from twin.scenario.file import load_scenario
 from twin.world.mission import prepare
 
@@ -30,19 +29,20 @@ def view():
     return render_view(mission("water.jerlov=3C"))
 
 
-def test_the_light_is_direct_signal_plus_backscatter(view):
+def test_the_light_is_the_sum_of_direct_signal_forward_scatter_and_backscatter(view):
     layers = view.decomposed.components
-    np.testing.assert_allclose(layers.total, layers.direct + layers.backscatter, rtol=1e-6)
+    np.testing.assert_allclose(layers.total, layers.direct + layers.forward + layers.backscatter, rtol=1e-5)
     # radiance reflected by the sea floor, attenuated along the range
     range_m = range_of(view.decomposed.depth, mission().rig)[..., None]
-    water = medium(mission("water.jerlov=3C").scenario.water)
+    water = mission("water.jerlov=3C").illumination.water
     albedo = view.decomposed.albedo / 255
     expected = albedo / np.pi * layers.floor_lx * np.exp(-water.attenuation_per_m * range_m)
     np.testing.assert_allclose(layers.direct, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_light_below_single_precision_is_reported_as_undefined():
-    layers = render_view(mission("water.jerlov=9C", "water.turbidity=20.0")).decomposed.components
+    murky = mission("water.jerlov=9C", "water.turbidity=20.0", "imaging.scattering=single")
+    layers = render_view(murky).decomposed.components
     assert np.isnan(layers.floor_lx[..., 2]).all() and np.isfinite(layers.backscatter).all()
 
 
@@ -120,7 +120,7 @@ def test_the_noise_of_a_physical_sensor_is_photon_and_read_noise():
     assert noise_image(view)[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
 
 
-EFFECTS = ["imaging.shadows=true", "imaging.forward_scatter=true", "snow.density_per_m3=200.0"]
+EFFECTS = ["imaging.shadows=true", "snow.density_per_m3=200.0"]
 
 
 def test_with_every_effect_the_light_is_still_the_sum_of_its_layers():
@@ -150,3 +150,32 @@ def test_the_command_prints_image_quality_and_writes_the_sheet(monkeypatch, tmp_
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 2 and "is not above the sea floor" in capsys.readouterr().err
+
+
+def test_a_twist_blurs_and_shears_the_single_image():
+    here = mission("sensor.bits=12", "sensor.readout_ms=20.0", "sensor.exposure_max_ms=30.0", "water.jerlov=clear")
+    rest, moving = render_view(here), render_view(here, twist_body=parse_twist("1.5,0,0,0,0,30"))
+    a, b = (view.decomposed.noise_free[..., 1].astype(float) for view in (rest, moving))
+    assert moving.decomposed.setting == rest.decomposed.setting
+    np.testing.assert_array_equal(moving.decomposed.components.total, rest.decomposed.components.total)
+    # the bow points up in the image: motion blur removes detail along the columns, rotation some along the rows
+    along, across = (np.abs(np.diff(b, axis=k)).mean() / np.abs(np.diff(a, axis=k)).mean() for k in (0, 1))
+    assert along < 0.8 and along < across
+    assert np.abs(noise_image(moving)).mean() < 5  # the decomposed image has the motion of the stereo pair
+
+
+BAD_TWISTS = ["1,0,0", "1,0,0,0,0,x", "1,0,0,0,0,nan", ""]
+
+
+@pytest.mark.parametrize("text", BAD_TWISTS)
+def test_bad_twists_are_rejected(text):
+    with pytest.raises(TwinError, match=r"--twist: .* is not a velocity \(allowed: VX,VY,VZ,WX,WY,WZ"):
+        parse_twist(text)
+
+
+def test_a_twist_needs_an_exposure_time():
+    with pytest.raises(
+        TwinError, match=r"--twist: the scenario has no exposure time \(allowed: with a section \[sensor"
+    ):
+        render_view(mission(), twist_body=np.ones(6))
+    np.testing.assert_allclose(parse_twist("1,2,3,0,0,180"), [0, 0, np.pi, 1, 2, 3])

@@ -54,7 +54,7 @@ def test_the_report_is_self_contained(report):
 
 def test_the_report_contains_the_values_of_the_metrics(folder, report):
     metrics, page = json.loads((folder / "metrics.json").read_text()), report
-    assert "The survey is complete" in page and "Jerlov type IB" in page
+    assert "The survey is complete" in page and "Jerlov type IB (Solonenko &amp; Mobley 2015)" in page
     for value in (metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"], metrics["map"]["nmad_m"]):
         assert wording.length(value) in page
     for row in metrics["tracks"]:

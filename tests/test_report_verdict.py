@@ -201,14 +201,14 @@ def test_metrics_that_were_not_evaluated_have_the_same_keys_and_meet_no_requirem
 IDEAL = load_scenario("quickstart")
 REAL = [
     "calibration_error.baseline_error=0.01", 'port.kind="flat"', "sensor.motion_blur=true", "snow.density_per_m3=10",
-    "imaging.forward_scatter=true", "imaging.shadows=true", "current.velocity_mps=[0.1, 0.0, 0.0]",
+    "imaging.shadows=true", "current.velocity_mps=[0.1, 0.0, 0.0]",
 ]  # fmt: skip
 
 
 def test_a_default_scenario_names_what_it_idealises():
     assert idealisations(IDEAL) == [
         "The cameras are ideal: no calibration error, no port, no motion blur.",
-        "The water is ideal: no forward scatter, no marine snow, no current.",
+        "The water is ideal: no marine snow, no current.",
         "The light is ideal: no shadows of the lamps.",
     ]
 

@@ -1,4 +1,4 @@
-"""The vehicle slows down where frames are lost and stops where vision is lost; a sound survey is flown as planned."""
+"""The vehicle slows down where frames are lost and stops where vision is lost; otherwise it flies as planned."""
 
 import functools
 
@@ -16,7 +16,7 @@ from twin.estimate.vision.f2f import constant_velocity_motion
 from twin.estimate.vision.motion_filter import MotionFilter
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
-from twin.session.mission_actions import RATES, SOUND_S, MissionActions
+from twin.session.mission_actions import RATES, RECOVERED_S, MissionActions
 from twin.surrogate.surrogate_world import SurrogateWorld
 from twin.world.mission import prepare
 from twin.world.pace import FULL, Pace
@@ -44,7 +44,7 @@ def frames(seconds, status):
     return [status] * round(seconds * RATE_HZ)
 
 
-def test_sound_frames_and_a_few_lost_ones_are_flown_at_full_pace():
+def test_measured_frames_and_a_few_lost_ones_are_flown_at_full_pace():
     actions = MissionActions(mission())
     statuses = frames(5, "ok") + ["lost"] * 5 + frames(5, "ok") + ["lost", "ok"] * 2
     assert set(paces(actions, statuses)) == {FULL} and actions.times == ActionTimes() and not actions.times.sentence
@@ -56,7 +56,7 @@ def test_the_vehicle_stops_where_vision_is_lost_and_flies_on_slowly_at_first():
     blind = paces(actions, frames(5, "lost"))
     assert blind[round(BLIND_S * RATE_HZ) - 1] == FULL
     assert blind[-1].rate == pytest.approx(0.0, abs=0.02) and sum(pace.keyframe for pace in blind) >= 1
-    after = paces(actions, frames(SOUND_S + 0.5, "ok"))
+    after = paces(actions, frames(RECOVERED_S + 0.5, "ok"))
     assert max(pace.rate for pace in after) <= RATES["slow"]
     assert paces(actions, frames(6, "ok"))[-1] == FULL
     assert log == ["hold", "slow", "fly"]
@@ -76,12 +76,12 @@ def test_frames_of_the_compiled_loop_count_as_measured():
     actions = MissionActions(mission())
     for _ in range(40):
         assert actions(estimate("lost")) == FULL
-        actions.add_sound_frames(14)
+        actions.add_measured_frames(14)
         assert actions(estimate("ok")) == FULL
 
 
-def test_prediction_and_reference_brake_alike():
-    """While nothing is measured, the filter predicts the path that the vehicle is told to fly: both differ by the lag
+def test_prediction_and_reference_brake_equally():
+    """While nothing is measured, the filter predicts the path of the reference: both differ by the lag
     of one frame, at most 0.35 m/s / 30 Hz each."""
     actions, predicted = MissionActions(mission()), MotionFilter()
     predicted.velocity[3] = speed = 0.35
@@ -94,17 +94,20 @@ def test_prediction_and_reference_brake_alike():
 
 
 def test_a_slowed_course_flies_the_same_path_with_the_same_keyframes():
-    whole, interval_s = mission().fly(1), 1 / RATE_HZ
-    time_s, courses = 0.0, []
-    while len(course := mission().fly_on(1, time_s, Pace(0.7))):
-        courses.append(course)
-        time_s = course.path_times_s[-1]
-    positions = np.concatenate([course.reference.position for course in courses])
-    velocities = np.concatenate([course.reference.velocity for course in courses])
-    assert len(courses) == np.ceil((len(whole) - 1) / 0.7)
-    assert sum(course.keyframe.sum() for course in courses) == whole.keyframe[1:].sum() and courses[-1].keyframe[-1]
+    whole, interval_s = mission().planned_frames(1), 1 / RATE_HZ
+    time_s, sequences = 0.0, []
+    while len(sequence := mission().next_frames(1, time_s, Pace(0.7))):
+        sequences.append(sequence)
+        time_s = sequence.path_times_s[-1]
+    positions = np.concatenate([sequence.reference.position for sequence in sequences])
+    velocities = np.concatenate([sequence.reference.velocity for sequence in sequences])
+    assert len(sequences) == np.ceil((len(whole) - 1) / 0.7)
+    assert (
+        sum(sequence.keyframe.sum() for sequence in sequences) == whole.keyframe[1:].sum()
+        and sequences[-1].keyframe[-1]
+    )
     np.testing.assert_allclose(positions[-1], whole.reference.position[-1])
-    times = [course.path_times_s[0] for course in courses]
+    times = [sequence.path_times_s[0] for sequence in sequences]
     for axis in range(3):
         np.testing.assert_allclose(
             positions[:, axis], np.interp(times, whole.path_times_s, whole.reference.position[:, axis]), atol=1e-3
@@ -130,16 +133,16 @@ def test_a_changing_rate_accelerates_the_reference():
 
 
 def test_at_full_pace_all_remaining_frames_follow():
-    whole = mission().fly(1)
-    rest = mission().fly_on(1, whole.path_times_s[99], FULL)
+    whole = mission().planned_frames(1)
+    rest = mission().next_frames(1, whole.path_times_s[99], FULL)
     np.testing.assert_allclose(rest.path_times_s, whole.path_times_s[100:])
     np.testing.assert_allclose(rest.reference.position, whole.reference.position[100:])
     np.testing.assert_array_equal(rest.keyframe, whole.keyframe[100:])
-    assert len(mission().fly_on(1, whole.path_times_s[-1], FULL)) == 0
+    assert len(mission().next_frames(1, whole.path_times_s[-1], FULL)) == 0
 
 
 def test_the_pilot_does_not_act_on_predicted_positions():
-    reference = mission().fly(1)[100].reference
+    reference = mission().planned_frames(1)[100].reference
     near, far = (estimate("lost", reference.position + [dx, 0.1, 0.0]) for dx in (0.0, 0.5))
     pressure, dvl = Readings(pressure_z_m=2.0), Readings(pressure_z_m=2.0, dvl_mps=np.zeros(3))
 
@@ -152,7 +155,7 @@ def test_the_pilot_does_not_act_on_predicted_positions():
     assert np.abs(command(near, pressure) - command(low, pressure)).max() > 0.1
 
 
-def test_a_sound_survey_is_the_same_with_and_without_actions():
+def test_a_survey_without_lost_frames_is_the_same_with_and_without_actions():
     def fly(actions):
         with open_world(mission(), Stopwatch()) as world:
             navigator = navigator_with(mission(), world.vision, Stopwatch())
@@ -167,7 +170,7 @@ def test_a_sound_survey_is_the_same_with_and_without_actions():
 
 def fly_blind(first, end, monkeypatch, actions):
     """Returns the true survey and the online path of a surrogate survey without F2F in the frames from first to end."""
-    monkeypatch.setattr(SurrogateWorld, "fast_forward", lambda *_: lambda course, k: k)
+    monkeypatch.setattr(SurrogateWorld, "fast_forward", lambda *_: lambda sequence, k: k)
     with open_world(mission(), Stopwatch()) as world:
         navigator = navigator_with(mission(), world.vision, Stopwatch())
         track, observe = world.vision.track_frame, world.vision.observe_stereo

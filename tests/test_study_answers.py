@@ -1,4 +1,4 @@
-"""Ranges that are said to pass do pass: on curves that are not monotonic, at the boundary, and with few surveys."""
+"""Ranges reported as passing do pass: on curves that are not monotonic, at the boundary, and with few surveys."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Degraded surveys in studies, holes of the map in the search, and completeness beside every map statistic."""
+"""Degraded surveys in studies, holes of the map in the search, and completeness with every map statistic."""
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def test_a_sentence_as_a_warning_ends_with_one_full_stop(study, tmp_path):
     assert wording.headline(study, warned).endswith("12 of 12 surveys: The surrogate extrapolates: too turbid.")
 
 
-def test_every_map_statistic_of_a_study_has_its_completeness_beside_it(study, tmp_path):
+def test_every_map_statistic_of_a_study_is_reported_with_completeness(study, tmp_path):
     assert with_completeness(["map.le90_area_m", "timing.wall_s", "map.le90_m", "map.rmse_m"]) == [
         "map.le90_area_m", "map.completeness_area", "timing.wall_s", "map.le90_m", "map.completeness", "map.rmse_m",
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Odd studies end with the right exit status, and what is said about them holds."""
+"""Odd studies end with the right exit status and the right answer."""
 
 import odd_studies
 import pytest
@@ -14,7 +14,7 @@ def _no_report(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "status", "said"),
+    ("name", "status", "expected"),
     [
         ("all refused", 2, ["not allowed (allowed: greater than 0) in sample 0 and 239 more"]),
         ("no survey can be planned", 2, ["No survey could be evaluated. 8 samples (8 surveys) cannot be flown"]),
@@ -40,11 +40,11 @@ def _no_report(monkeypatch):
         ("interrupted", 130, ["The study is not finished: 235 surveys not flown yet", "not decided with 5 surveys"]),
     ],
 )
-def test_an_odd_study_says_what_holds(tmp_path, name, status, said):
-    found, lines = odd_studies.says(name, tmp_path)
+def test_an_odd_study_is_answered_correctly(tmp_path, name, status, expected):
+    found, lines = odd_studies.answer_of(name, tmp_path)
     text = " ".join(lines)
     assert found == status
-    for sentence in said:
+    for sentence in expected:
         assert sentence in text
 
 

@@ -31,7 +31,7 @@ def analysis(study, tmp_path):
     return analyse(study, tmp_path)
 
 
-def test_the_first_sentence_says_where_the_seek_key_passes(tmp_path):
+def test_the_first_sentence_states_where_the_seek_key_passes(tmp_path):
     study = study_of(tmp_path, STUDY, ("samples = 12", "samples = 200"))
     analysis = analyse(study, tmp_path)
     first = wording.headline(study, analysis).partition(". ")[0]

@@ -1,4 +1,4 @@
-"""A plan found with the surrogate is recommended only if it passes rendered, and its failure improves the search."""
+"""A plan found with the surrogate is recommended only if its rendered surveys pass; if not, they improve the search."""
 
 import json
 import math
@@ -137,7 +137,7 @@ def test_no_cheaper_plan_of_the_final_front_is_left_untried(searched):
     assert not cheaper or in_round.count(max(in_round)) == config.plans
 
 
-def test_rendered_surveys_are_told_from_surrogate_ones_in_the_table(searched):
+def test_the_table_distinguishes_rendered_from_surrogate_surveys(searched):
     _, result, folder = searched
     table = pq.read_table(folder / "results.parquet").to_pylist()
     rendered = [row for row in table if row["fidelity"] == "rendered"]
@@ -151,7 +151,7 @@ def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(sea
     study, result, folder = searched
     config = tuning_config(study)
     headline = tuning_report.headline(study, config, result)
-    assert "Flown rendered, 2 of 2 surveys were completed and met every requirement" in headline
+    assert "2 of 2 rendered surveys were completed and met every requirement" in headline
     median = result.recommended_verification.medians["map.le90_m"]
     assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
     tuning_report.write_tuning_report(study, config, result, folder)
@@ -165,7 +165,7 @@ def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(sea
     for text in warnings:
         assert f"# Warning: {text}" in scenario
     assert page.count("<b>Warning:</b>") == len(warnings)
-    assert "Plans flown rendered" in page
+    assert "Plans with rendered surveys" in page
 
 
 def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_rounds(tmp_path):
@@ -175,7 +175,7 @@ def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_roun
     assert {v.search_round for v in result.verifications} <= {0, 1, 2}
     assert 1 <= len(result.verifications) <= 9
     headline = tuning_report.headline(study, tuning_config(study), result)
-    assert "no plan of the search passed when flown rendered" in headline
+    assert "no plan of the search passed in rendered surveys" in headline
     assert tuning_report.summary(study, tuning_config(study), result)["recommended"] is None
 
 
@@ -226,7 +226,7 @@ def test_without_verification_the_plan_is_recommended_with_a_warning_in_every_ou
 
 
 @pytest.mark.parametrize(("given", "kept"), [("", "metrics"), ('keep = "report"\n', "report")])
-def test_the_expected_time_is_told_before_and_the_run_folders_are_kept_on_request(tmp_path, capsys, given, kept):
+def test_the_expected_time_is_printed_before_and_the_run_folders_are_kept_on_request(tmp_path, capsys, given, kept):
     kept_of = []
 
     def fly(survey):
@@ -237,12 +237,12 @@ def test_the_expected_time_is_told_before_and_the_run_folders_are_kept_on_reques
     search(study, tmp_path / "out", fly)
     lines = capsys.readouterr().err.splitlines()
     assert "rendered: 2 surveys of about" in lines[0] and "(a rough estimate)" in lines[0]
-    assert lines[1].endswith("flown rendered: 0 of 2 surveys passed")
+    assert lines[1].endswith(": 0 of 2 rendered surveys passed")
     assert "(as measured)" in lines[2]
     assert set(kept_of) == {kept}
 
 
-def test_plans_outside_the_fit_of_the_surrogate_are_not_recommended_and_are_told(tmp_path):
+def test_plans_outside_the_fit_of_the_surrogate_are_not_recommended_and_are_reported(tmp_path):
     """The surrogate refuses altitudes above 2 m, where it would be right."""
     reason = "imaging.fidelity: the error model does not hold for {:.2f} m (allowed: up to 2 m, or --extrapolate)"
 
@@ -347,13 +347,30 @@ def test_the_cost_is_the_first_duration_or_else_the_first_objective(tmp_path, ob
 
 
 @pytest.mark.slow
-def test_a_tuned_plan_of_a_tiny_survey_is_flown_rendered(tmp_path):
+def test_a_tuned_plan_of_a_tiny_survey_is_verified_by_rendered_surveys(tmp_path):
     (tmp_path / "study.toml").write_text(TINY)
     options = study_command.StudyOptions(tmp_path / "out", jobs=2)
     assert study_command.tune(str(tmp_path / "study.toml"), options) == 0
     rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
     rendered = [row for row in rows if row["fidelity"] == "rendered"]
     assert [(row["status"], row["require.map.le90_m.passed"]) for row in rendered[-1:]] == [("complete", True)]
-    assert "Flown rendered, 1 of 1 surveys" in (tmp_path / "out" / "tuning.html").read_text()
+    assert "1 of 1 rendered surveys" in (tmp_path / "out" / "tuning.html").read_text()
     folders = [folder for folder in (tmp_path / "out" / "runs").iterdir() if (folder / "report.html").is_file()]
     assert len(folders) == len(rendered)
+
+
+def test_cheaper_plans_that_the_surrogate_rejects_are_tried_until_one_does_not_pass(tmp_path):
+    """The surrogate is too pessimistic; without these plans, the recommendation would stay at its limit of 1.8 m."""
+
+    def pessimistic(survey):
+        limit_m = SURROGATE_LIMIT_M if is_rendered(survey) else RENDERED_LIMIT_M
+        return flown(survey, 0.01 * (survey.values["plan.altitude_m"] / limit_m) ** 4)
+
+    study = study_of(tmp_path, TUNING, ("verify = 2", "verify = 2\nplans = 20"))
+    result = search(study, tmp_path / "out", pessimistic)
+    altitude_m = result.recommended.values["plan.altitude_m"]
+    assert RENDERED_LIMIT_M < altitude_m <= SURROGATE_LIMIT_M
+    (rejected,) = (v.surrogate.values["plan.altitude_m"] for v in result.verifications if not v.passed)
+    assert rejected > SURROGATE_LIMIT_M
+    all_m = [c.values["plan.altitude_m"] for c in result.candidates]
+    assert not [z for z in all_m if altitude_m < z < rejected]

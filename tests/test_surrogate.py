@@ -3,7 +3,9 @@
 import functools
 import subprocess
 import sys
+import time
 from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -19,14 +21,14 @@ from twin.errors import SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
 from twin.surrogate import error_model_file
-from twin.surrogate.error_model import ErrorModel, SigmaLaw, ViewsLaw
+from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, SigmaLaw
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import EDGE_PX, CellErrors, MapModel
+from twin.surrogate.map_model import EDGE_PX, CellErrors, MapModel, roughness_error_px, window_noise
 from twin.surrogate.matchability import bounds_px, lamp_share, unevenness_px
 from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
-from twin.surrogate_fit import fit
-from twin.surrogate_fit.comparison import ComparisonVision, single_error_models
-from twin.surrogate_fit.rendered_surveys import fit_to_surveys
+from twin.surrogate_fit import fit, rendered_surveys
+from twin.surrogate_fit.comparison import UNIT_PX, ComparisonVision, single_error_models
+from twin.surrogate_fit.rendered_surveys import all_statistics, fit_to_surveys
 from twin.world.mission import prepare
 from twin.world.pilot import make_pilot
 
@@ -86,7 +88,7 @@ def test_the_matching_bound_grows_with_turbidity_depth_and_noise():
 def test_the_lamp_share_decreases_with_sunlight():
     def share(lux, *sets):
         m = mission(f"sun.illuminance_lx={lux}", *sets)
-        return lamp_share(m.scenario, m.illumination, m.terrain)
+        return lamp_share(m.scenario, m.illumination)
 
     lamps = "lamps=[{position_m=[0.3, 0.3, 0.0], intensity_cd=500.0}]"
     shares = [share(lux, lamps) for lux in (0, 100, 1000, 10_000)]
@@ -98,7 +100,7 @@ def test_the_lamp_share_decreases_with_sunlight():
     dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
     plan = dark.scenario.plan.model_copy(update={"altitude_m": 1000.0})
     high = dark.scenario.model_copy(update={"plan": plan})
-    assert lamp_share(high, dark.illumination, dark.terrain) == 1  # no light returns
+    assert lamp_share(high, dark.illumination) == 1  # no light returns
 
 
 def test_unevenness_equals_the_deviation_of_a_curved_floor_from_its_plane():
@@ -258,9 +260,16 @@ def no_errors(vision):
     return CellErrors(zeros, zeros, zeros, 0.0, np.array([1.0, 3.0]), np.zeros(2), np.full(2, 0.01), np.ones(2))
 
 
+def patch_of(model, errors, pose, next_pose=None, estimated=None, seed=0):
+    """Returns the height patch of a keyframe; `estimated` is its estimated pose, by default the true one."""
+    observed = model.observe(pose, pose if estimated is None else estimated)
+    following = None if next_pose is None else model.observe(next_pose, next_pose)
+    return model.sample_patch(observed, following, np.zeros((6, 6)), errors, np.random.default_rng(seed))
+
+
 def test_without_errors_the_patch_of_a_keyframe_is_the_true_floor(vision, no_errors):
     pose = tilted(0.1, 0.2, 2.0)
-    patch = vision.scene.map_model.sample_patch(pose, None, pose, np.zeros((6, 6)), no_errors, np.random.default_rng(0))
+    patch = patch_of(vision.scene.map_model, no_errors, pose)
     known = np.isfinite(patch.height_m)
     rows, cols = patch.height_m.shape
     true = vision.scene.map_model.height_m[patch.row : patch.row + rows, patch.col : patch.col + cols]
@@ -272,10 +281,7 @@ def test_a_height_error_of_the_pose_shifts_the_patch_without_the_cells_of_the_ne
     pose, next_pose = tilted(0.1, 0.2, 2.0), tilted(0.3, 0.2, 2.0)
     raised = pose.copy()
     raised[2, 3] += 0.01
-    whole, strip = (
-        vision.scene.map_model.sample_patch(pose, n, raised, np.zeros((6, 6)), no_errors, np.random.default_rng(0))
-        for n in (None, next_pose)
-    )
+    whole, strip = (patch_of(vision.scene.map_model, no_errors, pose, n, raised) for n in (None, next_pose))
     rows, cols = whole.height_m.shape
     true = vision.scene.map_model.height_m[whole.row : whole.row + rows, whole.col : whole.col + cols]
     assert np.nanmean(whole.height_m - true) == pytest.approx(0.01, abs=1e-5)
@@ -327,19 +333,47 @@ def test_an_edge_does_not_change_the_unevenness_of_the_floor_around_it():
     assert with_wall == pytest.approx(without, rel=0.1)
 
 
-def test_the_variance_of_a_cell_decreases_with_the_number_of_keyframes(vision, no_errors):
-    """By the law r + (1 - r) / (1 + g (n - 1)), relative to one keyframe."""
-    errors = no_errors._replace(sigma_views=ViewsLaw(0.2, 2.0), depth_sigma_px=np.full(2, 0.1))
-    pose, model, rng = tilted(0.1, 0.2, 2.0), vision.scene.map_model, np.random.default_rng(0)
-    model._views_until_now[:] = 0
-    one = model.sample_patch(pose, None, pose, np.zeros((6, 6)), errors, rng)
-    for n in (2, 4):
-        for _ in range(n - 1):
-            assert not np.isfinite(model.sample_patch(pose, pose, pose, np.zeros((6, 6)), errors, rng).height_m).any()
-        several = model.sample_patch(pose, None, pose, np.zeros((6, 6)), errors, rng)
-        ratio = several.variance_m2 / one.variance_m2
-        np.testing.assert_allclose(ratio[np.isfinite(ratio)], 0.2 + 0.8 / (2 * n - 1), rtol=1e-5)
-    assert model.views.max() == 4
+def test_the_variance_of_a_cell_decreases_with_the_number_of_keyframes_and_their_distance(vision, no_errors):
+    """By the law c + (1 - c) / (1 + g (n - 1)), g = gain B^2 / (B^2 + half^2), for steps B of 1 and 2 baselines."""
+    law, baseline_m = DepthLaw(0.1, 0.0, 0.0, 0.2, 2.0, 1.5), vision.rig.baseline_m
+    errors, model = no_errors._replace(sigma_law=law, depth_sigma_px=np.full(2, 0.1)), vision.scene.map_model
+    for part in model._runs:
+        part[:] = 0
+    for step in (1, 2):
+        poses = [tilted(0.1 + step * baseline_m * k, 0.2, 2.0) for k in range(4)]
+        variances = {}
+        for n in (1, 4):
+            for pose, next_pose in pairwise([*poses[4 - n :], None]):
+                patch = patch_of(model, errors, pose, next_pose)
+            window = np.s_[
+                patch.row : patch.row + patch.height_m.shape[0], patch.col : patch.col + patch.height_m.shape[1]
+            ]
+            variances[n] = np.where(model.views[window] == n, patch.variance_m2, np.nan)
+        gain = 2.0 * step**2 / (step**2 + 1.5**2)
+        ratio = (variances[4] / variances[1])[np.isfinite(variances[4] / variances[1])]
+        assert len(ratio) > 1000
+        np.testing.assert_allclose(ratio, 0.2 + 0.8 / (1 + 3 * gain), rtol=1e-4)
+        assert law.relative_variance(4, step) == pytest.approx(0.2 + 0.8 / (1 + 3 * gain))
+
+
+def test_cells_without_a_height_lie_along_the_border_of_the_images(vision, no_errors):
+    """Of the cells at a distance b from the border, the fraction 0.5 exp(-b / 10) has no height."""
+    model, pose = vision.scene.map_model, tilted(0.1, 0.2, 2.0)
+    uniform = np.random.default_rng(0).random(model.seen.shape, np.float32)
+    errors = no_errors._replace(dropout=uniform, border_share=0.5, border_width_px=np.full(2, 10.0))
+    observed, patch = model.observe(pose, pose), patch_of(model, errors, pose)
+    for low, high in ((0, 10), (10, 20), (40, 60)):
+        cells = (observed.depth_m > 0) & (observed.border_px >= low) & (observed.border_px < high)
+        expected = 0.5 * np.exp(-observed.border_px[cells] / 10).mean()
+        holes = np.isnan(patch.height_m[cells]).mean()
+        assert holes == pytest.approx(expected, abs=4 * np.sqrt(expected / cells.sum()) + 1e-3)
+
+
+def test_the_noise_of_edges_has_unit_variance_and_the_correlation_of_a_window():
+    """Means over windows of four cells share three quarters of their cells with those of the neighbours."""
+    noise = window_noise((400, 400), 4, np.random.default_rng(0))
+    assert noise.std() == pytest.approx(1.0, rel=0.03)
+    assert np.mean(noise[:, 1:] * noise[:, :-1]) == pytest.approx(0.75, abs=0.05)
 
 
 def vision_roughness_px(vision):
@@ -350,12 +384,11 @@ def vision_roughness_px(vision):
 def test_rough_cells_have_larger_errors_and_more_holes(vision, no_errors):
     shape = vision.scene.map_model.seen.shape
     rng, pose, model = np.random.default_rng(0), tilted(0.1, 0.2, 2.0), vision.scene.map_model
-    model._views_until_now[:] = 0
     uniform = rng.random(shape, np.float32)
     errors = no_errors._replace(
         edge_noise=np.ones(shape, np.float32), dropout=uniform, edge_error_gain=2.0, edge_half_px=0.2
     )
-    patch = model.sample_patch(pose, None, pose, np.zeros((6, 6)), errors, rng)
+    patch = patch_of(model, errors, pose)
     window = np.s_[patch.row : patch.row + patch.height_m.shape[0], patch.col : patch.col + patch.height_m.shape[1]]
     difference = patch.height_m - model.height_m[window]
     known = np.isfinite(difference)
@@ -369,42 +402,103 @@ def test_rough_cells_have_larger_errors_and_more_holes(vision, no_errors):
     assert known[inside][rough[inside]].mean() < 0.9 * known[inside][~rough[inside]].mean()
 
 
+TRUE_DEPTH = DepthLaw(0.05, 1.5, 1.2, 0.05, 3.0, 1.4)
+
+
+def map_statistics(rng, scatter=0.02):
+    """Returns statistics of surveys whose variances follow `TRUE_DEPTH`, with known lateral, relief and edge errors."""
+    conditions = (0.02, 0, 0.5), (0.02, 1, 1.5), (0.04, 0, 3), (0.04, 1, 0.7), (0.1, 1, 2), (0.1, 0, 1)
+    for bound_px, lamp, step in conditions:
+        survey = {"bound_px": [bound_px], "lamp_share": [lamp]}
+        classes = ("smooth1", 1, 0.0), ("smooth4", 5, 0.0), ("smooth15", 20, 0.0), ("rough9", 11, 0.05)
+        for name, views, rough_px in (*classes, ("rougher9", 11, 0.2), ("steep", 5, 0.0), ("edge", 4, 1.0)):
+            pose, per_px2 = 1e-7, 8e-3
+            lateral, edge = (1e-5 if name == "steep" else 0.0), (1e-3 if name == "edge" else 0.0)
+            depth_px = TRUE_DEPTH.sigma_px(bound_px, lamp) ** 2 * TRUE_DEPTH.relative_variance(views, step)
+            relief = roughness_error_px(rough_px, 0.4, 0.05, 0.0) ** 2
+            images = pose + per_px2 * (depth_px + relief) + 1.5**2 * lateral + 0.7**2 * edge
+            images *= float(np.exp(scatter * rng.standard_normal()))
+            survey[f"map_error_{name}"] = [
+                images, pose, pose + per_px2 * UNIT_PX**2, pose + lateral, pose + edge, views, step, rough_px
+            ]  # fmt: skip
+        yield survey
+
+
 def test_the_fit_recovers_the_variances_of_maps():
-    """Variances of maps with known factors on depth, lateral shift and roughness, and with a known `ViewsLaw`."""
-    statistics, true, compared = [], ViewsLaw(0.2, 2.5), ViewsLaw(0.3, 1.0)
-    rng = np.random.default_rng(0)
-    for depth_factor in (0.5, 1.0, 2.0, 3.0):
-        survey = {}
-        for name, views in (("few", 1.2), ("many", 8.0), ("steep", 4.0), ("edge", 4.0)):
-            pose, depth, lateral, edge = (
-                1e-7,
-                4e-6,
-                {"steep": 9e-6, "edge": 2e-6}.get(name, 1e-8),
-                5e-5 * (name == "edge"),
-            )
-            share, compared_share = (law(np.array(views)) for law in (true, compared))
-            for source, value in (
-                ("pose", pose),
-                ("depth", pose + depth * compared_share),
-                ("lateral", pose + lateral),
-                ("edge", pose + edge),
-                ("images", pose + depth_factor * depth * share + 1.5 * lateral + 0.4 * edge),
-            ):
-                survey[f"map_error_{name}_{source}"] = [value * float(np.exp(0.02 * rng.standard_normal()))]
-            survey[f"map_views_{name}_images"] = [views] * 20
-        statistics.append(survey)
-    law, factors = fit._fit_map_variances(statistics, "error", compared)
-    assert law(8.0) / law(1.2) == pytest.approx(true(8.0) / true(1.2), rel=0.1)
-    np.testing.assert_allclose(factors[:, 0] * law(1.2), true(1.2) * np.array([0.5, 1.0, 2.0, 3.0]), rtol=0.2)
-    assert np.nanmedian(factors[:, 1]) == pytest.approx(1.5, rel=0.2)
-    assert np.nanmedian(factors[:, 2]) == pytest.approx(0.4, rel=0.2)
+    found = fit._fit_map_variances(list(map_statistics(np.random.default_rng(0))), "error", ErrorModel())
+    for bound_px, lamp, views, step in ((0.02, 0, 1, 1), (0.1, 1, 5, 1), (0.04, 0.5, 10, 0.6), (0.03, 1, 4, 3)):
+        fitted, true = (
+            law.sigma_px(bound_px, lamp) * np.sqrt(law.relative_variance(views, step))
+            for law in (found.depth, TRUE_DEPTH)
+        )
+        assert fitted == pytest.approx(true, rel=0.05)
+    assert found.lateral_sigma_px == pytest.approx(1.5, rel=0.05)
+    assert found.relief_gain == pytest.approx(0.4, rel=0.15)
+    assert found.relief_limit_px == pytest.approx(0.05, rel=0.1)
+    assert found.edge_gain == pytest.approx(0.7, rel=0.05)
+    assert found.scatter < 0.02
+
+
+def test_parameters_that_no_survey_determines_keep_the_values_of_the_compared_model():
+    """A unit error at edges has a thousandth of the effect of the pose, and the noise of the statistics is 2 %."""
+    surveys = list(map_statistics(np.random.default_rng(0)))
+    for statistics in surveys:
+        for name in [name for name in statistics if name.startswith("map")]:
+            if "edge" in name:
+                del statistics[name]
+            else:
+                statistics[name][4] = statistics[name][1] * 1.001
+    found = fit._fit_map_variances(surveys, "error", ErrorModel(edge_error_gain=1.7))
+    assert found.edge_gain == pytest.approx(1.7, rel=0.05)
+
+
+def test_the_fit_finds_the_scatter_of_depth_errors_between_surveys():
+    """32 surveys: the scatter from median absolute values has a relative standard error of about 0.2."""
+    rng, surveys = np.random.default_rng(1), []
+    for simulated in [s for _ in range(6) for s in map_statistics(rng)]:
+        factor = float(np.exp(0.4 * rng.standard_normal()))  # of the variance: 0.2 of the standard deviation
+        surveys.append({k: [v[0] * factor, *v[1:]] if k.startswith("map") else v for k, v in simulated.items()})
+    assert fit._fit_map_variances(surveys, "error", ErrorModel()).scatter == pytest.approx(0.2, rel=0.4)
+
+
+def test_the_fit_recovers_the_holes_at_image_borders():
+    true, surveys = BorderLaw(0.45, 1.5, 90.0, 1.2), []
+    for bound_px, lamp in ((0.01, 0.0), (0.04, 0.0), (0.02, 1.0), (0.06, 1.0)):
+        distance = np.array([0.25, 0.75, 1.5, 3.0, 6.0, 12.0])
+        known = 0.99 * (1 - true.share * np.exp(-distance / true.width_px(bound_px, lamp)))
+        surveys.append({
+            "bound_px": [bound_px], "lamp_share": [lamp], "hole_known": [0.99],
+            "border_px": distance, "border_known": known, "border_cells": [500.0] * 6,
+        })  # fmt: skip
+    np.testing.assert_allclose(fit._fit_border_holes(surveys), true, rtol=0.02)
 
 
 def test_the_fit_recovers_the_roughness_that_halves_the_map():
     roughness = np.array([0.1, 0.3, 0.7, 1.5, 3.0, 6.0])
     known = 0.99 / (1 + (roughness / 4.0) ** 2) * (1 + (0.1 / 4.0) ** 2)
-    survey = {"hole_known": known, "hole_roughness_px": roughness, "hole_cells": [1000.0] * 6}
+    survey = {"hole_known": known, "hole_px": roughness, "hole_cells": [1000.0] * 6}
     assert fit._fit_edge_holes([survey], 10.0) == pytest.approx(4.0, rel=0.1)
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_the_statistics_of_surveys_come_in_their_order(jobs, monkeypatch):
+    """With threads in place of processes; the first surveys take longest."""
+    monkeypatch.setattr(rendered_surveys, "ProcessPoolExecutor", lambda n, mp_context: ThreadPoolExecutor(n))
+    monkeypatch.setattr(rendered_surveys, "get_context", lambda method: None)
+
+    def statistics(scenario, folder, compared):
+        time.sleep(0.05 / (1 + scenario))
+        return {"value": [scenario], "folder": [folder], "compared": [compared]}
+
+    monkeypatch.setattr(rendered_surveys, "survey_statistics", statistics)
+    found = list(all_statistics([(k, f"run{k}") for k in range(6)], "model", jobs))
+    assert found == [{"value": [k], "folder": [f"run{k}"], "compared": ["model"]} for k in range(6)]
+
+
+def test_a_survey_in_water_without_matches_is_not_flown(tmp_path):
+    scenario = load_scenario("quickstart", ['water.jerlov="9C"', "water.turbidity=4", "plan.tracks=1"])
+    assert rendered_surveys.survey_statistics(scenario, tmp_path / "run", ErrorModel()) == {}
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
@@ -419,7 +513,7 @@ def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
 
 
 def test_water_without_matches_aborts_the_survey_with_a_reason(tmp_path):
-    murky = ['water.jerlov="9C"', "water.turbidity=4", "imaging.extrapolate=true"]
+    murky = ['water.jerlov="9C"', "water.turbidity=10", "imaging.extrapolate=true"]
     scenario = load_scenario("quickstart", [*SHORT, *murky])
     metrics = survey.run(scenario, tmp_path, outputs=()).metrics
     assert metrics["status"] == "aborted"
@@ -464,7 +558,8 @@ def test_the_fit_recovers_the_error_model_of_simulated_surveys():
     true = ErrorModel(
         match_sigma_px=SigmaLaw(0.03, 1.5), match_error_ratio=1.4, match_bias_fraction=0.4, lamp_error_growth=1.5,
         f2f_sigma_px=SigmaLaw(0.04, 2.0), f2f_error_ratio=1.0, f2f_anticorrelation=0.4, distance_growth=4.0,
-        relief_gain=0.3, mosaic_sigma_px=SigmaLaw(0.3, 1.0), depth_sigma_px=SigmaLaw(0.02, 1.0), lateral_sigma_px=0.5,
+        relief_gain=0.3, mosaic_sigma_px=SigmaLaw(0.3, 1.0), lateral_sigma_px=0.5,
+        depth_sigma=DepthLaw(0.1, 2.0, 0.0, 0.01, 3.0, 1.0), depth_error=DepthLaw(0.08, 2.0, 0.0, 0.01, 3.0, 1.0),
     )  # fmt: skip
     waters = [['water.jerlov="I"'], ['water.jerlov="III"'], ["lamps=[]", "sun.illuminance_lx=2000"]]
     statistics = [compare_survey(mission(*water), true, seed) for seed, water in enumerate(waters)]
@@ -478,7 +573,11 @@ def test_the_fit_recovers_the_error_model_of_simulated_surveys():
     assert fitted.f2f_error_ratio == pytest.approx(true.f2f_error_ratio, rel=0.1)
     assert fitted.f2f_anticorrelation == pytest.approx(true.f2f_anticorrelation, abs=0.1)
     assert fitted.distance_growth == pytest.approx(true.distance_growth, rel=0.25)
-    assert fitted.depth_sigma_px(bound_px) == pytest.approx(true.depth_sigma_px(bound_px), rel=0.15)
+    sigmas = [
+        m.depth_sigma.sigma_px(bound_px, 1.0) * np.sqrt(m.depth_sigma.relative_variance(6, 1)) for m in (fitted, true)
+    ]
+    assert sigmas[0] == pytest.approx(sigmas[1], rel=0.15)
+    assert fitted.depth_error_scatter < 0.1
     assert fitted.lateral_sigma_px == pytest.approx(true.lateral_sigma_px, rel=0.2)
 
 
@@ -538,7 +637,7 @@ def test_the_truth_records_track_reference_and_station_keeping_of_every_frame():
     with open_world(flown, Stopwatch()) as world:
         navigator = navigator_with(flown, world.vision, Stopwatch())
         survey.fly(flown, world, navigator, lambda *_: None)
-        truth, first, hold = world.truth(), flown.fly(1), len(flown.hold(1))
+        truth, first, hold = world.truth(), flown.planned_frames(1), len(flown.station_keeping_frames(1))
     n = len(first)
     assert len(truth.reference) == len(truth.holding) == len(truth.track) == len(world) == flown.n_frames
     np.testing.assert_array_equal(truth.reference[:n], first.reference.position)
@@ -560,15 +659,15 @@ def test_diverged_physics_ends_the_compiled_loop_with_an_error():
     flown = mission()
     with open_world(flown, Stopwatch()) as world:
         navigator, pilot = navigator_with(flown, world.vision, Stopwatch()), make_pilot(flown)
-        course, fast_forward = flown.fly(1), world.fast_forward(navigator, pilot)
-        navigator.update(world.observe(course[0]), 1)
+        sequence, fast_forward = flown.planned_frames(1), world.fast_forward(navigator, pilot)
+        navigator.update(world.observe(sequence[0]), 1)
         world.vehicle.state.velocity[0] = np.nan
         with pytest.raises(SurveyAborted, match="the physics diverged at"):
-            fast_forward(course, 1)
+            fast_forward(sequence, 1)
         assert len(world) == len(navigator.log) == 2  # the frame at which it was detected is kept
 
 
-def test_a_survey_without_pictures_loads_no_graphics_library(tmp_path):
+def test_a_survey_without_optional_outputs_loads_no_graphics_library(tmp_path):
     """MuJoCo, OpenGL and the drawing libraries would take 100 MB in each worker of a study."""
     line = f"""
 import sys

@@ -10,7 +10,7 @@ from twin import survey
 from twin.core import records
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
-from twin.report.run_writer import PICTURES
+from twin.report.run_writer import OPTIONAL_OUTPUTS
 from twin.scenario import file as scenario_file
 from twin.session.assembly import image_vision, navigator_with
 from twin.world import rendered_world
@@ -33,7 +33,7 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
     scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.report.survey_page.surface_picture", lambda _: None)
-        return survey.run(scenario, out, progress, outputs=PICTURES if report else ())
+        return survey.run(scenario, out, progress, outputs=OPTIONAL_OUTPUTS if report else ())
 
 
 def image_navigator(mission, folder):
@@ -77,10 +77,10 @@ def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
 
 
 def first_frame(*overrides):
-    """What a survey's first keyframe sees and reads."""
+    """Returns the first keyframe of a survey: images and readings."""
     mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, *overrides]))
     with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
-        return world.observe(next(step for step in mission.fly(1) if step.keyframe))
+        return world.observe(next(step for step in mission.planned_frames(1) if step.keyframe))
 
 
 def test_another_seed_gives_another_floor_and_another_noise():
@@ -209,7 +209,7 @@ def test_lost_vision_aborts_the_survey_with_a_reason(tmp_path):
     result = fly(tmp_path / "run", "water.jerlov=9C", "water.turbidity=20")
     assert result.status == "aborted"
     assert result.metrics["reason"].startswith("vision lost at ")
-    assert "in water 9C, turbidity 20: " in result.metrics["reason"]
+    assert "in water Jerlov 9C (Solonenko & Mobley 2015), turbidity 20: " in result.metrics["reason"]
 
 
 @pytest.mark.parametrize(

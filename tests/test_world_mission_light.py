@@ -20,8 +20,25 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
         (["water.scattering_per_m=[0.1, 0, 0]"], r"water\.absorption_per_m: missing, as there is a water\.scatt"),
         (["water.turbidity=-1.0"], r"water\.turbidity: -1\.0: not allowed"),
         (["water.mean_cosine=1.0"], r"water\.mean_cosine: 1\.0: not allowed"),
-        (["water.kept_share=1.1"], r"water\.kept_share: 1\.1: not allowed"),
+        (["water.phase_function=mie"], r"water\.phase_function: 'mie': not allowed"),
+        (["imaging.forward_scatter=true"], r"imaging\.forward_scatter: renamed to imaging\.scattering"),
         (["water.spectrum_file=none.csv"], r"water\.spectrum_file: .*none\.csv cannot be read"),
+        (["snow.junge_exponent=0.5"], r"snow\.junge_exponent: 0\.5: not allowed .*greater than 1"),
+        (["snow.diameter_max_m=0.02"], r"snow\.diameter_max_m: is unused: .* \(allowed: with snow\.junge_exponent\)"),
+        (
+            ["snow.junge_exponent=4.0", "snow.diameter_min_m=0.005", "snow.diameter_max_m=0.002"],
+            r"snow\.diameter_min_m: 0\.005: not smaller .* \(allowed: below snow\.diameter_max_m = 0\.002\)",
+        ),
+        (["lens.diffraction=true"], r"lens\.diffraction: needs the f-number .* \(allowed: with \[sensor\]\)"),
+        (["lens.focus_m=1.5"], r"lens\.focus_m: needs the f-number .* \(allowed: with \[sensor\]\)"),
+        (["sensor.bits=12", "lens.focus_m=0.01"], r"lens\.focus_m: 0\.01: too near \(allowed: 0, or 0\.05 or more\)"),
+        (["lens.blur_px=[3, 0, 0]"], r"lens\.blur_px\.0: 3: not allowed .*less than or equal to 2"),
+        (["lens.lateral_colour=[0.1, 0]"], r"lens\.lateral_colour\.0: 0\.1: not allowed"),
+        (['sensor.tone_curve="gamma"'], r"sensor\.tone_curve: 'gamma': not allowed .*linear"),
+        (['sensor.white_balance="auto"'], r"sensor\.white_balance: 'auto': not allowed .*grey_world"),
+        (["sensor.white_gains=[2, 1, 1]"], r"sensor\.white_gains: is unused: .*allowed: with .*white_balance = .gains"),
+        (["sensor.white_temperature_k=5000.0"], r"sensor\.white_temperature_k: is unused: .*temperature"),
+        (["rig.image_width_px=5000"], r"rig\.image_width_px: 5000: not allowed .*less than or equal to 4096"),
         (["snow.albedo=1.2"], r"snow\.albedo: 1\.2: not allowed .*less than or equal to 1"),
         (["lamps.0.intensity_cd=-5.0"], r"lamps\.0\.intensity_cd: -5\.0: not allowed"),
         (["lamps.1.beam=[[10, 1], [20, 0]]"], r"lamps\.1\.beam: angles do not increase from 0"),
@@ -37,15 +54,15 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
     ],
 )
 def test_invalid_light_is_reported(overrides, fault):
-    with pytest.raises(ScenarioError, match=fault) as told:
+    with pytest.raises(ScenarioError, match=fault) as raised:
         prepare(load_scenario("quickstart", [*SMALL, *overrides]))
-    assert len(told.value.lines) == 1
+    assert len(raised.value.lines) == 1
 
 
 def test_a_lamp_below_the_floor_is_accepted_at_the_allowed_height():
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as raised:
         prepare(load_scenario("quickstart", [*SMALL, "lamps.0.position_m=[0.25, 0.35, -2.0]"]))
-    height_m = float(told.value.lines[0].rpartition("allowed: ")[2].split()[0])
+    height_m = float(raised.value.lines[0].rpartition("allowed: ")[2].split()[0])
     prepare(load_scenario("quickstart", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
 
 
@@ -53,7 +70,7 @@ def test_water_lamps_and_sun_survive_a_round_trip_with_a_relative_spectrum_file(
     (tmp_path / "lake.csv").write_text("400, 0.1, 0.2\n700, 0.3, 0.2\n")
     file = tmp_path / "lake.toml"
     file.write_text(
-        'extends = "quickstart.toml"\n[water]\nspectrum_file = "lake.csv"\nkept_share = 0.5\n'
+        'extends = "quickstart.toml"\n[water]\nspectrum_file = "lake.csv"\nphase_function = "petzold"\n'
         "[sun]\nilluminance_lx = 500.0\ndepth_m = 9.0\ncaustics = 0.7\n"
         "[[lamps]]\nposition_m = [0.2, 0.3, 0.0]\nbeam = [[0, 1], [30.5, 0.25]]\ncolour_temperature_k = 4000.0\n"
     )

@@ -65,7 +65,7 @@ def test_loops_are_flown_and_mapped_by_vision(looped):
 
 def test_a_loop_is_linked_with_its_own_start_and_with_the_loop_before(looped):
     mission = prepare(load_scenario("quickstart", LOOPS))
-    n_first = sum(step.keyframe for step in mission.fly(1))
+    n_first = sum(step.keyframe for step in mission.planned_frames(1))
     i, j = edges(looped.folder).T
     assert ((j < n_first) & (j > n_first - 4) & (i < 4)).any()  # closure
     assert ((i < n_first) & (j >= n_first)).sum() > n_first  # neighbours all around

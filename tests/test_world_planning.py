@@ -65,7 +65,7 @@ def test_over_a_raised_plane_the_spacing_is_that_of_the_remaining_altitude():
 
 
 @pytest.mark.parametrize("kind", ["reef", "fractal", "step"])
-def test_all_but_5_percent_of_the_keyframes_keep_the_asked_overlap_over_the_floor(kind, monkeypatch):
+def test_all_but_5_percent_of_the_keyframes_keep_the_required_overlap_over_the_floor(kind, monkeypatch):
     if kind == "step":
         terrain = floor(lambda x, y: np.where(x > 0.3, 0.7, 0.0))
     else:
@@ -108,10 +108,10 @@ def test_coverage_counts_the_asked_area_only(monkeypatch):
 
 def test_a_survey_flown_as_planned_has_the_planned_overlap(monkeypatch):
     mission = over(terrains.generate("reef", (9.0, 7.0), 0.8, 0.0, 0.05, 0.2, 5), monkeypatch)
-    courses = [mission.fly(track) for track in mission.tracks]
-    reference = np.concatenate([c.reference.position for c in courses])
-    keyframe = np.flatnonzero(np.concatenate([c.keyframe for c in courses]))
-    track = np.repeat(list(mission.tracks), [len(c) for c in courses])
+    sequences = [mission.planned_frames(track) for track in mission.tracks]
+    reference = np.concatenate([c.reference.position for c in sequences])
+    keyframe = np.flatnonzero(np.concatenate([c.keyframe for c in sequences]))
+    track = np.repeat(list(mission.tracks), [len(c) for c in sequences])
     poses = np.tile(mission.start, (len(reference), 1, 1))
     poses[:, :3, 3] = reference
     path = Trajectory(np.arange(len(reference)) / 30, poses)
@@ -133,7 +133,7 @@ def test_a_path_over_the_floor_keeps_its_altitude_and_the_slope_limit(monkeypatc
     assert np.ptp(z) > 0.3
     spreads = [spread(forecast_over_floor(m).altitude_m) for m in (level, following)]
     assert spreads[1].maximum - spreads[1].minimum < 0.7 * (spreads[0].maximum - spreads[0].minimum)
-    reference = following.fly(1).reference
+    reference = following.planned_frames(1).reference
     speed = np.linalg.norm(reference.velocity[:, :2], axis=1)
     assert (np.abs(reference.velocity[:, 2]) <= climb_slope(following.scenario) * speed + 1e-6).all()
     corner, opposite = following.grid, level.grid
@@ -176,9 +176,9 @@ def test_a_kinematic_vehicle_cannot_follow_the_floor():
         prepare(scenario("plan.height=floor", "vehicle.dynamics=kinematic"))
 
 
-def test_a_floor_that_comes_too_near_for_the_asked_overlap_is_rejected():
+def test_a_floor_that_comes_too_near_for_the_required_overlap_is_rejected():
     ridge = floor(lambda x, y: np.where(np.abs(x) < 1.2, 1.93, 0.0))
-    with pytest.raises(TwinError, match="keeps the asked overlap|too fast: less than one frame"):
+    with pytest.raises(TwinError, match="keeps the required overlap|too fast: less than one frame"):
         plan_survey(scenario("plan.overlap_along=0.5"), ridge)
 
 

@@ -50,12 +50,21 @@ QuickOption = Annotated[bool, typer.Option("--quick", help="Compute a few cells 
 WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Random walks per cell of the Monte Carlo.")]
 PhaseOption = Annotated[
     str,
-    typer.Option("--phase", help="Phase function of the reference: model (Henyey-Greenstein) or sea (with Petzold's)."),
+    typer.Option("--phase", help="Phase function of both: a value of water.phase_function."),
 ]
 TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None,
     typer.Option("--at", metavar="X,Y,Z", help="Position of the left camera [m]. Default: centre of the survey."),
+]
+TwistOption = Annotated[
+    str | None,
+    typer.Option(
+        "--twist",
+        metavar="VX,VY,VZ,WX,WY,WZ",
+        help="Velocity of the vehicle during the exposure: forward, left, up [m/s], and about these axes [deg/s]. "
+        "Default: at rest.",
+    ),
 ]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it runs.")]
 FitArgument = Annotated[
@@ -186,6 +195,7 @@ def look(
     scene: SceneArgument,
     overrides: SetOption = [],  # noqa: B006 (typer copies it)
     at: AtOption = None,
+    twist: TwistOption = None,
     out: SheetOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -196,10 +206,11 @@ def look(
     from twin.world.mission import prepare
 
     position_m = None if at is None else viewing.parse_position(at)
+    twist_body = None if twist is None else viewing.parse_twist(twist)
     scenario = load_scenario(scene, overrides)
     file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-look.png"))
     mission = prepare(scenario)
-    view = viewing.render_view(mission, position_m)
+    view = viewing.render_view(mission, position_m, twist_body)
     with outputs.writing(file):
         sheet = look_sheet.draw(mission.scenario, view, file)
     quality = viewing.image_quality(view)
@@ -231,23 +242,24 @@ def light(
     out: TurbidityOutOption = Path("runs/light"),
     quick: QuickOption = False,
     walks: WalksOption = 40_000,
-    phase: PhaseOption = "model",
+    phase: PhaseOption = "sea",
     as_json: SummaryOption = False,
 ) -> None:
-    """Compare the light of the images with a Monte Carlo of any order of scattering, in green light."""
+    """Compare the light of lamps and sun in the images with a Monte Carlo simulation of any order of scattering."""
+    from twin.reproduce import daylight
     from twin.reproduce import light as comparison
 
-    if phase not in ("model", "sea"):
-        raise TwinError("--phase", repr(phase), "model or sea")
     outputs.output_file(out / "light.png")
     selection = comparison.QUICK if quick else comparison.ALL
     found = list(comparison.cells(selection, walks, phase))
+    under_sun = list(daylight.daylight_cells(daylight.QUICK_DAYLIGHT if quick else daylight.ALL_DAYLIGHT, walks))
     with outputs.writing(out):
-        summary = comparison.write(found, out)
+        summary = comparison.write(found, out) | {"daylight": daylight.write_daylight(under_sun, out)}
     if as_json:
         print(json.dumps(summary, indent=1))
     else:
         console.print_table("Light model and reference, green band", comparison.table(found))
+        console.print_table("Daylight, light model and reference, green band", daylight.daylight_table(under_sun))
         print(f"Sheet: {out / 'light.png'}")
 
 
@@ -256,13 +268,14 @@ def fit_surrogate(
     files: FitArgument = None,
     out: ModelOption = Path("error_model.toml"),
     runs: RunsOption = Path("runs/fit-surrogate"),
+    jobs: JobsOption = None,
 ) -> None:
     """Fit the error model of the surrogate to rendered surveys; finished surveys are reused."""
     from twin.app import fit_command
 
     outputs.output_file(out)
     outputs.output_file(runs / "study", "--runs")
-    raise typer.Exit(fit_command.run(files or [], out, runs))
+    raise typer.Exit(fit_command.run(files or [], out, runs, jobs))
 
 
 @app.command("calibrate", hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

@@ -10,13 +10,13 @@ from twin.core.records import Estimate, Frame
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
-from twin.report.run_writer import PICTURES, RunFolder
+from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
 from twin.session.conclusion import Flight, RunResult, conclude
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
-from twin.world.mission import Course, Mission, prepare
+from twin.world.mission import FrameSequence, Mission, prepare
 from twin.world.pace import FULL
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
@@ -27,9 +27,9 @@ def run(
     out: Path,
     progress: Callable[[SurveyProgress], None] = lambda _: None,
     live: bool = False,
-    outputs: Collection[str] | None = PICTURES,
+    outputs: Collection[str] | None = OPTIONAL_OUTPUTS,
 ) -> RunResult:
-    """Flies a scenario and writes a run folder; if the survey is aborted, the folder contains its partial results.
+    """Runs the survey of a scenario and writes a run folder, with the partial results if the survey is aborted.
 
     An interrupt (Ctrl-C) during the flight ends the flight. A later interrupt ends only the current stage: alignment,
     elevation map, evaluation, map files, report or recording. The results of all other stages are written, and
@@ -38,10 +38,13 @@ def run(
     Args:
         scenario: description of the survey.
         out: run folder.
-        progress: function called with the progress after every frame.
+        progress: function called with the progress after every frame and during the later stages.
         live: whether to show the survey in Rerun while it runs.
         outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
             them. None: write the metrics only.
+
+    Returns:
+        Status, metrics and run folder of the survey.
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
@@ -72,7 +75,7 @@ def fly(
 ) -> None:
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
-    If tracking is poor or lost, the vehicle slows down or stops on its path until it is sound again (`MissionActions`).
+    If tracking is poor or lost, the vehicle slows down or stops on its path until tracking recovers (`MissionActions`).
     After each track, the vehicle keeps station while the navigator runs a global alignment.
 
     Args:
@@ -80,33 +83,33 @@ def fly(
         world: simulates the vehicle, which executes the commands, and returns the frames.
         navigator: estimates the pose from the frames.
         observe: called with the estimate and its frame after every update of the navigator.
-        actions: chooses the pace along the path; None: the vehicle flies at the planned speed in any case.
+        actions: chooses the pace along the path; None: the vehicle always flies at the planned speed.
     """
     pilot = make_pilot(mission)
     fast_forward = world.fast_forward(navigator, pilot)
 
-    def follow(course: Course, track: int) -> None:
+    def follow(sequence: FrameSequence, track: int) -> None:
         k = 0
-        world.start_course(course, track)
-        while k < len(course):
-            frame = world.observe(course[k])
+        world.start_sequence(sequence, track)
+        while k < len(sequence):
+            frame = world.observe(sequence[k])
             estimate = navigator.update(frame, track)
             observe(estimate, frame)
-            reference = course[k].reference
+            reference = sequence[k].reference
             world.act(pilot(without_feedback(estimate, reference, frame.readings), reference))
             pace = FULL if actions is None else actions(estimate)
             k += 1
-            if course.holding or (pace == FULL and course.rate == 1):
-                first, k = k, fast_forward(course, k)
+            if sequence.holding or (pace == FULL and sequence.rate == 1):
+                first, k = k, fast_forward(sequence, k)
                 if actions is not None:
-                    actions.add_sound_frames(k - first)
+                    actions.add_measured_frames(k - first)
             else:
-                world.end_course(k)
-                course, k = mission.fly_on(track, course.path_times_s[k - 1], pace), 0
-                world.start_course(course, track)
+                world.end_sequence(k)
+                sequence, k = mission.next_frames(track, sequence.path_times_s[k - 1], pace), 0
+                world.start_sequence(sequence, track)
 
     for track in mission.tracks:
-        follow(mission.fly(track), track)
-        follow(mission.hold(track), track)
+        follow(mission.planned_frames(track), track)
+        follow(mission.station_keeping_frames(track), track)
         navigator.align_track(track)  # during station keeping
-        follow(mission.hold(track), track)
+        follow(mission.station_keeping_frames(track), track)

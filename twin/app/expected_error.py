@@ -1,4 +1,4 @@
-"""Expected height error of the map, from the surrogate's error model at the floor points that the keyframes see."""
+"""Expected height error of the map, from the surrogate's error model at the floor points visible in the keyframes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from twin.core.floor_rays import ray_grid
 from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.surrogate import error_model_file
-from twin.surrogate.map_model import EDGE_PX, WINDOW_PX, roughness
+from twin.surrogate.map_model import WINDOW_PX, roughness, roughness_error_px
 from twin.surrogate.matchability import Matchability
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import FloorForecast
@@ -28,7 +28,7 @@ class ExpectedError(NamedTuple):
     Args:
         sigma_m: (n,) standard deviation of the height at floor points spread evenly over the images [m].
         completeness: share of the floor in view for which the depth filter provides a height.
-        bound_px: largest Cramer-Rao bound of image matching over the depths of the plan [px].
+        bound_px: largest Cramér-Rao bound of image matching over the depths of the plan [px].
         fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
     """
 
@@ -68,11 +68,11 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
 
     The error has three parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
     length f [px] and baseline b [m]; it decreases with the number of keyframes that observe a point, which is
-    1 / (1 - overlap along the leg). A lateral error of the mapped surface is a height error in proportion to the slope
-    of the floor. Edges and other roughness within the matching window cause an error in proportion to the roughness.
-    The standard deviations of all errors come from the error model fitted to rendered surveys. The
-    disparity error depends on the water, light, texture and sensor of the scenario, through the Cramer-Rao bound of
-    image matching (`Matchability`).
+    1 / (1 - overlap along the leg), and with their distance. A lateral error of the mapped surface causes a height
+    error proportional to the slope of the floor. Edges and other roughness within the matching window cause an error
+    that increases with the roughness. The standard deviations of all errors come from the error model fitted to
+    rendered surveys. The disparity error depends on the water, light, texture and sensor of the scenario, through the
+    Cramer-Rao bound of image matching (`Matchability`).
     """
     rig, scenario = mission.rig, mission.scenario
     fitted = error_model_file.load(scenario.imaging.error_model)
@@ -80,14 +80,17 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     depth, slope, rough_m = _floor_points(mission, forecast)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
-    sigma_px = np.interp(depth, matching.depths_m, [model.depth_sigma_px(b) * model.depth_error_ratio for b in table])
+    sigma_px = np.interp(depth, matching.depths_m, model.depth_error.sigma_px(table, matching.lamp_share))
     in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
-    share = float(model.depth_error_views(np.array(1 / (1 - scenario.plan.overlap_along))))
+    poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
+    step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
+    share = float(model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
     rough_px = rough_m * rig.focal_px * rig.baseline_m / depth**2
-    edge = model.edge_error_gain * rough_m * rough_px**2 / (rough_px**2 + EDGE_PX**2)
-    sigma_m = np.sqrt(vertical**2 + lateral**2 + edge**2)
+    rough_px = roughness_error_px(rough_px, model.relief_error_gain, model.relief_error_limit_px, model.edge_error_gain)
+    rough = rough_px * depth**2 / (rig.focal_px * rig.baseline_m)
+    sigma_m = np.sqrt(vertical**2 + lateral**2 + rough**2)
     return ExpectedError(
         sigma_m, float(in_view.mean()) if len(depth) else 0.0,
         float(bound.max(initial=0.0)), model.bound_range_px[1],

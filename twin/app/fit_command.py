@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.progress import track
 
 from twin.app import console
+from twin.study.local_engine import default_jobs
 from twin.study.study_file import load_study
 from twin.study.surveys import surveys
+from twin.study.worker import SINGLE_THREADED
 from twin.surrogate import error_model_file
-from twin.surrogate_fit.rendered_surveys import fit_to_surveys, survey_statistics
+from twin.surrogate_fit.rendered_surveys import all_statistics, fit_to_surveys
 
 DEFAULT_STUDIES = ("fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper")
 
 
-def run(files: Sequence[str], out: Path, runs: Path) -> int:
+def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> int:
     """Runs the rendered surveys of the studies, fits the error model to their statistics and writes the model.
 
     Args:
         files: study files; if empty, `DEFAULT_STUDIES`.
         out: TOML file to which the error model is written.
         runs: folder of the rendered surveys; finished surveys are reused.
+        jobs: number of processes that fly surveys; None for one per core.
 
     Returns:
         The exit status.
@@ -36,9 +40,9 @@ def run(files: Sequence[str], out: Path, runs: Path) -> int:
         for file in files or DEFAULT_STUDIES
         for s in surveys(load_study(file), runs / Path(file).stem)
     ]
-    statistics = [
-        survey_statistics(scenario, folder, compared) for scenario, folder in track(rendered, "Rendered surveys")
-    ]
+    os.environ.update(SINGLE_THREADED)  # of the new processes
+    found = all_statistics(rendered, compared, jobs or default_jobs())
+    statistics = list(track(found, "Rendered surveys", total=len(rendered)))
     fitted = fit_to_surveys(statistics, compared)
     error_model_file.save(fitted, out)
     rows: list[tuple[str, ...]] = [(name, f"{value:.1%}") for name, value in fitted.misfit.items()]

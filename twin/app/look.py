@@ -11,7 +11,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
-from twin.imaging.camera import DecomposedImage, StereoCapture
+from twin.imaging.camera import AT_REST, DecomposedImage, StereoCapture
 from twin.imaging.renderer import NEAR_M
 from twin.report.wording import DASH, percent
 from twin.world.mission import Mission
@@ -46,29 +46,38 @@ class ViewLayers(NamedTuple):
     decomposed: DecomposedImage
 
 
-def render_view(mission: Mission, at_m: tuple[float, float, float] | None = None) -> ViewLayers:
+def render_view(
+    mission: Mission, at_m: tuple[float, float, float] | None = None, twist_body: Array | None = None
+) -> ViewLayers:
     """Renders a stereo pair and the light components of its left image.
 
     The cameras look straight down and the bow points along the first leg.
 
     Args:
-        at_m: position of the left camera in the world [m]; None: above the centre of the survey, at the planned
-            altitude.
+        at_m: position of the left camera in the world [m]; None: above the centre of the survey area, at the
+            planned altitude.
+        twist_body: (6,) [angular, linear] velocity of the body in its own axes during the exposure [rad/s, m/s];
+            None: at rest.
 
     Raises:
-        TwinError: a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor.
+        TwinError: a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor, or a velocity
+            is given without a section [sensor], which has the exposure time.
     """
+    if twist_body is not None and mission.scenario.sensor is None:
+        raise TwinError("--twist", "the scenario has no exposure time", "with a section [sensor]: --set sensor.bits=12")
+    twist = AT_REST if twist_body is None else twist_body
     area = mission.plan.area
     position_m = (*area.centre_m, mission.scenario.plan.altitude_m) if at_m is None else at_m
     world_from_left = geometry.pose(geometry.rotations_of_down_camera(np.asarray(area.heading)), np.array(position_m))
     _check_rig(mission, world_from_left)
     with RenderedWorld(mission, Stopwatch()) as world:
-        decomposed = world.camera.decompose(world_from_left)
-        return ViewLayers(world_from_left, world.camera.capture(world_from_left, stereo=True), decomposed)
+        decomposed = world.camera.decompose(world_from_left, twist)
+        stereo_pair = world.camera.capture(world_from_left, stereo=True, twist_body=twist)
+        return ViewLayers(world_from_left, stereo_pair, decomposed)
 
 
 def parse_position(text: str) -> tuple[float, float, float]:
-    """Returns the position (x, y, z) [m] of a text X,Y,Z. Raises TwinError unless it is three finite numbers."""
+    """Returns the position (x, y, z) [m] of a string X,Y,Z. Raises TwinError unless it is three finite numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -76,6 +85,23 @@ def parse_position(text: str) -> tuple[float, float, float]:
     if not np.isfinite([x, y, z]).all():
         raise TwinError("--at", f"{text!r} is not a position", "finite numbers")
     return x, y, z
+
+
+def parse_twist(text: str) -> Array:
+    """Returns the twist (6,) [angular, linear] in [rad/s, m/s] of a text VX,VY,VZ,WX,WY,WZ in [m/s] and [deg/s].
+
+    Raises:
+        TwinError: the text is not six finite numbers.
+    """
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != 6 or not np.isfinite(values).all():
+        raise TwinError(
+            "--twist", f"{text!r} is not a velocity", "VX,VY,VZ,WX,WY,WZ [m/s, deg/s], as in 0.5,0,0,0,0,20"
+        )
+    return np.concatenate([np.deg2rad(values[3:]), values[:3]])
 
 
 def _check_rig(mission: Mission, world_from_left: Array) -> None:
@@ -119,7 +145,7 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
         without noise / standard deviation of the noise; a low value limits matching.
     """
     a = view.decomposed
-    signal = a.components.total.astype(np.float64) * a.gain
+    signal = a.components.total.astype(np.float64) * a.gain if a.linear else a.noise_free / 255
     side = max(3, round(signal.shape[1] * WINDOW_SHARE) | 1)
     mean = cv2.blur(signal, (side, side))
     local_sigma = np.sqrt(np.maximum(cv2.blur(signal**2, (side, side)) - mean**2, 0))

@@ -1,4 +1,4 @@
-"""Output paths given by the user: checks before work begins, and write errors as TwinError."""
+"""Output paths given by the user: checks before work begins, and conversion of write errors to TwinError."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def output_file(file: Path, option: str = "--out") -> Path:
 
 @contextmanager
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
-    """Turns an OSError in this context into a TwinError, which states that the user's `path` cannot be written."""
+    """Converts an OSError in this context to a TwinError, which states that the user's `path` cannot be written."""
     try:
         yield
     except OSError as error:

@@ -12,7 +12,7 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon, Rectangle
 
-from twin.app.plan_summary import OVERLAP_TOLERANCE, PlanSummary, asked_overlaps
+from twin.app.plan_summary import OVERLAP_TOLERANCE, PlanSummary, required_overlaps
 from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
 from twin.world.mission import Mission
 
@@ -23,7 +23,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
     """Writes a PNG of the plan from above; returns its path.
 
     The left panel shows sea floor, planned path, footprint of the first image and survey area. The right panel shows
-    the overlap over the floor and marks where it is less than asked.
+    the overlap over the floor and marks where it is less than required.
     """
     mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):
@@ -43,16 +43,16 @@ def draw(summary: PlanSummary, file: Path) -> Path:
 
 
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
-    """Draws the overlap of each image pair midway between its two camera positions; a ring marks less than asked."""
-    floor, asked = summary.floor, asked_overlaps(summary.mission)
+    """Draws the overlap of each image pair midway between its two camera positions; rings mark insufficient ones."""
+    floor, required = summary.floor, required_overlaps(summary.mission)
     t = summary.mission.terrain
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
     axes.add_patch(_area(summary.mission, ec=COLOURS["limit"], ls="--", fill=False, linewidth=1.4))
     pairs = (
-        ("along", "o", 14, floor.along_position_m, floor.overlap_along, asked.along),
-        ("across", "D", 9, floor.across_position_m, floor.overlap_across, asked.across),
+        ("along", "o", 14, floor.along_position_m, floor.overlap_along, required.along),
+        ("across", "D", 9, floor.across_position_m, floor.overlap_across, required.across),
     )
-    short_label = "less than asked"
+    short_label = "less than required"
     for name, marker, size, position, values, least in pairs:
         shown = axes.scatter(
             *position.T, s=size, c=values, marker=marker, cmap="viridis", vmin=0, vmax=1, label=f"overlap {name}"

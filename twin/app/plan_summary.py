@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from controllers.forecast import Forecast, forecast
 from twin.app.expected_error import ExpectedError, expected_error
 from twin.app.plan_cost import ComputingCost, computing_cost
+from twin.imaging.water_tables import provenance_of
 from twin.judge.require import judge_requirements
 from twin.judge.summary_statistics import finite_tree
 from twin.report.wording import length, percent, plain
@@ -19,8 +20,8 @@ from twin.world.planning import SHORT_PERCENT
 #: Standard deviation of the disparity on good texture [px]; the depth error on the reference plane is proportional to
 #: it.
 DISPARITY_SIGMA_PX = 0.1
-#: An overlap counts as less than asked if it is lower by more than this. Rounding N, the number of frames per keyframe,
-#: to an integer can lower the overlap slightly.
+#: An overlap is insufficient if it is lower than required by more than this. Rounding N, the number of frames per
+#: keyframe, to an integer can lower the overlap slightly.
 OVERLAP_TOLERANCE = 0.01
 #: For each survey pattern: the name of a swath, and the swaths of one track.
 _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
@@ -36,7 +37,7 @@ _PROPERTIES: dict[str, tuple[str, Callable[[float | None], str]]] = {
     "stereo_share": ("floor seen by both cameras", percent),
     "height_sigma_m": ("expected sigma of height", length),
 }
-#: The error model counts as extrapolated beyond this multiple of the largest Cramer-Rao bound to which it was fitted.
+#: The error model counts as extrapolated beyond this multiple of the largest Cramér-Rao bound to which it was fitted.
 _EXTRAPOLATED = 1.5
 
 
@@ -118,33 +119,33 @@ def _missed(require: dict[str, dict[str, Any]]) -> list[str]:
     ]
 
 
-class AskedOverlap(NamedTuple):
-    """Overlaps asked for, as fractions of the image side along and of the image side across the swath."""
+class RequiredOverlap(NamedTuple):
+    """Required overlaps, as fractions of the image sides along and across the swath."""
 
     along: float
     across: float
 
 
-def asked_overlaps(mission: Mission) -> AskedOverlap:
+def required_overlaps(mission: Mission) -> RequiredOverlap:
     """Returns the required overlaps as fractions of the image sides along and across the swath.
 
     The overlap along is converted: the scenario gives it as a fraction of the image width (see `frames_per_keyframe`).
     """
-    plan, asked = mission.plan, mission.scenario.plan
-    along = 1 - (1 - asked.overlap_along) * plan.footprint_m[0] / plan.side_along_m
-    return AskedOverlap(max(0.0, along), asked.overlap_across)
+    plan, required = mission.plan, mission.scenario.plan
+    along = 1 - (1 - required.overlap_along) * plan.footprint_m[0] / plan.side_along_m
+    return RequiredOverlap(max(0.0, along), required.overlap_across)
 
 
 def _short_overlap(mission: Mission, floor: FloorForecast) -> list[str]:
-    """Returns a sentence for each direction in which the 5th percentile of the overlap is less than asked."""
-    asked = asked_overlaps(mission)
+    """Returns a sentence for each direction in which the 5th percentile of the overlap is less than required."""
+    required = required_overlaps(mission)
     found = (
-        ("along the swaths", spread(floor.overlap_along).p05, asked.along),
-        ("between swaths", spread(floor.overlap_across).p05, asked.across),
+        ("along the swaths", spread(floor.overlap_along).p05, required.along),
+        ("between swaths", spread(floor.overlap_across).p05, required.across),
     )
     return [
         f"{SHORT_PERCENT:g} % of the keyframes have an overlap {where} below {percent(p05)} over the floor; "
-        f"{percent(limit)} is asked"
+        f"{percent(limit)} is required"
         for where, p05, limit in found
         if p05 is not None and p05 < limit - OVERLAP_TOLERANCE
     ]
@@ -189,6 +190,7 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("on the reference plane: footprint", f"{length(width_m)} across, {length(height_m)} along"),
         ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
+        ("water", provenance_of(mission.scenario.water)),
         ("coverage of the area by both cameras", percent(summary.floor.coverage)),
         ("expected LE90 of the map", _expected_le90(summary)),
         ("simulation", cost_text(summary.cost)),
@@ -242,6 +244,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
         {
             "schema": "twin.plan/1",
             "name": mission.scenario.name,
+            "water": provenance_of(mission.scenario.water),
             "plan": plane | {"duration_s": plane["duration_s"] + hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,

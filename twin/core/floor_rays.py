@@ -22,7 +22,7 @@ class HeightField(NamedTuple):
         height_m: (ny, nx) heights of the nodes, row 0 = SOUTH, column 0 = west.
         spacing_m: distance between neighbouring nodes.
         west_m, south_m: position of node (0, 0).
-        lowest_m, highest_m: lowest and highest node.
+        lowest_m, highest_m: height of the lowest and of the highest node.
     """
 
     height_m: Array
@@ -34,7 +34,7 @@ class HeightField(NamedTuple):
 
 
 def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float, south_m: float) -> HeightField:
-    """Returns the height field with the node heights (ny, nx): at least 2 x 2 nodes, at least one of them finite."""
+    """Returns the height field with the node heights (ny, nx): at least 2 x 2 nodes, one of them or more finite."""
     height = np.ascontiguousarray(height_m, np.float64)
     return HeightField(
         height, float(spacing_m), float(west_m), float(south_m), float(np.nanmin(height)), float(np.nanmax(height))
@@ -92,8 +92,8 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 
     The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
     each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
-    is also inf if d does not point downwards, or if this traversal starts outside the grid or first enters a cell
-    without floor.
+    is also inf if d does not point downwards, if this traversal starts outside the grid, or if it enters a cell without
+    floor before the ray meets the floor.
     """
     if not dz < 0:
         return np.inf

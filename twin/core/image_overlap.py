@@ -9,8 +9,8 @@ from twin.core.floor_rays import HeightField, cast_camera_ray, cast_ray, ray_gri
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 
-#: Columns of the grid of rays. A cell that the edge of the second image cuts counts with the fraction that is inside;
-#: the error of an overlap is therefore far smaller than the share of one cell.
+#: Columns of the grid of rays. A cell that the edge of the second image cuts is weighted by its fraction inside; the
+#: error of an overlap is therefore far smaller than the share of one cell.
 RAY_COLUMNS = 24
 #: A floor point is occluded if the ray from the camera to it meets the floor earlier by more than this fraction of its
 #: range.
@@ -22,7 +22,7 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
 
     The first image is tiled by a grid of cells. The floor point at the centre of each cell is found by ray casting; the
     cell counts if this point projects into the second image and is not occluded there. A cell that the edge of the
-    second image cuts counts with the fraction that is inside. Cells whose ray meets no floor are left out. For two
+    second image cuts is weighted by its fraction inside. Cells whose ray meets no floor are left out. For two
     down-looking images of a level floor with the same heading and altitude, the result is exactly the overlap of
     their footprints.
 

@@ -35,7 +35,7 @@ def bicubic_with_gradient(image, x, y):
 
     The interpolation is bicubic (Catmull-Rom). (x, y) must lie inside the image; samples beyond the border repeat the
     border pixel. If y is an integer, as in rectified stereo, the derivative with respect to y is the central
-    difference.
+    difference at the column floor(x).
     """
     height, width = image.shape
     i, j = int(x), int(y)

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class StageGuard:
-    """Context manager that delivers interrupts only within a stage; an interrupt between two stages waits for the next.
+    """Context manager that delivers interrupts only within a stage; one that arrives between two stages waits.
 
     A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered;
     usually it raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the main
@@ -44,7 +44,7 @@ class StageGuard:
 
     @contextmanager
     def stage(self) -> Iterator[None]:
-        """Delivers interrupts within this context, including one that arrived before it and waits.
+        """Delivers interrupts within this context, including a pending one that arrived before it.
 
         Raises:
             KeyboardInterrupt: an interrupt came before or within the context.

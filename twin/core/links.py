@@ -1,4 +1,4 @@
-"""Measured motions between nodes of the keyframe network: one as a record, many as columns."""
+"""Measured motions between nodes of the keyframe network: a single link, and a sequence of links as arrays."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ class Link(NamedTuple):
             for the correlation, `cov` is the covariance of the single measurement times this number.
         closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
             exact; None: not computed.
-        floor_share: fraction (0 to 1) of the variance of the measurement that its image noise does not explain. It
-            belongs to the patches of floor and recurs in all links over them. Only in links that have not been stored.
+        floor_share: fraction (0 to 1) of the variance of the measurement that image noise does not explain. It is due
+            to the relief within the matched patches and is therefore correlated between the links that use the same
+            patches. `Links` does not store it.
     """
 
     i: int
@@ -55,7 +56,7 @@ _LINK = np.dtype(
 
 
 class Links(Sequence[Link]):
-    """Sequence of links stored as columns, for vectorised access; access to single links is slower."""
+    """Sequence of links stored as a structured array, for vectorised access; access to single links is slower."""
 
     def __init__(self, links: Iterable[Link] = ()):
         self._rows = GrowingArray(dtype=_LINK)
@@ -64,7 +65,7 @@ class Links(Sequence[Link]):
 
     @classmethod
     def from_sequence(cls, links: Sequence[Link]) -> Links:
-        """Returns the links stored as columns; the argument itself if it is a `Links` already."""
+        """Returns the links as a `Links` object; the argument itself if it is one already."""
         return links if isinstance(links, cls) else cls(links)
 
     def add(self, links: Iterable[Link]) -> None:

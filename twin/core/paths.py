@@ -16,7 +16,7 @@ def is_file(path: Path) -> bool:
 def resolved(path: Path) -> Path:
     """Returns the absolute path without symbolic links; a path that cannot be resolved is only made absolute.
 
-    The attempt to open such a path then fails with the reason.
+    Opening such a path later raises an error that states the reason.
     """
     try:
         return path.resolve()

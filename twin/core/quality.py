@@ -14,7 +14,8 @@ class EpipolarError(NamedTuple):
     """Errors of the rectification of the right image, estimated from row differences.
 
     Args:
-        estimate: (4,) pitch, yaw, roll [rad] and row offset [focal lengths].
+        estimate: (4,) pitch, yaw, roll of the right camera [rad], with the signs of `calibration_error.right_*`, and
+            row offset [focal lengths].
         sigma: (4,) standard deviations of `estimate`.
         removed: (4,) errors corrected in the right images, in the same units; yaw is never corrected.
     """
@@ -34,7 +35,7 @@ class EstimationQuality(NamedTuple):
         link_residual: median over the links of the residual of the matched points (robust standard deviation),
             divided by its expected value; None without a measured link.
         link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected.
-        epipolar: estimated errors of the rectification; None without images.
+        epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
         frame_sigma_m: standard deviation (3-D) that the position of a frame accumulates by frame-to-frame motion until
             the next node, 90th percentile over the nodes [m]; None without a second node.
     """
@@ -50,12 +51,12 @@ class EstimationQuality(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A reason why the result of a survey must not be trusted as it stands.
+    """A failed self-check of the estimators: a reason why the result of a survey must not be trusted.
 
     Args:
         check: short name of the check, a key of metrics.json.
         value: measured value.
-        limit: largest (or smallest) value at which the result can be trusted.
+        limit: largest (or smallest) value that passes the check.
         sentence: the finding in words.
     """
 
@@ -66,7 +67,7 @@ class Finding(NamedTuple):
 
 
 class ActionTimes(NamedTuple):
-    """Time that the vehicle flew slowly and that it was stopped [s]."""
+    """Durations of the actions "slow" and "hold" of a mission [s]."""
 
     slowed_s: float = 0.0
     held_s: float = 0.0

@@ -1,7 +1,7 @@
 """Estimators as a library: trajectory of a stereo camera and elevation map, computed from frames alone.
 
-`Navigator` processes frames one by one and builds the map at the end; see docs/estimators.md. Nothing here depends on
-the simulator, its scenarios or its missions.
+`Navigator` processes frames one by one and builds the map at the end; see docs/estimators.md. The package does not
+depend on the simulator, its scenarios or its missions.
 """
 
 from twin.core.records import (

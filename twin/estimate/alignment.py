@@ -36,7 +36,8 @@ class AlignmentResult(NamedTuple):
 
     Args:
         poses: (n, 4, 4) aligned world_from_camera of the nodes.
-        covs: (n, 6, 6) marginal covariances of the poses; zeros for nodes whose covariance was not requested.
+        covs: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for
+            nodes whose covariance was not requested.
         dropped: links that were removed as outliers.
         link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
     """
@@ -113,16 +114,17 @@ class _Window(NamedTuple):
     graph: FactorGraph
 
     def optimise(self, start: GraphState, max_iterations: int) -> Solution:
-        """Returns the local minimum of the cost that is reached from `start`."""
+        """Returns the solution at the local minimum of the cost that the iteration reaches from `start`."""
         return adjustment.optimise(self.graph, start, max_iterations)
 
     def outliers(self, chi2: Array) -> Mask:
         """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
 
         A link whose chi2 is far below the largest one is not removed in this round, because the link with the largest
-        chi2 may have distorted its residual. Links between consecutive keyframes are never removed.
+        chi2 may have distorted its residual. Links between consecutive nodes are never removed.
         """
-        chi2 = np.where(self.links.j - self.links.i == 1, 0.0, chi2)
+        motions = self.graph.binary[0]
+        chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
         return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
 
     def without(self, outliers: Mask) -> _Window:

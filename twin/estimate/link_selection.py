@@ -17,9 +17,13 @@ from twin.estimate.vision.two_view_motion import Motion
 
 _SAME_SWATH = 2  # number of immediately preceding nodes to link, as in Negahdaripour & Madjidi 2003
 _LARGEST_OVERLAP = 0.95  # larger overlaps occur where the vehicle keeps station, not along a path
-#: Covariance of the errors of a patch summed over all links, relative to errors that recur in full: 0.15 to 0.32 in
-#: eight surveys at five places of a reef (`horseshoe`), measured against the truth.
+#: Sum of the covariances between the errors of a patch in different links, as a fraction of the sum for errors that are
+#: equal in all links over the patch: 0.15 to 0.32 in eight surveys at five places of a reef (`horseshoe`), measured
+#: against the truth.
 _RECURRENCE = 0.25
+#: Standard error of `Motion.residual` times the root of the number of points: 1 / (2 f(m) m), with f the density of the
+#: chi distribution with three degrees of freedom and m its median.
+_RESIDUAL_STANDARD_ERROR = 0.562
 _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
@@ -27,8 +31,8 @@ class _View(NamedTuple):
     """Camera intrinsics and image size, for projection in compiled code.
 
     Args:
-        fx, fy: focal lengths along columns and rows [px].
-        cx, cy: principal point [px].
+        fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
+        cx, cy: column and row of the principal point [px].
         width, height: image size [px].
         margin: smallest distance of a visible point from the image border [px].
     """
@@ -103,14 +107,15 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     If the links were treated as independent, one stereo observation would count n times, and the variances of the
     positions would be underestimated. Therefore the covariance of each link is multiplied by n.
 
-    The fraction s of the variance that image noise does not explain (`Link.floor_share`) belongs to the floor: relief
+    The fraction s of the variance that image noise does not explain (`Link.floor_share`) is caused by the floor: relief
     within a patch shifts its match by M t, with t the translation between the images and M a property of the patch.
-    The shift is the same in all links of the path while the patch is in view. With the overlap q of consecutive nodes,
-    links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in common, so the variance of
-    the summed error is that of independent errors times 1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), l < m, if the
-    shifts recurred in full. They recur in part (`_RECURRENCE`), because not all corners are selected again and M
-    changes with the direction of view. The covariance is therefore also multiplied by 1 + c s (m - 1), with c the
-    recurrence. m refers to the nodes of the path, also for longer links, because their errors repeat with every node.
+    Suppose that the shift of a patch is the same in all links of the path while the patch is in view. With the overlap
+    q of consecutive nodes, links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in
+    common. The variance of the summed error is then that of independent errors times
+    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), with l < m. In fact the shifts are only partly the same, because not
+    all corners are selected again and M changes with the viewing direction. The covariance is therefore also multiplied
+    by 1 + c s (m - 1), with c = `_RECURRENCE`. Links that span several nodes have the same m, because one such link
+    starts at every node.
     """
     growth = _RECURRENCE * (_links_over_a_footprint(links) - 1)
     factors = [len(links) * (1 + growth * link.floor_share) for link in links]
@@ -126,13 +131,14 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    It is 1 - 1 / r^2 for residuals r times their expected size, and 0 unless r exceeds 1 by two standard errors,
-    2 * 1.17 / sqrt(n) for the median of n residuals.
+    With r the standard deviation of the residuals divided by the expected one, it is 1 - 1 / r^2, or 0 if r does not
+    exceed 1 by two standard errors. For n normally distributed residuals with three coordinates, r is the median of n
+    chi-distributed values divided by its expectation, and has a standard error of 0.56 / sqrt(n).
 
     Args:
         motion: motion from `two_view_motion.pair_motion`.
     """
-    limit = 1 + 2 * 1.17 / max(motion.n_points, 1) ** 0.5
+    limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0
 
 

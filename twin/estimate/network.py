@@ -74,19 +74,19 @@ class LinkQueue:
 
 @dataclass
 class AlignmentHistory:
-    """Record of the global alignments so far.
+    """Record of the link measurements and the global alignments so far.
 
     Attributes:
         alignments: duration and size of each alignment.
         dropped: links rejected as outliers by any alignment.
         before_ga: per track, positions (n, 3) of the keyframes just before the alignment of the track [m].
         after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
-        link_residuals: for each measured link, the residual of its points divided by the expected one; NaN where the
-            measurement failed.
+        link_residuals: for each attempted link measurement, the residual of the points divided by the expected one;
+            NaN where the measurement failed.
         nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
             failed), because the link could not be measured.
-        frame_sigmas_m: for each node after the first, the standard deviation (3-D) of the motion since the previous
-            node, accumulated over the frames [m].
+        frame_sigmas_m: for each node after the first, the standard deviation (3-D) of the translation since the
+            previous node, from frame-to-frame motion fused with the DVL [m].
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -167,6 +167,9 @@ class KeyframeNetwork:
             bridge: link from the last node that consists of the F2F motion, to replace a `chain` that could not be
                 measured; otherwise None.
             displacement: displacement since the last node, measured by the DVL; None if it was not measured.
+
+        Raises:
+            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
         """
         s = self.settings
         with self.stopwatch("network"):
@@ -192,6 +195,10 @@ class KeyframeNetwork:
         Returns:
             (6, 6) marginal covariance of the pose of the last node [rotation, translation] (rad, m), in its camera
             axes; None if the global alignment is switched off or there are fewer than two nodes.
+
+        Raises:
+            SurveyAborted: the alignment failed.
+            OSError: images could not be read or written.
         """
         if not self.settings.use_ga or len(self.nodes) < 2:
             return None
@@ -231,7 +238,13 @@ class KeyframeNetwork:
         self._alignable = False
 
     def truncate(self, n_frames: int) -> None:
-        """Keeps the keyframes, nodes and links of the first `n_frames` frames; a frame may have been aborted midway."""
+        """Removes the keyframes, nodes and links of all frames after the first `n_frames`.
+
+        These are left if the processing of a frame is interrupted.
+
+        Raises:
+            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
+        """
         self._collect_links()
         self.keyframes = [k for k in self.keyframes if k.row < n_frames]
         self.nodes = [k for k in self.nodes if k.row < n_frames]
@@ -307,7 +320,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets the poses of nodes, by number; keyframes between nodes keep their pose relative to the last node."""
+        """Sets the poses of nodes, by number; other keyframes keep their pose relative to the preceding node."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

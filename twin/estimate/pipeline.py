@@ -112,6 +112,9 @@ class Navigator:
         Args:
             frame: images and sensor readings of the frame.
             track: number of the track, from 1; `align_track` aligns a window of tracks.
+
+        Raises:
+            OSError: images could not be read or written.
         """
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
@@ -131,6 +134,10 @@ class Navigator:
         """Aligns the window of tracks that ends with `track`, and corrects the online pose.
 
         The online pose receives the same correction as the last keyframe.
+
+        Raises:
+            SurveyAborted: the alignment failed.
+            OSError: images could not be read or written.
         """
         node_cov = self.network.align_window(track)
         if node_cov is not None:
@@ -179,8 +186,8 @@ class Navigator:
     ) -> ElevationMap | None:
         """Builds the elevation map along the final trajectory.
 
-        Heights are along z of the world if the optical axis of the first keyframe is within 45 degrees of straight
-        down, otherwise along the optical axis, towards the camera (`ElevationMap.map_from_world`).
+        Heights are measured along z of the world if the optical axis of the first keyframe is within 45 degrees of
+        straight down, otherwise along this axis, towards the camera (`ElevationMap.map_from_world`).
 
         Args:
             result: result of the survey (`finish`).
@@ -228,7 +235,7 @@ class Navigator:
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the error models of the sensors read at every frame, for a given interval between frames [s]."""
+        """Returns the error models of the sensors for a given interval between frames [s], and the DVL state."""
         return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:

@@ -1,8 +1,8 @@
 """Checks of a survey without the truth: reasons why its result must not be trusted.
 
 Each check compares a quantity that the estimators measure with a limit. The limits lie between the values of ordinary
-surveys, whose errors agree with their covariances (generated and real floors, Jerlov types I to 3C), and the values of
-surveys whose path was lost; docs/findings.md lists both.
+surveys, whose errors agree with their covariances (generated and photographed floors, Jerlov types I to 3C), and the
+values of surveys with gross errors of the trajectory; docs/findings.md (section 9) lists both.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
 MAX_LINK_CHI2 = 2.5  # mean chi-square per degree of freedom
 MAX_LINK_RESIDUAL = 2.0  # median residual / expected residual
-MAX_ROW_SPREAD = 1.6  # scatter of the row differences / claimed standard deviation
+MAX_ROW_SPREAD = 1.6  # standard deviation of the row differences / expected standard deviation
 MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correction
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
@@ -28,7 +28,9 @@ _SIGNIFICANT = 4.0  # standard deviations
 
 
 def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
-    """Returns the findings of all checks, the most serious kind first; an empty list if every check passes.
+    """Returns the findings of all checks; an empty list if every check passes.
+
+    The findings are in the order of tracking, stereo, rectification and consistency.
 
     Args:
         result: output of the estimators.
@@ -58,7 +60,7 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:
-    """Checks the number of stereo matches, the ambiguity of the texture and the scatter of the row differences."""
+    """Checks the number of stereo matches, the repetition of the texture and the scatter of the row differences."""
     pairs = result.stereo_observations
     if not pairs:
         return
@@ -72,7 +74,7 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
         yield Finding("repetition", repeated, MAX_REPETITION, text)
     ratio = _median(pair.row_spread_ratio for pair in pairs)
     if ratio is not None and ratio > MAX_ROW_SPREAD:
-        text = f"row differences of stereo matches scatter {ratio:.1f} times as much as their claimed noise"
+        text = f"row differences of stereo matches scatter {ratio:.1f} times as much as expected"
         yield Finding("row_spread", ratio, MAX_ROW_SPREAD, text)
 
 

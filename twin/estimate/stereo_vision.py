@@ -56,8 +56,8 @@ class StereoVision:
         rig: believed calibration.
         settings: settings of the estimators.
         folder: folder for the images of keyframes and the tiles of the mosaic.
-        cell_m: cell size of the mosaic for images of full size [m]; binned images have cells larger by the binning. By
-            default the ground sample distance of the first keyframe.
+        cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
+            By default the ground sample distance of the first keyframe.
         stopwatch: returns the context manager that times the stage of a given name.
     """
 
@@ -121,7 +121,7 @@ class StereoVision:
         return time_s - last if time_s > last else None
 
     def _on_plane(self, world_from_camera: Array) -> Array:
-        """Returns the pose (4, 4) in the axes of the mosaic, which are set at the first keyframe."""
+        """Returns the pose (4, 4) in the axes of the mosaic, which are chosen at the first keyframe."""
         if self._plane_from_world is None:
             self._plane_from_world = viewing_plane(world_from_camera)
         return self._plane_from_world @ world_from_camera

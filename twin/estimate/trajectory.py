@@ -13,8 +13,8 @@ from twin.core.geometry import Array
 def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
     """Interpolates the poses of keyframes to all frames along the frame-to-frame motion.
 
-    From each keyframe, the poses follow the frame-to-frame motion to the next keyframe. The misclosure there,
-    the motion from the pose so reached to the pose of that keyframe, is distributed linearly over the frames between.
+    From each keyframe, the poses follow the frame-to-frame motion to the next keyframe. The misclosure there, i.e. the
+    motion from the pose thus computed to the pose of that keyframe, is distributed linearly over the frames in between.
 
     Args:
         f2f: (n, 4, 4) poses from frame-to-frame motion alone.

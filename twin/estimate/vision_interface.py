@@ -69,11 +69,11 @@ class Vision(Protocol):
         ...
 
     def epipolar_error(self) -> EpipolarError | None:
-        """Returns the estimated errors of the rectification; None if the measurements do not come from images."""
+        """Returns the estimated errors of the rectification; None if row differences are not measured."""
         ...
 
     def discard(self, numbers: range) -> None:
-        """Releases the data in memory of the keyframes with these numbers; they must not be linked afterwards."""
+        """Frees the memory of the keyframes with these numbers; they must not be linked afterwards."""
         ...
 
     def build_map(

@@ -34,7 +34,7 @@ class PoseGraph(NamedTuple):
         links: one link per edge; overlap is NaN and the number of matched points 0, as the formats contain neither.
         ignored: the ignored lines, per unknown tag.
         warnings: sentences, with file and line, on unknown tags, nodes without an edge, nodes without a vertex, and
-            parts of the graph that no edge connects.
+            separate connected components of the graph.
     """
 
     poses: dict[int, Array]
@@ -63,7 +63,8 @@ def write(path: Path, result: SurveyResult) -> None:
 def read(path: Path) -> PoseGraph:
     """Reads VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o) or VERTEX3 and EDGE3 lines (TORO: x y z roll pitch yaw).
 
-    The warnings of the result report ignored lines, nodes without an edge, and unconnected parts of the graph.
+    The warnings of the result report ignored lines, nodes without an edge, nodes without a vertex, and separate
+    connected components of the graph.
 
     Raises:
         TwinError: the file cannot be read or has no such line; a line has the wrong number of values, a value that is
@@ -74,7 +75,7 @@ def read(path: Path) -> PoseGraph:
     vertices = [(rows[tag], *_poses(path, rows[tag], convert)) for tag, convert in _VERTICES.items()]
     edges = [(rows[tag], *_poses(path, rows[tag], convert)) for tag, convert in _EDGES.items()]
     if not any(len(part.line) for part, *_ in vertices + edges):
-        others = "".join(f"; {told_ignored(path, lines)}" for lines in ignored)
+        others = "".join(f"; {ignored_warning(path, lines)}" for lines in ignored)
         raise TwinError(str(path), f"has no vertex and no edge{others}", ", ".join(_LAYOUTS))
     poses: dict[int, Array] = {}
     for part, pose, _ in vertices:
@@ -85,12 +86,12 @@ def read(path: Path) -> PoseGraph:
     node_lines = np.concatenate([part.line for part, *_ in vertices])
     pairs = np.concatenate([part.nodes for part, *_ in edges])
     pair_lines = np.concatenate([part.line for part, *_ in edges])
-    warnings = [told_ignored(path, lines) for lines in ignored]
+    warnings = [ignored_warning(path, lines) for lines in ignored]
     warnings += connection_warnings(path, (nodes, node_lines), (pairs, pair_lines))
     return PoseGraph(poses, links, ignored, tuple(warnings))
 
 
-def told_ignored(path: Path, lines: IgnoredLines) -> str:
+def ignored_warning(path: Path, lines: IgnoredLines) -> str:
     """Returns a sentence that reports the ignored lines of an unknown tag."""
     return f"{path}:{lines.first_line}: {lines.n_lines} lines with the unknown tag {lines.tag[:40]!r} are ignored"
 
@@ -176,7 +177,11 @@ _Convert = Callable[[Array], tuple[Array, Array, _Problem]]
 
 
 def _from_quaternions(values: Array) -> tuple[Array, Array, _Problem]:
-    """Returns rotations (n, 3, 3) and Jacobians (identities) of x y z qx qy qz qw, and quaternions of length != 1."""
+    """Converts values x y z qx qy qz qw (n, 7 or more).
+
+    Returns:
+        Rotations (n, 3, 3), Jacobians (n, 3, 3) (identities, see `_poses`), and the rows without a unit quaternion.
+    """
     length = np.linalg.norm(values[:, 3:7], axis=1)
     bad = np.abs(length - 1) > _QUATERNION_TOLERANCE
     text = f"the quaternion has the length {length[bad][0]:.3g}" if bad.any() else ""
@@ -186,7 +191,11 @@ def _from_quaternions(values: Array) -> tuple[Array, Array, _Problem]:
 
 
 def _from_euler_angles(values: Array) -> tuple[Array, Array, _Problem]:
-    """Returns rotations (n, 3, 3) and Jacobians (see `_poses`) of x y z roll pitch yaw, and the pitches of +-90 deg."""
+    """Converts values x y z roll pitch yaw (n, 6 or more).
+
+    Returns:
+        Rotations (n, 3, 3), Jacobians (n, 3, 3) (see `_poses`), and the problem of the pitches of +-90 deg.
+    """
     from scipy.spatial.transform import Rotation  # imported here as in `geometry.rotation_from_wxyz`
 
     roll, pitch = values[:, 3:5].T

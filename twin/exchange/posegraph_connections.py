@@ -1,4 +1,4 @@
-"""Connectivity of a pose graph: warns of nodes without an edge, nodes without a vertex, and unconnected parts."""
+"""Connectivity of a pose graph: warns of nodes without an edge, nodes without a vertex, and separate components."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum number of nodes that a warning lists, and of warnings of unconnected parts; the others are counted.
+#: Maximum number of nodes that a warning lists, and of warnings of separate components; the others are counted.
 _LISTED = 5
 
 _Nodes = NDArray[np.int64]
 
 
 def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tuple[_Nodes, _Nodes]) -> list[str]:
-    """Returns one warning for all nodes without an edge, one for all without a vertex, and one per unconnected part.
+    """Returns one warning for all nodes without an edge, one for all without a vertex, and one per separate component.
 
     Args:
         path: file of the graph.
@@ -30,10 +30,10 @@ def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tupl
     if len(nodes) and undefined.any():
         missing = np.setdiff1d(pairs[undefined], nodes)
         warnings.append(f"{path}:{pair_lines[undefined][0]}: {_listed(missing)} in an edge, but without a vertex")
-    return warnings + _separate_parts(path, pairs, pair_lines)
+    return warnings + _separate_components(path, pairs, pair_lines)
 
 
-def _separate_parts(path: Path, pairs: _Nodes, pair_lines: _Nodes) -> list[str]:
+def _separate_components(path: Path, pairs: _Nodes, pair_lines: _Nodes) -> list[str]:
     """Returns a warning for each connected component of the graph other than that of the first edge."""
     if not len(pairs):
         return []
@@ -52,10 +52,10 @@ def _separate_parts(path: Path, pairs: _Nodes, pair_lines: _Nodes) -> list[str]:
         if part != main:
             line, n_nodes = pair_lines[part_of_edge == part][0], int((part_of_node == part).sum())
             node = numbers[part_of_node == part][0]
-            problem = f"{n_nodes} nodes, the first of them {node}, have no edge to the part of node {pairs[0, 0]}"
+            problem = f"{n_nodes} nodes, the first of them {node}, have no edge to the component of node {pairs[0, 0]}"
             warnings.append(f"{path}:{line}: {problem}")
             if len(warnings) == _LISTED and n_parts - 1 > _LISTED:
-                return [*warnings, f"{path}: and {n_parts - 1 - _LISTED} more separate parts"]
+                return [*warnings, f"{path}: and {n_parts - 1 - _LISTED} more separate components"]
     return warnings
 
 

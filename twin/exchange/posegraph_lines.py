@@ -63,8 +63,8 @@ def read_rows(file: Path, layouts: Mapping[str, Layout]) -> tuple[dict[str, Rows
         The rows of each tag of `layouts`, and the lines with other tags.
 
     Raises:
-        TwinError: the file cannot be read, or a line has the wrong number of values, a text that is not a number, or a
-            value that is not finite.
+        TwinError: the file cannot be read, or a line has the wrong number of values, or a value that is not a finite
+            number.
     """
     by_tag: dict[str, tuple[list[int], list[list[str]]]] = defaultdict(lambda: ([], []))
     for count, text in enumerate(_text(file).splitlines(), start=1):
@@ -95,7 +95,7 @@ def _text(file: Path) -> str:
 
 
 def _rows(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[list[str]]) -> Rows:
-    """Converts the text of all lines of a tag. Raises TwinError at the first line that is malformed."""
+    """Returns node numbers and values of all lines with a tag. Raises TwinError at the first line that is malformed."""
     first = 1 + layout.n_nodes
     try:
         nodes = np.array([int(row[k]) for row in rows for k in range(1, first)], np.int64)

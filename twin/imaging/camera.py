@@ -12,9 +12,11 @@ from twin.core import geometry
 from twin.core.records import Image
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
-from twin.imaging.photo_sensor import PhotoSensor, sensor_of
+from twin.imaging.lens_psf import LensPsf
+from twin.imaging.photo_sensor import PhotoSensor, Sensor, sensor_of
 from twin.imaging.pixels import Raw
-from twin.imaging.sensor import ExposureSetting
+from twin.imaging.sensor import ExposureSetting, Radiance
+from twin.imaging.shutter import ExposureMotion, integrate
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
@@ -25,6 +27,7 @@ Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 AT_REST: Array = np.zeros(6)
+METERED_PX = 4  # where raw images are sampled from rendered ones, every n-th pixel along each axis is metered
 
 
 class StereoCapture(NamedTuple):
@@ -50,6 +53,7 @@ class DecomposedImage(NamedTuple):
         noise_free: (H, W, 3) image without noise.
         raw: digital numbers of the physical sensor, including the noise that the next capture will have; (H, W) with a
             Bayer filter, otherwise (H, W, 3); None for the plain sensor.
+        linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
     """
 
     albedo: Image
@@ -58,6 +62,7 @@ class DecomposedImage(NamedTuple):
     setting: ExposureSetting
     noise_free: Image
     raw: Raw | None
+    linear: bool
 
     @property
     def gain(self) -> float:
@@ -75,6 +80,8 @@ class StereoCamera:
         left_rng, right_rng: random streams of the image noise.
         stopwatch: timer of the stages "render" and "optics".
         true_cameras: geometry of the true cameras; None = as defined by the scenario.
+    Raises:
+        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`.
     """
 
     def __init__(
@@ -94,7 +101,8 @@ class StereoCamera:
         self._left_from_right, self._frame_rate_hz = rig.left_from_right, rig.frame_rate_hz
         body_from_cameras = rig.body_from_camera, rig.body_from_camera @ rig.left_from_right
         self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
-        self._sensor = sensor_of(scenario, self._cameras.raw_rig)
+        self._sensor, self._psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
+        self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
         self._rngs = (left_rng, right_rng)
         self._n_captures = 0
 
@@ -120,20 +128,31 @@ class StereoCamera:
         """Returns the [angular, linear] velocity (6,) of a camera (0 left, 1 right) in its own axes [rad/s, m/s]."""
         return self._camera_from_body_twist[camera] @ twist_body
 
-    def decompose(self, world_from_left: Array) -> DecomposedImage:
-        """Returns the left image at a pose and time 0 with intermediate results; has no effect on later captures."""
+    def decompose(self, world_from_left: Array, twist_body: Array = AT_REST) -> DecomposedImage:
+        """Returns the left image at a pose and time 0 with intermediate results; has no effect on later captures.
+
+        Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
+                image and the digital numbers, not the components.
+        """
         albedo, depth = self._renderer.render(world_from_left)
-        components = self._image_formation.components(albedo, depth, 0, StampedPose(world_from_left, 0.0))
+        pose = StampedPose(world_from_left, 0.0)
+        components = self._image_formation.components(albedo, depth, 0, pose)
         cameras = self._cameras
         sensor = sensor_of(self._scenario, cameras.raw_rig)
-        light = cameras.sample(components.total, depth, 0)
-        setting = sensor.meter(light)
+        floor = self._image_formation.radiance_without_snow(albedo, depth, 0, pose)
+        setting = self._meter(sensor, components.total, depth)
+        motion = sensor.motion(self.twist_of_camera(0, twist_body), setting, len(depth))
+        light = self._through_lens(floor, depth, 0, pose, motion)
         noise_free = cameras.rectify(sensor.image(light, setting, None))
         next_rng = copy.deepcopy(self._rngs[0])
         raw = sensor.raw(light, setting, next_rng) if isinstance(sensor, PhotoSensor) else None
         cropped = {name: cameras.crop(part) for name, part in components._asdict().items() if part is not None}
         components = components._replace(**cropped)
-        return DecomposedImage(cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw)
+        return DecomposedImage(
+            cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw, self._linear
+        )
 
     def _expose(
         self, pose: StampedPose, camera: int, twist_body: Array, setting: ExposureSetting | None
@@ -143,12 +162,48 @@ class StereoCamera:
         with self._stopwatch("render"):
             albedo, depth = self._renderer.render(world_from_camera)
         with self._stopwatch("optics"):
-            light = self._image_formation.radiance(albedo, depth, camera, pose)
-            raw = None
+            floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose)
+            at_rest = None
             if setting is None:
-                raw = self._cameras.sample(light, depth, camera)
-                setting = self._sensor.meter(raw)
-            integrated = self._sensor.integrate(light, depth, self.twist_of_camera(camera, twist_body), setting)
-            raw = self._cameras.sample(integrated, depth, camera) if raw is None or integrated is not light else raw
+                at_rest = self._with_snow(floor, depth, pose)
+                setting = self._meter(self._sensor, at_rest, depth)
+            motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
+            raw = self._through_lens(floor, depth, camera, pose, motion, at_rest)
             image = self._cameras.rectify(self._sensor.image(raw, setting, self._rngs[camera]))
             return image, self._cameras.crop(depth), setting
+
+    def _with_snow(self, floor: Radiance, depth: Depth, pose: StampedPose) -> Radiance:
+        """Returns the light in the left camera without motion blur: `floor`, or a copy of it with marine snow."""
+        if not self._image_formation.snows:
+            return floor
+        light = floor.copy()
+        self._image_formation.add_snow(light, depth, 0, pose)
+        return light
+
+    def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
+        """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
+        every_px = 1 if self._cameras.sampling is None else METERED_PX
+        return sensor.meter(self._cameras.sample(light, depth, 0, every_px), every_px)
+
+    def _through_lens(
+        self,
+        floor: Radiance,
+        depth: Depth,
+        camera: int,
+        pose: StampedPose,
+        motion: ExposureMotion | None,
+        at_rest: Radiance | None = None,
+    ) -> Radiance:
+        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water, which may be changed.
+
+        Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
+        with its own blur afterwards. `at_rest` is the light with marine snow in a camera at rest, if it is known.
+        """
+        light = self._psf.out_of_focus(floor, depth)
+        if motion is not None:
+            light = integrate(light, depth, self._focal_px, motion)
+        if light is floor and motion is None and at_rest is not None:
+            light = at_rest
+        else:
+            self._image_formation.add_snow(light, depth, camera, pose, motion)
+        return self._cameras.sample(self._psf.transfer(light), depth, camera)

@@ -1,10 +1,18 @@
 """Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
 
-The surface is a sum of waves that are periodic in a square tile. A vertical ray that meets the surface at a small slope
-s is refracted by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a floor at depth D with a
-horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite side, so the mean of the
-pattern is 1. The angular size of the sun and scattering in the water (small-angle theory of Wells, as in
-`forward_scatter`) blur the pattern, so its contrast decreases with depth.
+The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A vertical ray that meets the
+surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a
+floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
+side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
+
+- waves shorter than two cells: the mean over their phases is a Gaussian blur by their slopes, as they focus far above
+  the floor;
+- the angular size of the sun;
+- scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
+  `scattering_blur`).
+
+Waves longer than the tile are left out, as they focus far below the floor: the side of the tile is `TILE_DEPTHS` times
+the depth, so a camera below the surface rarely sees the pattern repeated.
 """
 
 from __future__ import annotations
@@ -13,52 +21,62 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.special import j0
 
-from twin.imaging.forward_scatter import forward_scattering
 from twin.imaging.illumination import Illumination
+from twin.imaging.phase_function import PhaseTable, table_of
 from twin.imaging.water import Medium
+from twin.imaging.waves import angular_frequency, slope_density, slope_variance
 
 Array = NDArray[np.float64]
 
-TILE_M, CELLS = 4.0, 128  # side of the tile [m]; number of cells per side, a power of two
-RAYS = 2  # number of rays per side of a cell
-WAVELENGTHS_M = (0.3, 3.0)  # shortest and longest water wave
-SLOPE_RMS = 0.08  # RMS slope of the water surface in a light breeze
-WATER_INDEX, GRAVITY_MPS2 = 1.339, 9.81
-SUN_RAD = 0.0047 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
+CELLS = 256  # number of cells per side of the tile, a power of two
+TILE_DEPTHS = 1.5  # side of the tile in units of the depth
+RESOLVED = 0.95  # wave number of the shortest waves, in units of the Nyquist wave number of the cells
+WATER_INDEX = 1.339  # refractive index of sea water
+SUN_RAD = 0.00465 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
 STREAM = 1 << 16  # key of the random stream for the waves
+_HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scattering_blur`
 
 
 class Caustics:
     """Caustics of one survey: a time-dependent pattern, computed on the reference plane.
 
+    The wind blows from west to east. The phases of the waves are random, their amplitudes are not: the slopes have the
+    variance of the spectrum at any time.
+
     Args:
         illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
             that the waves focus; the rest of the daylight is diffuse and uniform.
+        wind_mps: wind speed 10 m above the sea.
         seed: seed of the scenario.
     """
 
-    def __init__(self, illumination: Illumination, seed: int):
+    def __init__(self, illumination: Illumination, wind_mps: float, seed: int):
         water, daylight = illumination
         depth_m = daylight.reference_depth_m
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
-        per_m = 2 * np.pi * fft.fftfreq(CELLS, TILE_M / CELLS)
-        kx, ky = np.meshgrid(per_m, per_m)
+        self.tile_m = TILE_DEPTHS * depth_m
+        kx, ky = _wave_numbers(self.tile_m)
         k = np.hypot(kx, ky)
-        in_band = (k >= 2 * np.pi / WAVELENGTHS_M[1]) & (k <= 2 * np.pi / WAVELENGTHS_M[0])
-        # slope variance is equal in each octave; most waves run downwind (east), none upwind
-        weight = np.where(in_band & (kx > 0), kx**2 / np.maximum(k, 1e-9) ** 4, 0.0)
-        height = np.sqrt(weight) * (rng.normal(size=k.shape) + 1j * rng.normal(size=k.shape))
-        height *= SLOPE_RMS * np.sqrt(2 / (np.abs(k * height) ** 2).sum())  # the mean square of a sine is 1/2
-        # columns in which all waves are shorter than the shortest wavelength are zero and are not stored
-        columns = slice(int(np.count_nonzero(per_m[: CELLS // 2] <= 2 * np.pi / WAVELENGTHS_M[0])))
-        self._omega = np.sqrt(GRAVITY_MPS2 * k[:, columns])
-        # 0.5: the spectrum of a real surface is Hermitian, and only one half of it is stored
-        self._slope = [(0.5j * along * height)[:, columns].astype(np.complex64) for along in (kx, ky)]
-        self._cells_per_slope = np.float32((1 - 1 / WATER_INDEX) * depth_m * CELLS / TILE_M)
-        self._blur = _blur(k[:, : CELLS // 2 + 1], depth_m, water).astype(np.float32)
+        shortest = RESOLVED * np.pi * CELLS / self.tile_m
+        # waves travel downwind: the half plane kx > 0 has the variance of both; of kx = 0, one half is kept, too
+        downwind = (k <= shortest) & ((kx > 0) | (ky > 0))
+        variance = np.where(downwind, 2 * slope_density(kx, ky, wind_mps) * (2 * np.pi / self.tile_m) ** 2, 0.0)
+        waves = np.sqrt(2 * variance) * np.exp(2j * np.pi * rng.random(k.shape))
+        # the spectrum of a real surface is Hermitian, and only one half of it is stored; column 0 holds both halves
+        waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
+        self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
+        self._omega = angular_frequency(k)
+        self._cells_per_slope = np.float32((1 - 1 / WATER_INDEX) * depth_m * self.cells_per_m)
+        self._blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest)).astype(np.float32)
         self._share = np.float32(daylight.focused_share)
         self._cached: tuple[float, NDArray[np.float32]] | None = None
+
+    @property
+    def cells_per_m(self) -> float:
+        """Number of cells of the pattern per metre."""
+        return CELLS / self.tile_m
 
     def pattern(self, time_s: float) -> NDArray[np.float32]:
         """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west.
@@ -70,64 +88,89 @@ class Caustics:
         return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Returns the slopes of the water surface towards east and towards north, each (CELLS, CELLS)."""
-        phase = np.exp(-1j * self._omega * time_s).astype(np.complex64)  # deep-water dispersion
+        """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS)."""
+        angle = np.remainder(self._omega * time_s, 2 * np.pi).astype(np.float32)
+        phase = np.cos(angle) - 1j * np.sin(angle)
         size = CELLS, CELLS
         east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
         return east, north
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
+        """Returns `pattern` without the cache."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
         blurred = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))
         return 1 + self._share * (blurred - 1)
 
+    def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
+        """Returns the modulation transfer function of the blur by the sun, the water and the unresolved waves.
 
-def _blur(k: Array, depth_m: float, water: Medium) -> Array:
-    """Returns the modulation transfer function of the blur by the solar disc and by forward scattering of green light.
+        Args:
+            depth_m: depth of the plane below the surface.
+            water: optical properties of the water.
+            unresolved: variance of the slopes along and across the wind due to waves that the cells do not resolve.
+        """
+        kx, ky = _wave_numbers(self.tile_m)
+        along, across = (SUN_RAD**2 + (1 - 1 / WATER_INDEX) ** 2 * variance for variance in unresolved)
+        rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
+        green = float(water.absorption_per_m[1]), float(water.scattering_per_m[1])
+        phase = table_of(water.scatterers[1])
+        return rough * scattering_blur(np.hypot(kx, ky), depth_m, green, phase)
 
-    With t the optical thickness of forward scattering over the depth, the fraction exp(-t) of the light is not
-    scattered; the rest is scattered t / (1 - exp(-t)) times on average.
+
+def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase: PhaseTable) -> Array:
+    """Returns the modulation transfer function of the irradiance at a depth below a narrow vertical beam.
+
+    Light that is scattered by the angle t at the height h above the plane meets it at a distance of h tan(t), after a
+    path that is longer by h (1 / cos(t) - 1), over which it is absorbed. With any number of such scattering events
+    (Wells 1973), the irradiance has the transform exp(b (F(k) - F(0))), where F(k) is the integral over h from 0 to the
+    depth and over all downward directions of p(t) exp(-a h (1 / cos(t) - 1)) J0(k h tan(t)).
 
     Args:
         k: wave numbers of the pattern, of any shape [rad/m].
         depth_m: depth of the plane below the surface.
-        water: optical properties of the water.
+        per_m: absorption coefficient a and scattering coefficient b of the water [1/m].
+        phase: phase function p of the water.
     """
-    lobe = forward_scattering(water.mean_cosine)
-    thickness = lobe.share * float(water.scattering_per_m[1]) * depth_m
-    unscattered = np.exp(-thickness)
-    n_scatterings = thickness / (1 - unscattered) if thickness > 1e-9 else 1.0
-    scattered = np.exp(-0.5 * (k * depth_m) ** 2 * lobe.variance_rad2 * n_scatterings / 3)
-    return np.exp(-0.5 * (k * depth_m * SUN_RAD) ** 2) * (unscattered + (1 - unscattered) * scattered)
+    absorption, scattering = per_m
+    if scattering * depth_m == 0:
+        return np.ones_like(k)
+    every = (len(phase.cumulative) - 1) // _ANGLES
+    middle = (np.arange(_ANGLES) + 0.5) / _ANGLES
+    angle, share = 2 * np.arcsin(middle**2), np.diff(phase.cumulative[::every])
+    angle, share = angle[angle < np.pi / 2], share[angle < np.pi / 2]
+    node, weight = np.polynomial.legendre.leggauss(_HEIGHTS)
+    height = depth_m * (node[:, None] + 1) / 2
+    arriving = share * np.exp(-absorption * height * (1 / np.cos(angle) - 1)) * weight[:, None] * depth_m / 2
+    at = np.concatenate([[0.0], np.geomspace(0.01 / depth_m, max(float(k.max()), 1 / depth_m), _WAVE_NUMBERS)])
+    scattered = np.array([(arriving * j0(one * height * np.tan(angle))).sum() for one in at])
+    return np.exp(scattering * (np.interp(k, at, scattered) - scattered[0]))
+
+
+def _wave_numbers(tile_m: float) -> tuple[Array, Array]:
+    """Returns the wave numbers towards east (1, CELLS / 2 + 1) and north (CELLS, 1) of one half plane [rad/m]."""
+    step, index = 2 * np.pi / tile_m, np.arange(CELLS, dtype=np.float64)
+    return step * index[None, : CELLS // 2 + 1], step * np.where(index < CELLS / 2, index, index - CELLS)[:, None]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces evenly spaced vertical rays through the surface; adds each to four cells of `light` with bilinear weights.
+    """Traces one vertical ray per cell through the surface; adds each to four cells of `light` with bilinear weights.
 
     Args:
         east, north: (n, n) slopes of the surface.
         cells_per_slope: displacement of a ray on the floor per unit of slope [cells].
         light: (n, n) illuminance relative to its mean, modified in place.
     """
-    n, each, one = light.shape[0], np.float32(1 / RAYS**2), np.float32(1.0)
+    n, one = light.shape[0], np.float32(1.0)
     for i in range(n):
-        i1 = (i + 1) & (n - 1)
         for j in range(n):
-            j1 = (j + 1) & (n - 1)
-            for part in range(RAYS * RAYS):
-                a, b = np.float32((part // RAYS) / RAYS), np.float32((part % RAYS) / RAYS)
-                to_east = (one - a) * ((one - b) * east[i, j] + b * east[i, j1])
-                to_east += a * ((one - b) * east[i1, j] + b * east[i1, j1])
-                to_north = (one - a) * ((one - b) * north[i, j] + b * north[i, j1])
-                to_north += a * ((one - b) * north[i1, j] + b * north[i1, j1])
-                col, row = np.float32(j) + b - cells_per_slope * to_east, np.float32(i) + a - cells_per_slope * to_north
-                left, low = np.floor(col), np.floor(row)
-                w, h = col - left, row - low
-                k, m = int(left) & (n - 1), int(low) & (n - 1)
-                k1, m1 = (k + 1) & (n - 1), (m + 1) & (n - 1)
-                light[m, k] += each * (one - w) * (one - h)
-                light[m, k1] += each * w * (one - h)
-                light[m1, k] += each * (one - w) * h
-                light[m1, k1] += each * w * h
+            col, row = np.float32(j) - cells_per_slope * east[i, j], np.float32(i) - cells_per_slope * north[i, j]
+            left, low = np.floor(col), np.floor(row)
+            w, h = col - left, row - low
+            k, m = int(left) & (n - 1), int(low) & (n - 1)
+            k1, m1 = (k + 1) & (n - 1), (m + 1) & (n - 1)
+            light[m, k] += (one - w) * (one - h)
+            light[m, k1] += w * (one - h)
+            light[m1, k] += (one - w) * h
+            light[m1, k1] += w * h

@@ -1,21 +1,17 @@
-"""Forward scatter: light from the floor, scattered by small angles, blurs the image; the blur increases with range.
+"""Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
-Light scattered by angles below a limit, with coefficient b_f < b, is not lost from the image. The radiance L of a
-floor at range r then arrives as L exp(-(c - b_f) r): the fraction exp(-b_f r) of this is the direct signal,
-L exp(-c r), and the fraction 1 - exp(-b_f r) is blurred. This is the form of McGlamery (1979) and Jaffe (1990),
-direct + (exp(-G r) - exp(-c r)) blurred, with G = c - b_f; with the default phase function, G = a + 0.26 b.
-
-The width of the blur follows from small-angle theory (Wells 1969, 1973): light scattered once, at a uniformly
-distributed position along the ray, by an angle of variance s^2 (along each axis), appears displaced with variance
-s^2 / 3. The number of scatterings is Poisson distributed with mean b_f r; the mean for light scattered at least once
-is n = b_f r / (1 - exp(-b_f r)). The point spread function is a Gaussian of variance n s^2 / 3. If c already excludes
-the fraction `water.kept_share` of b, this fraction is subtracted from b_f, so that it is not counted twice. The image
-is mirrored at its borders, so no light is lost there. Forward scatter between lamps and floor is not modelled.
+Without scattering, the fraction exp(-b r) of the light arrives; the scattered light arrives with a kernel that has a
+sharp core and a long tail (`spread.camera_mixture`). It is a mixture of Gaussians, the levels of an image pyramid: each
+level doubles the width, and its weights depend on band and range. The weights of a pixel are those of its own range:
+its ray receives light from the floor around it. Much of the tail lies outside the image. There the floor is taken to
+be the plane that fits the depth of the image, with the mean albedo of the image; the coarse levels of the pyramid cover
+it. The fine levels are mirrored at the borders of the image.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -23,148 +19,204 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.imaging.optics import Depth, Radiance
-from twin.imaging.powers import LOG2_E, two_to
-from twin.imaging.row_parallel import in_row_bands
-from twin.imaging.shading import FAR_M, PATH_MAX_M
-from twin.imaging.water import SEA_WATER_MEAN_COSINE, Medium, phase_function
+from twin.imaging.shading import FAR_M, RANGE_SCALE_M
+from twin.imaging.spread import NODES_M, Absorbed, camera_mixture, over_path
+from twin.imaging.water import Medium
 
 Array = NDArray[np.float64]
+Radiance: TypeAlias = NDArray[np.float32]
+Depth: TypeAlias = NDArray[np.float32]
+#: Fractional row index of the table `ForwardScatter.kept`, for each pixel.
+Place: TypeAlias = NDArray[np.float32]
 
-FORWARD_DEG = 15.0  # light scattered by a larger angle is lost from the image
-LEVELS = 4  # number of blur levels, with 1, 2, 4, 8 times the smallest variance; other variances mix two levels
-STEP_M = 0.02  # range step of the table of levels
-MAX_LOG_GAIN = 60.0  # upper limit of b_f r, against overflow; no light arrives from such ranges
+SHARE_STEPS = 512  # number of steps of r / (r + RANGE_SCALE_M) from 0 to 1
+SURROUNDINGS_TAN = 1.6  # extent of the surroundings, as the tangent of the angle from the axis
+SURROUNDINGS_STEP_TAN = 0.035  # side of a pixel of the surroundings, as a tangent, within a factor of 1.4
+WIDEST_TAN = 1.2  # largest standard deviation of a level
+PLANE_STEP_PX = 8  # spacing of the pixels to which the plane is fitted
 
 
-class ForwardScattering(NamedTuple):
-    """Scattering by angles below `FORWARD_DEG`.
+class Surroundings(NamedTuple):
+    """The coarse grid of the image and its surroundings.
 
     Args:
-        share: fraction of the scattering coefficient b due to these angles.
-        variance_rad2: variance of the scattering angle along one axis [rad^2].
+        level: level of the image pyramid whose pixel size it has.
+        pad: number of pixels before the first of the image, in rows and columns.
+        shape: rows and columns of the grid.
+        focal_px: focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel.
     """
 
-    share: float
-    variance_rad2: float
-
-
-def forward_scattering(mean_cosine: float = SEA_WATER_MEAN_COSINE) -> ForwardScattering:
-    """Integrates the phase function over angles below `FORWARD_DEG`, for a mean cosine of the scattering angle."""
-    angle = (np.arange(20000) + 0.5) / 20000 * np.deg2rad(FORWARD_DEG)
-    density = 2 * np.pi * np.sin(angle) * phase_function(np.cos(angle), mean_cosine) * (angle[1] - angle[0])
-    return ForwardScattering(float(density.sum()), float((density * angle**2).sum() / density.sum() / 2))
+    level: int
+    pad: int
+    shape: tuple[int, int]
+    focal_px: float
 
 
 class ForwardScatter:
-    """Computes the forward-scattered light from the floor, given the direct signal.
+    """Blur of the light of the floor by scattering on its way to the camera.
 
     Args:
         rig: the rendered cameras.
         water: optical properties of the water.
+
+    Attributes:
+        range_per_depth: range divided by depth of the pixels of the surroundings.
+        surroundings: grid on which `add` expects the light of the floor around the image.
+        kept: (n + 1, 4) share of the light of the floor, attenuated by absorption alone, that arrives without blur: the
+            unscattered light and the core of the kernel, narrower than a pixel; for R, G, B and a zero, at even
+            steps of r / (r + RANGE_SCALE_M).
     """
 
     def __init__(self, rig: StereoRig, water: Medium):
-        lobe = forward_scattering(water.mean_cosine)
-        scattered_per_m = max(lobe.share - water.kept_share, 0.0) * water.scattering_per_m
-        thickness = scattered_per_m * np.arange(0.0, PATH_MAX_M, STEP_M)[:, None]
-        n_scatterings = np.where(thickness > 1e-9, thickness / -np.expm1(-np.maximum(thickness, 1e-9)), 1.0)
-        self._scattered_per_m = scattered_per_m.astype(np.float32)
-        self._level = _level_of(n_scatterings).astype(np.float32)
-        self._focal_px = rig.focal_px
-        self._variance_px2 = rig.focal_px**2 * lobe.variance_rad2 / 3 * 2.0 ** np.arange(LEVELS)
-        self._blurred = np.empty((rig.height_px, rig.width_px, 3), np.float32)
-        self._bin_px = _bin_px(rig.width_px, rig.height_px, float(np.sqrt(self._variance_px2[0])))
+        self.surroundings = _surroundings(rig)
+        levels = max(int(np.log2(WIDEST_TAN * rig.focal_px)), self.surroundings.level)
+        x = np.linspace(0.0, 1.0, SHARE_STEPS + 1)[:-1]
+        range_m = RANGE_SCALE_M * x / (1 - x)
+        range_m = np.append(range_m, range_m[-1])
+        unscattered = np.exp(-water.scattering_per_m * range_m[:, None])
+        weights = level_weights(water.bands, rig.focal_px, levels, range_m)
+        self._core = weights[0]
+        self._weights = weights[1:].astype(np.float32)
+        self.kept = np.zeros((SHARE_STEPS + 1, 4), np.float32)
+        self.kept[:, :3] = unscattered + weights[0]
+        v, u = (np.arange(0.0, n, PLANE_STEP_PX) - (n - 1) / 2 for n in (rig.height_px, rig.width_px))
+        self._fit = np.linalg.pinv(_plane_terms(u / rig.focal_px, v / rig.focal_px))
+        rows, cols = (np.arange(0.0, n) - (n - 1) / 2 for n in self.surroundings.shape)
+        focal = self.surroundings.focal_px
+        self._terms = _plane_terms(cols / focal, rows / focal)
+        self.range_per_depth = np.sqrt((self._terms**2).sum(1)).reshape(self.surroundings.shape).astype(np.float32)
 
-    def spread(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Returns the forward-scattered light (H, W, 3) per colour band in photometric units [cd/m2].
+    def plane(self, depth: Depth) -> Depth:
+        """Returns the depth of the plane around the image on the grid `surroundings` [m]; inf beyond `FAR_M`.
+
+        In an image of a plane, 1 / depth is linear in column and row.
+        """
+        per_m = 1 / depth[::PLANE_STEP_PX, ::PLANE_STEP_PX].astype(np.float64)
+        found = np.maximum(self._terms @ (self._fit @ per_m.ravel()), 1e-9)
+        return np.where(found > 1 / FAR_M, 1 / found, np.inf).reshape(self.surroundings.shape).astype(np.float32)
+
+    def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
+        """Adds the blurred light of the floor to `light` in place, without the core of the kernel, which is in `kept`.
 
         Args:
-            direct: (H, W, 3) direct signal: light from the floor that reaches the camera without scattering [cd/m2].
-            depth: (H, W) depth along the optical axis [m].
+            floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
+            place: fractional row index into `kept` for every second pixel in both directions, see `place_of`.
+            around: light and row index into `kept` of the surroundings; pixels inside the image are overwritten.
+            light: (H, W, 3) image to which the light is added.
         """
-        return self._blur(direct, depth).copy()
+        grid = self.surroundings
+        images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
+        places: list[Place] = [place]
+        while len(images) < len(self._weights):
+            if len(images) == grid.level:
+                inner = np.s_[grid.pad : grid.pad + len(images[-1]), grid.pad : grid.pad + images[-1].shape[1]]
+                outer, outer_place = around
+                outer[inner], outer_place[inner] = images[-1], places[-1]
+                images[-1], places[-1] = outer, outer_place
+            images.append(np.asarray(cv2.pyrDown(images[-1]), np.float32))
+            places.append(np.asarray(cv2.pyrDown(places[-1]), np.float32))
+        _weigh(images[-1], places[-1], self._weights[-1], np.zeros_like(images[-1]))
+        for k in reversed(range(len(images) - 1)):
+            height, width = places[k].shape
+            wider = cv2.pyrUp(images[k + 1], dstsize=(width, height))
+            _weigh(images[k], places[k], self._weights[k], wider)
+            if k + 1 == grid.level:
+                height, width = (n_px_at(n, grid.level) for n in floor.shape[:2])
+                images[k] = images[k][grid.pad : grid.pad + height, grid.pad : grid.pad + width]
+        height, width = floor.shape[:2]
+        cv2.add(light, cv2.pyrUp(images[0], dstsize=(width, height)), dst=light)
 
-    def add(self, direct: Radiance, depth: Depth, light: Radiance) -> None:
-        """Adds the direct signal and the forward-scattered light from the floor to `light` (H, W, 3), in place."""
-        spread = self._blur(direct, depth)
-        parts = light.reshape(len(light), -1), spread.reshape(len(light), -1), direct.reshape(len(light), -1)
-        in_row_bands(lambda first, end: _add(*parts, first, end), len(light))
+    def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
+        """Returns all light (H, W, 3) that was scattered between floor and camera [cd/m2].
 
-    def _blur(self, direct: Radiance, depth: Depth) -> Radiance:
-        """Same as `spread`, but returns a buffer that the next call overwrites; a new array would double the time."""
-        size, (height, width) = self._bin_px, depth.shape
-        bins = np.zeros((LEVELS, height // size, width // size, 3), np.float32)
-        scene = direct, depth, np.float32(self._focal_px), self._scattered_per_m, self._level, size, bins
-        in_row_bands(lambda first, end: _collect(*scene, first, end), height // size, size)
-        # binning and bilinear interpolation between bins add variance, which is subtracted here
-        sigma = np.sqrt(np.maximum(self._variance_px2 / size**2 - (0.25 - 1 / (4 * size**2)), 1e-3))
-        pairs = zip(bins, sigma, strict=True)
-        blurred = np.zeros_like(bins[0])
-        for level, level_sigma in pairs:
-            if level.any():
-                blurred += cv2.GaussianBlur(level, (0, 0), level_sigma, borderType=cv2.BORDER_REFLECT)
-        cv2.resize(blurred / np.float32(size**2), (width, height), dst=self._blurred, interpolation=cv2.INTER_LINEAR)
-        return self._blurred
+        Args:
+            floor, around: see `add`.
+            range_m: (H, W) distance of the floor from the camera.
+        """
+        place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
+        core = np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
+        light = (floor * core).astype(np.float32)
+        self.add(floor, np.ascontiguousarray(place[::2, ::2]), around, light)
+        return light
 
 
-def _level_of(ratio: Array) -> Array:
-    """Returns the fractional blur level for variances `ratio` times the smallest; linear in `ratio` between levels."""
-    below = np.minimum(np.floor(np.log2(ratio)), LEVELS - 2)
-    return np.minimum(below + ratio / 2**below - 1, LEVELS - 1)
+def place_of(range_m: Array) -> Place:
+    """Returns the row of the table `ForwardScatter.kept` that belongs to a range [m]; inf is valid."""
+    near = np.minimum(range_m, FAR_M)
+    return (SHARE_STEPS * near / (near + RANGE_SCALE_M)).astype(np.float32)
 
 
-def _bin_px(width_px: int, height_px: int, sigma_px: float) -> int:
-    """Returns the bin side [px]: the largest of 8, 4, 2 that divides width and height and is below 0.8 sigma, or 1."""
-    sides = [n for n in (8, 4, 2) if width_px % n == height_px % n == 0 and n < 0.8 * sigma_px]
-    return sides[0] if sides else 1
+def level_sigma_px(level: int) -> float:
+    """Returns the standard deviation of the blur of a level [px]; each step down and up adds a filter's variance."""
+    return float(np.sqrt(2 * (4.0**level - 1) / 3))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"})
-def _collect(direct, depth, focal, scattered_per_m, level, size, bins, first, end):
-    """Adds the forward-scattered light of each pixel to its bin, split between two levels of the blur variance.
+@cache
+def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
+    """Returns the weights (levels + 1, 3, nodes) of the levels at the ranges `NODES_M`."""
+    sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
+    return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
-    Fills rows `first` to `end` of the bins. The light is computed per pixel; the level per bin, from its mean range.
+
+def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, range_m: Array) -> Array:
+    """Returns the weights (levels + 1, n, 3) of the levels of the kernel; level 0 is light that is not blurred.
+
+    Args:
+        bands: bands of the water.
+        focal_px: focal length.
+        levels: number of levels of the pyramid.
+        range_m: (n,) ranges.
     """
-    levels, _, cols, _ = bins.shape
-    width, last = depth.shape[1], level.shape[0] - 1
-    one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
-    red, green, blue = np.float32(LOG2_E) * scattered_per_m
-    most = np.float32(LOG2_E * MAX_LOG_GAIN)
-    # rows: forward-scattered light in R, G, B; sum of ranges; number of pixels that show the floor
-    of_columns, of_bins = np.empty((5, width), np.float32), np.empty((5, cols), np.float32)
-    for row in range(first, end):
-        of_columns[:] = zero
-        for v in range(row * size, (row + 1) * size):
-            y = (np.float32(v) - half * np.float32(depth.shape[0] - 1)) / focal
-            here, light = depth[v], direct[v].reshape(-1)
-            for u in range(width):
-                x = (np.float32(u) - half * np.float32(width - 1)) / focal
-                range_m = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else zero
-                of_columns[0, u] += light[3 * u] * (two_to(min(red * range_m, most)) - one)
-                of_columns[1, u] += light[3 * u + 1] * (two_to(min(green * range_m, most)) - one)
-                of_columns[2, u] += light[3 * u + 2] * (two_to(min(blue * range_m, most)) - one)
-                of_columns[3, u] += range_m
-                of_columns[4, u] += one if range_m > zero else zero
-        for k in range(5):
-            of_pixels = of_columns[k]
-            for col in range(cols):
-                total = zero
-                for u in range(size):
-                    total += of_pixels[col * size + u]
-                of_bins[k, col] = total
-        for col in range(cols):
-            at = min(int(of_bins[3, col] / max(of_bins[4, col], one) * np.float32(1 / STEP_M) + half), last)
+    nodes = level_weights_of(bands, focal_px, levels)
+    rows = [
+        over_path(nodes[:, k], band.scattering_per_m, range_m) if band.scattering_per_m else nodes[:, k, :1] * range_m
+        for k, band in enumerate(bands)
+    ]
+    return np.stack(rows, axis=-1)
+
+
+def n_px_at(n_px: int, level: int) -> int:
+    """Returns the number of pixels of a side of an image at a level of its pyramid."""
+    for _ in range(level):
+        n_px = (n_px + 1) // 2
+    return n_px
+
+
+def _surroundings(rig: StereoRig) -> Surroundings:
+    """Returns the grid of the surroundings of an image."""
+    level = max(round(np.log2(SURROUNDINGS_STEP_TAN * rig.focal_px)), 1)
+    side = 2.0**level
+    half = max(rig.width_px, rig.height_px) / 2 / side
+    pad = max(int(np.ceil(SURROUNDINGS_TAN * rig.focal_px / side - half)), 2)
+    # at least the pixels of the image at this level; (n - 1) / 2 is its centre
+    rows, cols = (
+        max(round((n - 1) / side), n_px_at(n, level) - 1) + 1 + 2 * pad for n in (rig.height_px, rig.width_px)
+    )
+    return Surroundings(level, pad, (rows, cols), rig.focal_px / side)
+
+
+def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
+    """Returns 1, x and y of each pixel (n, 3) of a grid with columns at x and rows at y."""
+    across, down = np.meshgrid(x, y)
+    return np.column_stack([np.ones(across.size), across.ravel(), down.ravel()]).astype(np.float64)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(image, place, weights, wider):
+    """Multiplies one level by its weights and adds the wider levels, in place.
+
+    Args:
+        image: (rows, cols, 3) light of the floor at this level.
+        place: (rows, cols) fractional row of the table for each pixel.
+        weights: (n, 3) weights of this level.
+        wider: (rows, cols, 3) weighted light of the wider levels.
+    """
+    last = weights.shape[0] - 2
+    for v in range(place.shape[0]):
+        for u in range(place.shape[1]):
+            at = place[v, u]
+            k = min(int(at), last)
+            w = at - np.float32(k)
             for c in range(3):
-                k = min(int(level[at, c]), levels - 2)
-                above = of_bins[c, col] * (level[at, c] - np.float32(k))
-                bins[k, row, col, c] = of_bins[c, col] - above
-                bins[k + 1, row, col, c] = above
-
-
-@njit(cache=True, nogil=True)
-def _add(light, one, other, first, end):
-    """Adds the images `one` and `other` to `light` (H, 3 W) in rows `first` to `end`."""
-    for v in range(first, end):
-        for k in range(light.shape[1]):
-            light[v, k] = light[v, k] + one[v, k] + other[v, k]
+                weight = weights[k, c] + w * (weights[k + 1, c] - weights[k, c])
+                image[v, u, c] = image[v, u, c] * weight + wider[v, u, c]

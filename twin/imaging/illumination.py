@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import TwinError
+from twin.imaging.sun_sky import SunSky, direction_to_sun
 from twin.imaging.water import Medium, downwelling_per_m, medium
 from twin.scenario.model import Scenario, SunConfig
 
@@ -15,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Daylight(NamedTuple):
-    """Daylight from the zenith in the bands R, G, B.
+    """Daylight in the bands R, G, B.
 
     Args:
         surface_lx: (3,) illuminance just below the water surface, or on the floor if there is no surface.
@@ -24,6 +25,7 @@ class Daylight(NamedTuple):
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
         camera_depth_m: depth of the cameras below the surface at the planned altitude; 0 where there is no surface.
         focused_share: fraction of the daylight that the surface waves focus into caustics.
+        source: direction to the sun under water, and share of the sky in the illuminance.
     """
 
     surface_lx: Array
@@ -32,6 +34,7 @@ class Daylight(NamedTuple):
     reference_depth_m: float
     camera_depth_m: float
     focused_share: float
+    source: SunSky = SunSky()
 
 
 class Illumination(NamedTuple):
@@ -44,12 +47,19 @@ class Illumination(NamedTuple):
 def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
+    The absorption of a band is the effective one over twice the planned altitude, the path to the floor and back, for
+    the spectrum of the lamps, or of daylight if there are no lamps. Daylight itself is attenuated with the effective
+    absorption over the path from the surface to the reference plane.
+
     Raises:
         TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or
             caustics are requested without a surface.
     """
-    water = medium(scenario.water)
-    return Illumination(water, daylight_at(scenario.sun, water, scenario.plan.altitude_m))
+    altitude_m, sun, scattering = scenario.plan.altitude_m, scenario.sun, scenario.imaging.scattering
+    light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
+    water = medium(scenario.water, scattering, path_m=2 * altitude_m, light=light)
+    above = medium(scenario.water, scattering, path_m=sun.depth_m, light="daylight")
+    return Illumination(water, daylight_at(sun, above, altitude_m))
 
 
 def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
@@ -59,14 +69,15 @@ def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
         TwinError: the altitude is above the surface, or caustics are requested without a surface.
     """
     surface_lx = np.full(3, sun.illuminance_lx)
+    source = SunSky(direction_to_sun(sun.elevation_deg, sun.azimuth_deg), sun.sky_share)
     if not sun.depth_m:
         if sun.caustics:
             raise TwinError("sun.caustics", f"{sun.caustics:g}: there is no surface", "0, or set sun.depth_m")
-        return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0)
+        return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0, source)
     if altitude_m >= sun.depth_m:
         raise TwinError(
             "sun.depth_m", f"{sun.depth_m:g}: the cameras are above the surface", f"more than {altitude_m:g}"
         )
-    per_m, camera_depth_m = downwelling_per_m(water), sun.depth_m - altitude_m
+    per_m, camera_depth_m = downwelling_per_m(water, source.mean_cosine), sun.depth_m - altitude_m
     illuminance_lx = sun.illuminance_lx * np.exp(-per_m * camera_depth_m)
-    return Daylight(surface_lx, illuminance_lx, per_m, sun.depth_m, camera_depth_m, sun.caustics)
+    return Daylight(surface_lx, illuminance_lx, per_m, sun.depth_m, camera_depth_m, sun.caustics, source)

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Image, StereoRig
-from twin.imaging.caustics import CELLS, TILE_M, Caustics
-from twin.imaging.forward_scatter import ForwardScatter
+from twin.imaging.caustics import Caustics
+from twin.imaging.facets import Facets, Heights
 from twin.imaging.illumination import Illumination
-from twin.imaging.optics import Depth, Lit, Optics, Radiance, WaterSurface
-from twin.imaging.shadows import Heights, Shadows
+from twin.imaging.lens_psf import defocus_of
+from twin.imaging.materials import material_of
+from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface
+from twin.imaging.shadows import Shadows
+from twin.imaging.shutter import ExposureMotion
 from twin.imaging.snow import MarineSnow
 from twin.scenario.model import Scenario
 
@@ -33,7 +36,8 @@ class RadianceComponents(NamedTuple):
         floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where the water transmits too little light
             from the floor to the camera to compute it.
         direct: light from the floor that was not scattered on its path to the camera [cd/m2].
-        forward: light from the floor that was scattered by small angles [cd/m2]; None if forward scatter is disabled.
+        forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless
+            `imaging.scattering` is full.
         backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
         snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than what they hide;
             None if marine snow is disabled.
@@ -54,7 +58,8 @@ class ImageFormation:
     Args:
         scenario: settings of lamps, marine snow and current, and which effects are enabled.
         illumination: optical properties of the water, and daylight.
-        floor: heights of the floor, which casts shadows.
+        floor: heights of the floor, which has facets and casts shadows; None = a smooth floor without shadows, whose
+            normals follow from its depth.
         snow_rng: random stream of the particle positions.
         rig: the rendered cameras; None = the believed rig.
     """
@@ -63,23 +68,28 @@ class ImageFormation:
         self,
         scenario: Scenario,
         illumination: Illumination,
-        floor: Heights,
+        floor: Heights | None,
         snow_rng: np.random.Generator,
         rig: StereoRig | None = None,
     ):
         rig = scenario.believed_rig() if rig is None else rig
         imaging, snow, (water, daylight) = scenario.imaging, scenario.snow, illumination
         current_mps = np.array(scenario.current.velocity_mps)
-        self._rig = rig
+        self._rig, self._material = rig, material_of(scenario.terrain)
+        self._facets = None if floor is None else Facets(floor)
         self._optics = Optics(rig, illumination, scenario.lamps)
         sources = self._optics.light_sources
-        self._reference_depth_m = daylight.reference_depth_m
-        self._caustics = Caustics(illumination, scenario.seed) if daylight.focused_share else None
-        self._shadows = Shadows(floor, rig, [source.position_m for source in sources]) if imaging.shadows else None
-        self._forward = ForwardScatter(rig, water) if imaging.forward_scatter else None
-        self._direct = np.empty((rig.height_px, rig.width_px, 3), np.float32) if imaging.forward_scatter else None
+        self._reference_depth_m, self._daylight_on = daylight.reference_depth_m, bool(daylight.surface_lx.any())
+        waves = bool(daylight.focused_share)
+        self._caustics = Caustics(illumination, scenario.sun.wind_mps, scenario.seed) if waves else None
+        slanted = bool(daylight.surface_lx.any()) and daylight.source.sun_cosine < 1
+        to_sun = np.array(daylight.source.to_sun) if slanted else None
+        positions_m = [source.position_m for source in sources]
+        shaded = imaging.shadows and floor is not None
+        self._shadows = Shadows(floor, rig, positions_m, to_sun) if shaded and floor is not None else None
         snows = snow.density_per_m3 > 0
-        self._snow = MarineSnow(snow, current_mps, rig, water, sources, snow_rng) if snows else None
+        particles = snow, current_mps, rig, water, self._optics.lamp_light, snow_rng
+        self._snow = MarineSnow(*particles, defocus_of(scenario, rig)) if snows else None
 
     def radiance(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
         """Returns the light (H, W, 3) that reaches a camera, per colour band in photometric units [cd/m2].
@@ -90,46 +100,66 @@ class ImageFormation:
             camera: 0 left, 1 right.
             pose: pose of the left camera, and time since the start of the survey.
         """
-        lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
-        if self._forward is None:
-            light = self._optics.radiance(albedo, depth, camera, lit, surface)
-        else:
-            direct, light = self._optics.split(albedo, depth, camera, lit, surface, self._direct)
-            self._forward.add(direct, depth, light)
-        if self._snow is not None:
-            self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s)
+        light = self.radiance_without_snow(albedo, depth, camera, pose)
+        self.add_snow(light, depth, camera, pose)
         return light
+
+    def radiance_without_snow(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
+        """Returns the light (H, W, 3) of floor and water [cd/m2]; the arguments are those of `radiance`."""
+        floor, surface = self._floor_view(depth, camera, pose), self._water_surface(camera, pose)
+        light = self._optics.radiance(albedo, depth, camera, floor, surface)
+        return light
+
+    def add_snow(
+        self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None
+    ) -> None:
+        """Draws marine snow, if enabled, into `light` (H, W, 3) in place.
+
+        Args:
+            light: (H, W, 3) light of floor and water.
+            depth, camera, pose: see `radiance`.
+            motion: motion of the camera during the exposure, which images particles as streaks; None = no motion.
+        """
+        if self._snow is not None:
+            self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
+
+    @property
+    def snows(self) -> bool:
+        """Returns whether marine snow is enabled."""
+        return self._snow is not None
 
     def components(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> RadianceComponents:
         """Returns the components of the light that reaches a camera; the arguments are those of `radiance`."""
-        lit, surface = self._lit(depth, camera, pose), self._water_surface(camera, pose)
-        direct, backscatter = self._optics.split(albedo, depth, camera, lit, surface)
-        forward = None if self._forward is None else self._forward.spread(direct, depth)
+        floor, surface = self._floor_view(depth, camera, pose), self._water_surface(camera, pose)
+        direct, forward, backscatter = self._optics.parts(albedo, depth, camera, floor, surface)
         snow = None
         if self._snow is not None:
             before = direct + backscatter if forward is None else direct + backscatter + forward
             snow = before.copy()
-            self._snow.draw(snow, depth, pose.world_from_left, camera, pose.time_s)
+            self.add_snow(snow, depth, camera, pose)
             snow -= before
         total = self.radiance(albedo, depth, camera, pose)
-        floor_lx = self._optics.floor_lx(depth, camera, lit, surface)
+        floor_lx = self._optics.floor_lx(depth, camera, floor, surface)
         return RadianceComponents(floor_lx, direct, forward, backscatter, snow, total)
 
-    def _lit(self, depth: Depth, camera: int, pose: StampedPose) -> Lit | None:
+    def _floor_view(self, depth: Depth, camera: int, pose: StampedPose) -> FloorView:
+        """Returns facets, shadows and material of the floor for a camera."""
+        world_from_camera = self._world_from_camera(camera, pose)
+        facets = None if self._facets is None else self._facets.seen_from(world_from_camera)
         if self._shadows is None:
-            return None
-        return self._shadows.lit(depth, self._world_from_camera(camera, pose), camera)
+            return FloorView(facets, None, self._material)
+        return FloorView(facets, self._shadows.lit(depth, world_from_camera, camera), self._material)
 
     def _water_surface(self, camera: int, pose: StampedPose) -> WaterSurface | None:
-        """Returns the water surface above a camera; None if the scenario has no surface, so daylight is uniform."""
-        if not self._reference_depth_m:
+        """Returns the water surface above a camera; None without daylight."""
+        if not self._daylight_on:
             return None
         east, north, up = self._world_from_camera(camera, pose)[:3]
         from_camera = np.array([east, north, -up])
-        from_camera[:2] *= CELLS / TILE_M
         from_camera[2, 3] += self._reference_depth_m
         if self._caustics is None:
             return WaterSurface(None, from_camera)
+        from_camera[:2] *= self._caustics.cells_per_m
         return WaterSurface(np.pad(self._caustics.pattern(pose.time_s), (0, 1), mode="wrap"), from_camera)
 
     def _world_from_camera(self, camera: int, pose: StampedPose) -> Array:

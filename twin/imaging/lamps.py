@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.errors import TwinError
+from twin.imaging.bands import NM, band_weights
 from twin.imaging.illumination import Daylight
 from twin.scenario.model import LampConfig
 
@@ -23,13 +24,12 @@ LED_BEAM = (
 )  # fmt: skip
 
 WHITE_K = 6500.0  # colour temperature of white light
-WAVELENGTHS_M = np.array([650e-9, 550e-9, 450e-9])  # centres of the bands R, G, B
 LUMINANCE_SHARES = np.array([0.2126, 0.7152, 0.0722])  # fractions of R, G, B in the luminance of white (ITU-R BT.709)
 _HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
 
 
 class LightSources(NamedTuple):
-    """Light sources as seen by one camera: lamps in the camera's axes, and daylight.
+    """Light sources of one camera: the lamps in the axes of the camera, and the daylight.
 
     Args:
         position_m: (n, 3) positions of the lamps [m].
@@ -94,11 +94,13 @@ def beam_share(cos_angle: Array, table: Array) -> Array:
 
 
 def colour(temperature_k: float) -> Array:
-    """Returns the intensities (3,) of a black body in R, G, B, relative to a black body at 6500 K of equal luminance.
-
-    Planck (1901): at wavelength l, radiance varies with temperature T as 1 / (exp(h c / (l k T)) - 1).
-    """
-    against_white = np.expm1(_HC_PER_K / (WAVELENGTHS_M * WHITE_K)) / np.expm1(
-        _HC_PER_K / (WAVELENGTHS_M * temperature_k)
-    )
+    """Returns the intensities (3,) of a black body in R, G, B, relative to one at 6500 K of equal luminance."""
+    power, white = _black_body(temperature_k), _black_body(WHITE_K)
+    against_white = band_weights(white) @ (power / white)
     return against_white / (against_white @ LUMINANCE_SHARES)
+
+
+def _black_body(temperature_k: float) -> Array:
+    """Returns the power (n,) of a black body per wavelength at `bands.NM`, up to a factor (Planck 1901)."""
+    metres = NM * 1e-9
+    return metres**-5 / np.expm1(_HC_PER_K / (metres * temperature_k))

@@ -56,9 +56,9 @@ def distort(normalised: Array, lens: Distortion) -> Array:
 
 
 def undistort(distorted: Array, lens: Distortion) -> Array:
-    """Returns the normalised coordinates (..., 2) of rays from their distorted coordinates (..., 2); NaN without a ray.
+    """Returns the normalised coordinates (..., 2) of the rays with the distorted image coordinates (..., 2).
 
-    Inverse of `distort` by Newton's method.
+    Inverse of `distort` by Newton's method; NaN where it does not converge to a radius below `fold`.
     """
     normalised = distorted
     for _ in range(STEPS):
@@ -72,7 +72,7 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
 
 def fold(lens: Distortion) -> float:
-    """Returns the tangent of the off-axis angle beyond which the distorted radius decreases; inf if it never does."""
+    """Returns the normalised radius r beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) decreases; inf if it never does."""
     # The derivative of r (1 + k1 r^2 + ...), divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1,
     # so distortion coefficients of zero cause no division by zero.
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])

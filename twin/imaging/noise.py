@@ -21,13 +21,13 @@ def normal_numbers() -> NDArray[np.float32]:
 
 
 def seed_of(rng: np.random.Generator) -> np.uint64:
-    """Draws the seed for the random numbers of one image."""
+    """Returns a seed for the random numbers of one image, sampled from `rng`."""
     return rng.integers(1 << 64, dtype=np.uint64)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def random_bits(seed, index):
-    """Returns 64 random bits at any index of the stream of a seed (SplitMix64; Steele, Lea & Flood 2014)."""
+    """Returns 64 random bits: element `index` of the sequence of `seed` (SplitMix64; Steele, Lea & Flood 2014)."""
     z = seed + index * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

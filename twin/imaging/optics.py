@@ -1,15 +1,18 @@
-"""Image formation in water: direct signal and backscatter of lamps and daylight.
+"""Image formation in water: light of the floor and backscatter of lamps and daylight.
 
 Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle
 (Jaffe 1990, McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
 
-    L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_sun) * exp(-c r)  +  B(r)
-    B(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds, summed over lamps and the sun
+    L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_day) * exp(-c r)  +  B(r)
+    B(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds + B_day(r), summed over lamps
 
 with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
-of the angle of incidence, E_sun the illuminance by daylight, psi_i the scattering angle, p the phase function, b the
-scattering coefficient and c the effective attenuation (`water.Medium`). The model has no free scale factors. Shadows,
-caustics and forward scatter are computed in other modules. Multiple scattering is neglected in the backscatter.
+of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`),
+psi_i the scattering angle, p the phase function, b the scattering coefficient and c = a + b the
+attenuation (`water.Medium`). The model has no free scale factors. For lamps, these equations describe single
+scattering. With multiple scattering, light that is scattered on its way arrives too: that of the lamps as a softer
+beam (`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists of softened beams
+and is blurred (`backscatter`). Shadows and caustics are computed in other modules.
 """
 
 from __future__ import annotations
@@ -22,11 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Image, StereoRig
+from twin.imaging.backscatter import backscatter_table, grid_of, grid_rays, table_range_m
+from twin.imaging.daylight import DaylightVeil, FloorDaylight, floor_daylight
+from twin.imaging.facets import FacetView
+from twin.imaging.forward_scatter import ForwardScatter, Place, place_of
 from twin.imaging.illumination import Illumination
-from twin.imaging.lamps import LightSources, beam_share, light_sources_in_camera
+from twin.imaging.lamp_light import LampLight, floor_tables
+from twin.imaging.lamps import beam_share, light_sources_in_camera
+from twin.imaging.materials import Material
 from twin.imaging.row_parallel import in_row_bands
-from twin.imaging.shading import PATH_MAX_M, PATH_STEP_M, RANGE_SCALE_M, shade
-from twin.imaging.water import Medium, phase_function
+from twin.imaging.shading import PATH_MAX_M, PATH_STEP_M, shade
+from twin.imaging.water import Medium
 from twin.scenario.model import LampConfig
 
 Array = NDArray[np.float64]
@@ -34,43 +43,84 @@ Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 Lit = NDArray[np.uint8]
 
-LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
-LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the direct signal
-BACKSCATTER_GRID, BACKSCATTER_RANGES, BACKSCATTER_SUBSTEPS = (16, 20), 48, 8
+LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the light of the floor
+ALBEDO_STEP_PX = 16  # spacing of the pixels from whose mean the albedo of the floor around the image is computed
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
 
 class WaterSurface(NamedTuple):
-    """The water surface above a camera: the caustics that it casts, and its position relative to the camera.
+    """The water surface above a camera: its caustics, and its position relative to the camera.
 
     Args:
         caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
             first row and column. None if daylight is uniform.
-        from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics` and depth below the
-            surface [m].
+        from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics`, which grow towards east
+            and north, and depth below the surface [m].
     """
 
     caustics: NDArray[np.float32] | None
     from_camera: Array
 
 
+class FloorView(NamedTuple):
+    """Properties of the floor that the shading of a camera needs besides its depth.
+
+    Args:
+        facets: triangles of the floor; None = the normals are computed from the depth.
+        lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; the sun may follow the lamps;
+            None = no shadows.
+        material: reflection of the unscattered light of lamps; None = Lambertian.
+    """
+
+    facets: FacetView | None = None
+    lit: Lit | None = None
+    material: Material | None = None
+
+
+class LightParts(NamedTuple):
+    """Parts of the light that reaches a camera, per colour band in photometric units [cd/m2]; (H, W, 3) float32 each.
+
+    Args:
+        direct: light of the floor that was not scattered between floor and camera.
+        forward: light of the floor that was scattered between floor and camera; None with single scattering.
+        backscatter: light that the water scattered into the camera without reflection by the floor.
+    """
+
+    direct: Radiance
+    forward: Radiance | None
+    backscatter: Radiance
+
+
 class _Tables(NamedTuple):
     """Lookup tables of the shading kernel (`shading.shade`) for one camera.
 
     Args:
-        beams: (lamps, n) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)) in [0, 1].
-        transmission: (3, n) exp(-c s) at even steps of the path length s.
-        backscatter: (rows, cols, 3, ranges) radiance on a coarse pixel grid, at even steps of
-            r / (r + `RANGE_SCALE_M`), with r the range.
+        beams: (lamps, n) intensity relative to that on the axis, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
+        all_light, scattered: (lamps, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; None with
+            single scattering.
+        transmission: (3, n) exp(-c s) at equal steps of the path length s.
+        backscatter: (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of
+            r / (r + `RANGE_SCALE_M`), with r the range; R, G, B and a zero.
     """
 
     beams: NDArray[np.float32]
+    all_light: NDArray[np.float32] | None
+    scattered: NDArray[np.float32] | None
     transmission: NDArray[np.float32]
     backscatter: NDArray[np.float32]
 
 
+class _Output(NamedTuple):
+    """Arrays that the shading kernel fills; the arguments of `shading.shade` with the same names."""
+
+    out: Radiance
+    other: Radiance | None = None
+    kept: NDArray[np.float32] | None = None
+    place: Place | None = None
+
+
 class Optics:
-    """Model of the direct signal and the backscatter that reach each camera, for R, G, B.
+    """Model of the light that reaches each camera, for R, G, B.
 
     Args:
         rig: the rendered cameras.
@@ -79,21 +129,33 @@ class Optics:
 
     Attributes:
         light_sources: lamps and daylight in the axes of the left and of the right camera.
+        lamp_light: light of the lamps in the water, in the axes of the left and of the right camera.
     """
 
     def __init__(self, rig: StereoRig, illumination: Illumination, lamps: Sequence[LampConfig]):
         self._rig, self._medium = rig, illumination.water
         daylight = illumination.daylight
         self.light_sources = [light_sources_in_camera(rig, lamps, daylight, camera) for camera in (0, 1)]
+        self.lamp_light = [LampLight(sources, self._medium) for sources in self.light_sources]
+        scatters = self._medium.multiple and bool(self._medium.scattering_per_m.any())
+        sunny = scatters and bool(daylight.surface_lx.any())
+        self._veil = DaylightVeil(daylight, self._medium, table_range_m()) if sunny else None
         # computed on demand, as some callers need one camera only
-        self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.light_sources[camera]))
-        self._surface_lx = daylight.surface_lx
-        self._loss_per_m = np.array([daylight.attenuation_per_m, self._medium.attenuation_per_m], np.float32)
-        level = np.array([[0.0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
+        self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
+        self._forward = ForwardScatter(rig, self._medium) if scatters else None
+        self._floor = np.empty((rig.height_px, rig.width_px, 3), np.float32) if scatters else None
+        self._place = np.empty(((rig.height_px + 1) // 2, (rig.width_px + 1) // 2), np.float32)
+        self._floor_daylight = floor_daylight(daylight, self._medium)
+        level = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
         self._calm_surface = WaterSurface(None, level)
 
     def radiance(
-        self, albedo: Image, depth: Depth, camera: int, lit: Lit | None = None, surface: WaterSurface | None = None
+        self,
+        albedo: Image,
+        depth: Depth,
+        camera: int,
+        floor: FloorView | None = None,
+        surface: WaterSurface | None = None,
     ) -> Radiance:
         """Returns the light (H, W, 3) float32 that reaches a camera, per colour band in photometric units [cd/m2].
 
@@ -101,63 +163,95 @@ class Optics:
             albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
-            lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; None = no shadows.
+            floor: facets, shadows and material of the floor; None = normals from the depth, no shadows,
+                Lambertian.
             surface: the water surface; None = a calm surface, for a camera that points straight down at the planned
-                altitude.
+                altitude, with east on its right.
         """
         out = np.empty(albedo.shape, np.float32)
-        self._run(albedo, depth, camera, lit, surface, (out, None))
+        if self._forward is None or self._floor is None:
+            self._run(albedo, depth, camera, floor, surface, _Output(out))
+        else:
+            target = _Output(self._floor, out, self._forward.kept, self._place)
+            self._run(albedo, depth, camera, floor, surface, target)
+            self._forward.add(self._floor, self._place, self.around(albedo, depth, camera, surface), out)
         return out
 
-    def split(
+    def parts(
         self,
         albedo: Image,
         depth: Depth,
         camera: int,
-        lit: Lit | None = None,
+        floor: FloorView | None = None,
         surface: WaterSurface | None = None,
-        direct: Radiance | None = None,
-    ) -> tuple[Radiance, Radiance]:
-        """Returns the direct signal and the backscatter, each (H, W, 3) float32 [cd/m2]; `radiance` returns their sum.
-
-        Args:
-            albedo, depth, camera, lit, surface: see `radiance`.
-            direct: (H, W, 3) float32 array to fill with the direct signal; None = a new array.
-        """
-        direct = np.empty(albedo.shape, np.float32) if direct is None else direct
-        backscatter = np.empty(albedo.shape, np.float32)
-        self._run(albedo, depth, camera, lit, surface, (direct, backscatter))
-        return direct, backscatter
+    ) -> LightParts:
+        """Returns the parts of the light that reaches a camera; their sum is `radiance`, with the same arguments."""
+        light, backscatter = self._floor_and_backscatter(albedo, depth, camera, floor, surface)
+        if self._forward is None:
+            return LightParts(light, None, backscatter)
+        range_m = range_of(depth, self._rig)
+        unscattered = np.exp(-self._medium.scattering_per_m * range_m[..., None])
+        forward = self._forward.spread(light, range_m, self.around(albedo, depth, camera, surface))
+        return LightParts((light * unscattered).astype(np.float32), forward, backscatter)
 
     def floor_lx(
-        self, depth: Depth, camera: int, lit: Lit | None = None, surface: WaterSurface | None = None
+        self, depth: Depth, camera: int, floor: FloorView | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
         """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where the transmission to the camera is too small.
 
-        It is computed from the direct signal of a white floor, divided by the transmission from floor to camera.
+        It is computed from the light of a white floor, divided by the transmission from floor to camera.
         """
-        white, _ = self.split(np.full((*depth.shape, 3), 255, np.uint8), depth, camera, lit, surface)
-        back = np.exp(-self._medium.attenuation_per_m * range_of(depth, self._rig)[..., None])
+        matt = None if floor is None else floor._replace(material=None)
+        white, _ = self._floor_and_backscatter(np.full((*depth.shape, 3), 255, np.uint8), depth, camera, matt, surface)
+        back = np.exp(-self._medium.camera_loss_per_m * range_of(depth, self._rig)[..., None])
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(back > LEAST_TRANSMISSION, np.pi * white / back, np.nan).astype(np.float32)
+
+    def around(
+        self, albedo: Image, depth: Depth, camera: int, surface: WaterSurface | None = None
+    ) -> tuple[Radiance, Place]:
+        """Returns the argument `around` of `ForwardScatter.add`, the light of the floor around the image."""
+        assert self._forward is not None
+        grid, plane = self._forward.surroundings, self._forward.plane(depth)
+        light = np.empty((*grid.shape, 3), np.float32)
+        mean = albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX].mean((0, 1)).round().astype(np.uint8)
+        white = np.broadcast_to(mean, light.shape)
+        self._run(white, plane, camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
+        return light, place_of(plane * self._forward.range_per_depth)
+
+    def _floor_and_backscatter(
+        self, albedo: Image, depth: Depth, camera: int, floor: FloorView | None, surface: WaterSurface | None
+    ) -> tuple[Radiance, Radiance]:
+        """Returns the light of the floor, attenuated by `Medium.camera_loss_per_m`, and the backscatter [cd/m2]."""
+        light, backscatter = np.empty(albedo.shape, np.float32), np.empty(albedo.shape, np.float32)
+        self._run(albedo, depth, camera, floor, surface, _Output(light, backscatter))
+        return light, backscatter
 
     def _run(
         self,
         albedo: Image,
         depth: Depth,
         camera: int,
-        lit: Lit | None,
+        floor: FloorView | None,
         surface: WaterSurface | None,
-        out: tuple[Radiance, Radiance | None],
+        out: _Output,
+        focal_px: float | None = None,
     ) -> None:
-        """Fills `out`: (radiance, None) or (direct signal, backscatter), arrays (H, W, 3) [cd/m2]."""
-        sources, focal = self.light_sources[camera], np.float32(self._rig.focal_px)
-        caustics, from_camera = self._calm_surface if surface is None else surface
-        sky = self._surface_lx.astype(np.float32), self._loss_per_m, caustics, np.asarray(from_camera, np.float32)
+        """Fills `out` by `shading.shade`; `focal_px` is the focal length of the image, None = that of the rig."""
+        sources, focal = self.light_sources[camera], np.float32(focal_px or self._rig.focal_px)
+        above = self._calm_surface if surface is None else surface
+        sky = _sky(self._floor_daylight, self._medium, above)
         lamps = np.column_stack([sources.position_m, sources.axis, sources.intensity_cd, sources.colour])
-        lamps, (beams, transmission, backscatter) = lamps.astype(np.float32), self._tables_of(camera)
-        scene = np.ascontiguousarray(albedo), depth, focal, lamps, beams, transmission, backscatter, sky
-        in_row_bands(lambda first, end: shade(*scene, out[0], lit, out[1], first, end), len(depth))
+        lamps, (beams, all_light, scattered, transmission, backscatter) = (
+            lamps.astype(np.float32), self._tables_of(camera)
+        )  # fmt: skip
+        if self._veil is not None:
+            rays = grid_rays(self._rig, grid_of(sources.beam)) @ _world_axes(above)
+            backscatter = backscatter + _with_a_zero(self._veil.radiance(rays, float(above.from_camera[2, 3])))
+        seen = FloorView() if floor is None else floor
+        soft = all_light if seen.lit is None and seen.material is None else scattered
+        scene = np.ascontiguousarray(albedo), depth, focal, lamps, beams, soft, transmission, backscatter, sky
+        in_row_bands(lambda first, end: shade(*scene, *seen, *out, first, end), len(depth))
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:
@@ -167,60 +261,42 @@ def range_of(depth: Depth, rig: StereoRig) -> Array:
     return depth.astype(np.float64) * np.sqrt(1 + x**2 + y[:, None] ** 2)
 
 
-def backscatter_per_m(sources: LightSources, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter added per metre of range: the integrand of B in the module docstring.
-
-    Args:
-        sources: lamps and daylight in the axes of the camera.
-        water: optical properties of the water.
-        ray: (..., 3) unit viewing direction in the axes of the camera.
-        range_m: (..., n) distances along the ray [m].
-
-    Returns:
-        (..., n, 3) radiance per metre of range, per colour band in photometric units [cd/m3].
-    """
-    scattering, attenuation = water.scattering_per_m, water.attenuation_per_m
-    points = ray[..., None, :] * range_m[..., None]
-    # Daylight is assumed to propagate along the optical axis, which points down.
-    phase = phase_function(-ray[..., 2], water.mean_cosine)[..., None, None]
-    day = sources.daylight.illuminance_lx * np.exp(-sources.daylight.attenuation_per_m * points[..., 2:])
-    total = day * phase * scattering * np.exp(-attenuation * range_m[..., None])
-    for position, axis, intensity, colour, beam in zip(*sources[:5], strict=True):
-        from_lamp = points - position
-        distance = np.maximum(np.linalg.norm(from_lamp, axis=-1), LAMP_RADIUS_M)
-        from_lamp /= distance[..., None]
-        strength = intensity * beam_share(from_lamp @ axis, beam) / distance**2
-        strength *= phase_function(-np.einsum("...nk,...k->...n", from_lamp, ray), water.mean_cosine)
-        transmission = np.exp(-attenuation * (distance + range_m)[..., None])
-        total = total + strength[..., None] * colour * scattering * transmission
-    return total
+def _world_axes(surface: WaterSurface) -> Array:
+    """Returns the directions east, north and up in the axes of the camera, as columns (3, 3)."""
+    rows = surface.from_camera[:, :3] / np.linalg.norm(surface.from_camera[:, :3], axis=1, keepdims=True)
+    return np.column_stack([rows[0], rows[1], -rows[2]])
 
 
-def _tables(rig: StereoRig, water: Medium, sources: LightSources) -> _Tables:
+def _sky(daylight: FloorDaylight, water: Medium, surface: WaterSurface) -> tuple:
+    """Returns the daylight as the argument `sky` of `shading.shade`."""
+    axes = _world_axes(surface)
+    turn = np.eye(4)
+    turn[:3, :3] = axes
+    q = turn @ daylight.rest_lx @ turn.T
+    pairs = [2 * q[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))]
+    form = np.stack([q[:, 0, 0], q[:, 1, 1], q[:, 2, 2], *pairs, q[:, 3, 3]], 1)
+    beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1)
+    fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m])
+    given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, water.camera_loss_per_m
+    arrays = [np.ascontiguousarray(value, np.float32) for value in given]
+    return *arrays, surface.caustics, np.asarray(surface.from_camera, np.float32)
+
+
+def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:
     """Returns the lookup tables for one camera."""
-    cosines = 1 - np.linspace(0.0, 1.0, BEAM_STEPS + 1) ** 2
+    cosines, sources = 1 - np.linspace(0.0, 1.0, BEAM_STEPS + 1) ** 2, lamps.sources
     beams = np.array([beam_share(cosines, beam) for beam in sources.beam]).reshape(-1, cosines.size)
-    backscatter = np.ascontiguousarray(np.moveaxis(_backscatter_table(rig, water, sources), -1, 2), np.float32)
-    return _Tables(beams.astype(np.float32), _transmission(water.attenuation_per_m), backscatter)
+    backscatter = _with_a_zero(backscatter_table(rig, water, lamps))
+    all_light, scattered = (floor_tables(sources, water, shadows) for shadows in (False, True))
+    transmission = _transmission(water.attenuation_per_m)
+    return _Tables(beams.astype(np.float32), all_light, scattered, transmission, backscatter)
+
+
+def _with_a_zero(table: Array) -> NDArray[np.float32]:
+    """Returns a table (..., 3) of R, G, B padded with a zero to (..., 4), so that an entry lies in one cache line."""
+    return np.concatenate([table, np.zeros((*table.shape[:-1], 1))], axis=-1).astype(np.float32)
 
 
 def _transmission(per_m: Array) -> NDArray[np.float32]:
-    """Returns the transmission (3, n) at even steps of path length, for attenuation coefficients `per_m` (3,)."""
+    """Returns the transmission (3, n) at equal steps of path length, for attenuation coefficients `per_m` (3,)."""
     return np.exp(-per_m[:, None] * np.arange(0.0, PATH_MAX_M, PATH_STEP_M)).astype(np.float32)
-
-
-def _backscatter_table(rig: StereoRig, water: Medium, sources: LightSources) -> Array:
-    """Returns the backscatter (rows, cols, ranges, 3) on a coarse grid of pixels and ranges; empty in clear water."""
-    if not water.scattering_per_m.any():
-        return np.zeros((0, 0, 0, 3))
-    rows, cols = BACKSCATTER_GRID
-    u, v = np.meshgrid(np.linspace(0, rig.width_px - 1, cols), np.linspace(0, rig.height_px - 1, rows))
-    ray = np.stack([(u - rig.cx_px) / rig.focal_px, (v - rig.cy_px) / rig.focal_px, np.ones_like(u)], -1)
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    # Midpoints of even steps of x = r / (r + scale), which reaches infinite range at x = 1; dr/dx = scale / (1 - x)^2.
-    n = BACKSCATTER_RANGES * BACKSCATTER_SUBSTEPS
-    x = (np.arange(n) + 0.5) / n
-    per_x = RANGE_SCALE_M / (1 - x) ** 2
-    light = backscatter_per_m(sources, water, ray, np.broadcast_to(RANGE_SCALE_M * x / (1 - x), (rows, cols, n)))
-    steps = (light * per_x[:, None] / n).reshape(rows, cols, BACKSCATTER_RANGES, BACKSCATTER_SUBSTEPS, 3).sum(3)
-    return np.concatenate([np.zeros((rows, cols, 1, 3)), steps.cumsum(2)], axis=2)

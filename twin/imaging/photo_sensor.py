@@ -13,8 +13,10 @@ from twin.core.records import Image, StereoRig
 from twin.imaging.photons import electrons_per_cd, vignetting
 from twin.imaging.pixels import PixelResponse, Raw, read_out
 from twin.imaging.row_parallel import in_row_bands
-from twin.imaging.sensor import Array, AutoExposure, Depth, ExposureSetting, PlainSensor, Radiance
-from twin.imaging.shutter import apply_rolling_shutter, blur_by_motion
+from twin.imaging.sensor import Array, AutoExposure, ExposureSetting, PlainSensor, Radiance
+from twin.imaging.shutter import ExposureMotion
+from twin.imaging.tone import linear_of, tone
+from twin.imaging.white_balance import WhiteBalance
 from twin.scenario.model import Scenario, SensorConfig
 
 BLACK_SHARE = 1 / 64  # black level as a fraction of full scale, so that dark noise is not clipped at zero
@@ -23,19 +25,19 @@ BLACK_SHARE = 1 / 64  # black level as a fraction of full scale, so that dark no
 class Sensor(Protocol):
     """Interface of the sensor model that both cameras share."""
 
-    def meter(self, light: Radiance) -> ExposureSetting: ...
+    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting: ...
 
-    def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance: ...
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None: ...
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image: ...
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns a scenario's sensor in its initial state: physical if section [sensor] is given, otherwise plain.
+    """Returns a scenario's sensor in its initial state: `PhotoSensor` with a section [sensor], else `PlainSensor`.
 
     Args:
         scenario: survey scenario.
-        raw_rig: rig with the size and focal length of the raw images; None = the rig of the frames.
+        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
@@ -45,6 +47,11 @@ class PhotoSensor:
 
     At the limits of exposure time and gain, images become dark or saturate. Auto-exposure meters the radiance, not
     the image, so it does not oscillate if an image saturates.
+
+    Args:
+        scenario: survey scenario.
+        sensor: section [sensor] of the scenario.
+        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -54,57 +61,69 @@ class PhotoSensor:
         self._electrons_per_cd_s = electrons_per_cd(sensor, scenario.port.water_index)
         top, self._black_dn = float((1 << sensor.bits) - 1), float(round(BLACK_SHARE * (1 << sensor.bits)))
         self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
-        self._white = self._electrons_per_cd_s.max() / self._electrons_per_cd_s
-        self._tones = self._tone_table()
+        self._white = WhiteBalance(scenario, self._electrons_per_cd_s)
         # signal per second at 1 cd/m2 and gain 1 in the most sensitive band; white balance amplifies the others
         self._signal_per_s = float(self._electrons_per_cd_s.max()) / sensor.full_well_e
         self._shortest_s, self._longest_s = sensor.exposure_min_ms / 1000, sensor.exposure_max_ms / 1000
         self._most_gain = 10 ** (sensor.gain_max_db / 20)
         limits = self._signal_per_s * self._shortest_s, self._signal_per_s * self._longest_s * self._most_gain
-        gray_level = scenario.imaging.gray_level
+        gray_level = linear_of(scenario.imaging.gray_level, sensor.tone_curve)
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
-    def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames."""
-        gain = self._exposure.gain_for(float(_weighted_mean(light, self._vignetting).max()))
-        product_s = gain / self._signal_per_s
-        exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
-        return ExposureSetting(gain, exposure_s, min(max(product_s / exposure_s, 1.0), self._most_gain))
-
-    def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
-        """Returns the radiance (H, W, 3) recorded by the moving camera, with rolling shutter and motion blur.
+    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
+        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames.
 
         Args:
-            light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
-            depth: (H, W) depth in the same image [m].
+            light: (h, w, 3) radiance of every n-th raw pixel along columns and rows.
+            every_px: the number n.
+        """
+        weights = (
+            self._vignetting
+            if every_px == 1
+            else np.ascontiguousarray(self._vignetting[every_px // 2 :: every_px, every_px // 2 :: every_px])
+        )
+        mean = _weighted_mean(light, weights)
+        white = self._white.factors(mean, self._exposure.share)
+        gain = self._exposure.gain_for(float((mean * self._white.relative(white)).max()))
+        product_s = gain / self._signal_per_s
+        exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
+        amplification = min(max(product_s / exposure_s, 1.0), self._most_gain)
+        balance = None if self._white.is_of_white_light else (white[0], white[1], white[2])
+        return ExposureSetting(gain, exposure_s, amplification, balance)
+
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
+        """Returns the motion of a camera during its exposure; None if it has no effect on the image.
+
+        Args:
             twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
             setting: exposure of this frame.
+            n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor.
         """
-        if not twist.any():
-            return light
-        if self._sensor.readout_ms:
-            row_ratio = (light.shape[0] - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
-            readout_s = row_ratio * self._sensor.readout_ms / 1000
-            light = apply_rolling_shutter(light, depth, self._focal_px, twist, readout_s)
-        if not self._sensor.motion_blur:
-            return light
-        return blur_by_motion(light, depth, self._focal_px, twist, setting.exposure_s)
+        row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
+        readout_s = row_ratio * self._sensor.readout_ms / 1000
+        exposure_s = setting.exposure_s if self._sensor.motion_blur else 0.0
+        return ExposureMotion(twist, exposure_s, readout_s) if twist.any() and (readout_s or exposure_s) else None
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
         """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
-        return self.develop(self.raw(light, setting, rng))
+        return self.develop(self.raw(light, setting, rng), setting.white)
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
         """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""
         return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
 
-    def develop(self, raw: Raw) -> Image:
+    def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
         """Returns the 8-bit RGB image (H, W, 3) of a raw image.
 
-        Subtracts the black level, applies a white balance for clear water and demosaics; the tone curve is linear.
+        Subtracts the black level, applies white balance and tone curve, and demosaics.
+
+        Args:
+            raw: digital numbers.
+            white: factors of R, G, B; None = those of white light.
         """
         toned = np.empty(raw.shape, np.uint8)
-        bands = raw.reshape(*raw.shape[:2], -1), self._tones, toned.reshape(*raw.shape[:2], -1)
+        tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))
+        bands = raw.reshape(*raw.shape[:2], -1), tones, toned.reshape(*raw.shape[:2], -1)
         in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw))
         if raw.ndim == 3:
             return toned
@@ -118,10 +137,10 @@ class PhotoSensor:
             self._dn_per_e * setting.analogue_gain, self._black_dn, self._top_dn,
         )  # fmt: skip
 
-    def _tone_table(self) -> NDArray[np.uint8]:
+    def _tone_table(self, white: Array) -> NDArray[np.uint8]:
         """Returns the tone table (3, 2^bits): the 8-bit value of each digital number in each band."""
         signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
-        return np.clip(255 * self._white[:, None] * signal + 0.5, 0, 255).astype(np.uint8)
+        return np.clip(255 * tone(white[:, None] * signal, self._sensor.tone_curve) + 0.5, 0, 255).astype(np.uint8)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})

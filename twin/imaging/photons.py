@@ -1,15 +1,15 @@
 """Radiometry of lens and pixel: photons and electrons per unit of luminance, and vignetting.
 
-Light has three bands. The radiance of a band is given as the luminance [cd/m2] of white light with this radiance in
-the band: a white floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE illuminant E).
-A band is 100 nm wide; its centre is the wavelength lambda for which the water properties are given. In each band, one
-lux of white light yields, per second and square metre,
+Light has three bands (`bands`). The radiance of a band is given as the luminance [cd/m2] of white light with this
+radiance in the band: a white floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE
+illuminant E). In each band, one lux of white light yields, per second and square metre,
 
-    photons = width lambda / (h c Km Y),    Y = integral of V over wavelength
+    photons = integral of S lambda / (h c Km Y) over wavelength,    Y = integral of V over wavelength
 
-with h Planck's constant, c the speed of light, Km = 683 lm/W the luminous efficacy at 555 nm, and V the photopic
-luminous efficiency function (CIE 1924; Y = 106.857 nm). Using the luminous efficacy at lambda instead would describe
-the light of three lasers, under which a white floor looks violet.
+with S the sensitivity of the band relative to its largest, lambda the wavelength, h Planck's constant, c the speed of
+light, Km = 683 lm/W the luminous efficacy at 555 nm, and V the photopic luminous efficiency function (CIE 1924;
+Y = 106.857 nm). Using the luminous efficacy at the centre of each band instead would describe the light of three
+lasers, under which a white floor looks violet.
 
 On the axis of a lens of f-number N, focused at infinity, the illuminance of the sensor is
 
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
+from twin.imaging.bands import NM, sensitivity
 from twin.scenario.model import SensorConfig
 
 Array = NDArray[np.float64]
@@ -33,14 +34,15 @@ Array = NDArray[np.float64]
 PLANCK_J_S, LIGHT_M_S = 6.62607015e-34, 299792458.0
 LUMENS_PER_WATT = 683.0
 LUMINOUS_EFFICIENCY_NM = 106.857  # integral of V over wavelength
-BAND_NM = (650.0, 550.0, 450.0)  # centres of the bands R, G, B, as in the table of water types
-BAND_WIDTH_NM = 100.0
 
 
 def photons_per_lux() -> Array:
-    """Returns the number of photons of white light per lux, square metre and second, for R, G, B (3,) [1/(lx m2 s)]."""
-    watts_per_m2 = BAND_WIDTH_NM / (LUMENS_PER_WATT * LUMINOUS_EFFICIENCY_NM)
-    return watts_per_m2 * np.array(BAND_NM) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
+    """Returns the photons of white light per lux, square metre and second in the bands R, G, B (3,) [1/(lx m2 s)].
+
+    Each photon is weighted with the sensitivity of the band relative to its largest.
+    """
+    watts_per_nm = 1 / (LUMENS_PER_WATT * LUMINOUS_EFFICIENCY_NM)  # per square metre
+    return watts_per_nm * (sensitivity() * NM).sum(1) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)  # in steps of 1 nm
 
 
 def electrons_per_cd(sensor: SensorConfig, water_index: float) -> Array:

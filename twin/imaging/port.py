@@ -1,12 +1,14 @@
 """Ports of a camera housing: refraction of rays at the inner and outer face of the glass (Snell's law).
 
 All quantities are in the axes of the camera with the entrance pupil of the lens as origin; the housing is filled with
-air of refractive index 1. Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a
-ray at a small angle leaves the outer face at height h and angle w, both proportional to its angle in air. The pinhole
-lies at a distance h / w from that face, on the side of the camera, and its focal length is that of the lens times the
-ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g, in water of index n,
-the pinhole lies d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that of the lens.
-Treibitz et al. 2012 (doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
+air of refractive index 1. A ray of direction (X, Y, Z) in air is described by its normalised coordinates X / Z, Y / Z.
+
+Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a ray at a small angle
+leaves the outer face at height h and angle w, both proportional to its angle in air. The pinhole lies at a distance
+h / w from that face, on the side of the camera, and its focal length is that of the lens times the ratio of the angles
+in air and in water. For a flat pane at distance d, of thickness t and index g, in water of index n, the pinhole lies
+d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that of the lens. Treibitz et al. 2012
+(doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
-STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: maximum steps; finite difference, tolerance (tangents)
+STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: maximum steps; finite difference and tolerance of X / Z
 SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
@@ -47,16 +49,16 @@ def pinhole(port: PortConfig) -> Pinhole:
     return Pinhole(float(z - x * along_z / along_x), float(SMALL_RAD * along_z / along_x))
 
 
-def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
-    """Returns origin on the outer face [m] and unit direction in water, both (..., 3), of rays with tangents in air.
+def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
+    """Returns the origin on the outer face [m] and the unit direction in water of rays, both (..., 3).
 
     NaN where a ray misses the port or is totally reflected. Without a port, rays start at the entrance pupil.
 
     Args:
         port: geometry and refractive indices.
-        tangents: (..., 2) tangents of the rays in air.
+        normalised: (..., 2) normalised coordinates X / Z, Y / Z of the rays in air.
     """
-    ray = np.concatenate([tangents, np.ones_like(tangents[..., :1])], axis=-1)
+    ray = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     start = np.zeros_like(ray)
     if port.kind == "none":
@@ -68,32 +70,32 @@ def water_rays(port: PortConfig, tangents: Array) -> tuple[Array, Array]:
     return outer, refract(ray, normal, port.glass_index / port.water_index)
 
 
-def air_tangents(port: PortConfig, points_m: Array) -> Array:
-    """Returns the tangents (..., 2) in air of the rays that reach points (..., 3) [m]; NaN where no ray does.
+def air_coordinates(port: PortConfig, points_m: Array) -> Array:
+    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where no ray exists.
 
     Inverse of `water_rays` by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
     monotonic, because the angle in air grows faster than the angle in water.
     """
-    tangents = points_m[..., :2] / points_m[..., 2:]
+    normalised = points_m[..., :2] / points_m[..., 2:]
     if port.kind == "none":
-        return tangents
+        return normalised
     equivalent = pinhole(port)
-    tangents = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
+    normalised = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
 
     def miss(at: Array) -> Array:
-        """Returns the lateral offset (..., 2) of the rays from the points at their depth, divided by the depth."""
+        """Returns the lateral distance (..., 2) from the points to the rays at the same depth, divided by the depth."""
         origin, direction = water_rays(port, at)
         along = (points_m[..., 2:] - origin[..., 2:]) / direction[..., 2:]
         return (origin + along * direction - points_m)[..., :2] / points_m[..., 2:]
 
     for _ in range(STEPS):
-        residual = miss(tangents)
+        residual = miss(normalised)
         if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
             break
-        columns = [(miss(tangents + step) - residual) / STEP for step in STEP * np.eye(2)]
-        tangents = tangents - solve(np.stack(columns, axis=-1), residual)
-    converged = np.abs(miss(tangents)).max(axis=-1) < 100 * TOLERANCE
-    return np.where(converged[..., None], tangents, np.nan)
+        columns = [(miss(normalised + step) - residual) / STEP for step in STEP * np.eye(2)]
+        normalised = normalised - solve(np.stack(columns, axis=-1), residual)
+    converged = np.abs(miss(normalised)).max(axis=-1) < 100 * TOLERANCE
+    return np.where(converged[..., None], normalised, np.nan)
 
 
 def refract(ray: Array, normal: Array, ratio: float) -> Array:

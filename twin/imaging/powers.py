@@ -11,7 +11,7 @@ LEAST = -126.0  # exponent of the smallest normal number in single precision; sm
 
 @njit(cache=True, nogil=True, inline="always")
 def two_to(t):
-    """Returns 2^t for t up to 127 with a relative error of 2e-7; exactly 1 at 0.
+    """Returns 2^t for t from -126 to 127 with a relative error of 2e-7, exactly 1 at 0; a smaller t counts as -126.
 
     2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is a minimax polynomial, 2^n sets the bits of a float32.
     """

@@ -97,7 +97,7 @@ class Renderer:
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the visible tiles; hidden tiles lose their mesh, as a geom without a mesh costs almost no time."""
+        """Shows only the visible tiles; removes the mesh of the others, as geoms without a mesh take almost no time."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible
@@ -131,7 +131,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the tiles that may be in view; the others lie outside one side of the view frustum.
+    """Returns a mask (n,) of the tiles that may be in view; each other tile lies outside a plane of the view frustum.
 
     Args:
         scene: MuJoCo model of the scene.

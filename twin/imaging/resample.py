@@ -20,8 +20,9 @@ Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [
 
 REACH_PX = 2  # support of the spline to each side
 POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
+TAPS = 10  # pixels to each side in the prefilter of rows; POLE^10 is 2e-6
 INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
-INTERSECTION_PX = 1e-3  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
+INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
@@ -44,7 +45,7 @@ def interpolate(image: Image, positions: Positions) -> Image:
 
 def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
     out = np.empty((*positions.shape[:2], 3), np.float32)
-    in_row_bands(lambda first, end: _sample(source, positions, out, first, end), len(positions))
+    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
     return out
 
 
@@ -75,8 +76,8 @@ def _weights(t):
     return a, b, np.float32(1.0) - a - b - d, d
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sample(source, positions, out, first, end):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _fill_from(source, positions, out, first, end):
     """Fills rows `first` to `end` of `out` (h, w, 3) from `source` (H, 3 W)."""
     rows, cols = source.shape[0], source.shape[1] // 3
     for v in range(first, end):
@@ -84,15 +85,30 @@ def _sample(source, positions, out, first, end):
             x, y = positions[v, u, 0], positions[v, u, 1]
             col, row = int(np.floor(x)), int(np.floor(y))
             wx, wy = _weights(x - np.float32(col)), _weights(y - np.float32(row))
-            a, b = 3 * min(max(col - 1, 0), cols - 1), 3 * min(max(col, 0), cols - 1)
-            c, d = 3 * min(max(col + 1, 0), cols - 1), 3 * min(max(col + 2, 0), cols - 1)
-            red = green = blue = np.float32(0.0)
-            for j in range(4):
-                line = source[min(max(row - 1 + j, 0), rows - 1)]
-                red += wy[j] * (wx[0] * line[a] + wx[1] * line[b] + wx[2] * line[c] + wx[3] * line[d])
-                green += wy[j] * (wx[0] * line[a + 1] + wx[1] * line[b + 1] + wx[2] * line[c + 1] + wx[3] * line[d + 1])
-                blue += wy[j] * (wx[0] * line[a + 2] + wx[1] * line[b + 2] + wx[2] * line[c + 2] + wx[3] * line[d + 2])
-            out[v, u, 0], out[v, u, 1], out[v, u, 2] = red, green, blue
+            if 0 < col < cols - 2 and 0 < row < rows - 2:
+                weighted_sum(source, row - 1, row, row + 1, row + 2, 3 * (col - 1), wx, wy, out[v, u])
+                continue
+            for band in range(3):
+                total = np.float32(0.0)
+                for j in range(4):
+                    line = source[min(max(row - 1 + j, 0), rows - 1)]
+                    for i in range(4):
+                        total += wy[j] * wx[i] * line[3 * min(max(col - 1 + i, 0), cols - 1) + band]
+                out[v, u, band] = total
+
+
+@njit(cache=True, nogil=True, inline="always")
+def weighted_sum(image, a, b, c, d, at, across, down, out):
+    """Writes to `out` (3,) the weighted sum of 4 x 4 pixels of an image (H, 3 W): rows a to d, from element `at` on."""
+    above, here, below, last = image[a], image[b], image[c], image[d]
+    k, three = np.uint64(at), np.uint64(3)
+    for band in range(3):
+        total = np.float32(0.0)
+        i = k + np.uint64(band)
+        for j in range(4):
+            total += across[j] * (down[0] * above[i] + down[1] * here[i] + down[2] * below[i] + down[3] * last[i])
+            i += three
+        out[band] = total
 
 
 @njit(cache=True, nogil=True)
@@ -131,11 +147,43 @@ def _filter_columns(image, first, end):
             here[k] = pole * (after[k] - np.float32(6.0) * here[k])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def _filter_rows(image, first, end):
-    """Same as `_filter_columns`, but for rows `first` to `end` of an image (H, 3 W)."""
+    """Same as `_filter_columns`, but for rows `first` to `end` of an image (H, 3 W).
+
+    The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
+    |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the last pixel.
+    """
+    n = image.shape[1]
+    width = n // 3
+    wide = np.empty(n + 6 * TAPS, np.float32)
+    pole = np.float32(POLE)
+    middle_weight = np.float32(-6.0) * pole / (np.float32(1.0) - pole * pole)
     for v in range(first, end):
-        _filter_columns(image[v].reshape(-1, 3), 0, 3)
+        row = image[v]
+        wide[3 * TAPS : 3 * TAPS + n] = row
+        for i in range(1, TAPS + 1):
+            before, after = _mirrored(-i, width), _mirrored(width - 1 + i, width)
+            for band in range(3):
+                wide[3 * (TAPS - i) + band] = row[3 * before + band]
+                wide[3 * (TAPS + width - 1 + i) + band] = row[3 * after + band]
+        middle = wide[3 * TAPS : 3 * TAPS + n]
+        for k in range(n):
+            row[k] = middle_weight * middle[k]
+        weight = middle_weight
+        for i in range(1, TAPS + 1):
+            weight *= pole
+            left, right = wide[3 * (TAPS - i) : 3 * (TAPS - i) + n], wide[3 * (TAPS + i) : 3 * (TAPS + i) + n]
+            for k in range(n):
+                row[k] += weight * (left[k] + right[k])
+
+
+@njit(cache=True, nogil=True)
+def _mirrored(at, size):
+    """Returns the position of a pixel in an image that is mirrored at the centres of its first and last pixel."""
+    period = max(2 * (size - 1), 1)
+    at = abs(at) % period
+    return min(at, period - at) if size > 1 else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -146,8 +194,10 @@ def _intersect(near, positions, parallax, out, first, end):
     """
     rows, cols = near.shape
     for v in range(first, end):
+        inverse = near[v * rows // len(out), 0]
         for u in range(out.shape[1]):
-            x, y = positions[v, u, 0], positions[v, u, 1]
+            x = positions[v, u, 0] + parallax[v, u, 0] * inverse  # start from the inverse depth at the last pixel
+            y = positions[v, u, 1] + parallax[v, u, 1] * inverse
             for _ in range(INTERSECTION_STEPS):
                 col = min(max(int(np.floor(x)), 0), cols - 2)
                 row = min(max(int(np.floor(y)), 0), rows - 2)

@@ -11,17 +11,18 @@ THREADS = 2  # with more threads, synchronization costs more than it gains: an i
 LEAST_ROWS = 32  # smallest band; for fewer rows, starting a thread costs more than the work
 
 
-def in_row_bands(work: Callable[[int, int], None], n_rows: int, pixels: int = 1) -> None:
+def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: int = 1) -> None:
     """Runs `work(first_row, end_row)` over all rows, in parallel if the image is large and processors are available.
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
         n_rows: number of rows.
-        pixels: number of image rows that each processed row represents.
+        rows_per_row: number of image rows that each processed row represents.
+
     Raises:
         Exception: any exception that `work` raises in any band.
     """
-    if n_rows * pixels < THREADS * LEAST_ROWS or _n_processors() < THREADS:
+    if n_rows * rows_per_row < THREADS * LEAST_ROWS or _n_processors() < THREADS:
         work(0, n_rows)
         return
     cuts = [n_rows * k // THREADS for k in range(THREADS + 1)]

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from twin.core.records import Image
 from twin.imaging.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.row_parallel import in_row_bands
+from twin.imaging.shutter import ExposureMotion
 from twin.scenario.model import ImagingConfig, Scenario
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
-Depth = NDArray[np.float32]
 
 EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
 
@@ -38,6 +38,8 @@ class AutoExposure:
         frame_rate_hz: frames per second.
         lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
         limits: smallest and largest gain [1 / (cd/m2)].
+    Attributes:
+        share: fraction by which log gain approaches its target per frame.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class AutoExposure:
         limits: tuple[float, float] = (0.0, math.inf),
     ):
         self._gray_level = gray_level
-        self._share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
+        self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
         self._limits = limits
         self._log_gain: float | None = None
 
@@ -62,7 +64,7 @@ class AutoExposure:
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
         metered = float(np.log(wanted))
         log_gain = metered if self._log_gain is None else self._log_gain
-        self._log_gain = log_gain + self._share * (metered - log_gain)
+        self._log_gain = log_gain + self.share * (metered - log_gain)
         return float(np.exp(log_gain))
 
 
@@ -73,11 +75,13 @@ class ExposureSetting(NamedTuple):
         gain: image signal per unit of radiance on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
         exposure_s: exposure time; 0 for a sensor without motion blur.
         analogue_gain: amplification before digitization.
+        white: (3,) factors of R, G, B by the white balance of a sensor; None = those of white light.
     """
 
     gain: float
     exposure_s: float = 0.0
     analogue_gain: float = 1.0
+    white: tuple[float, float, float] | None = None
 
 
 class PlainSensor:
@@ -87,13 +91,13 @@ class PlainSensor:
         self._imaging = scenario.imaging
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
-    def meter(self, light: Radiance) -> ExposureSetting:
+    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
         """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames."""
         return ExposureSetting(self._exposure.gain(light))
 
-    def integrate(self, light: Radiance, depth: Depth, twist: Array, setting: ExposureSetting) -> Radiance:
-        """Returns `light` unchanged, as the exposure time is zero."""
-        return light
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
+        """Returns None: the exposure time is zero."""
+        return None
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
         """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""

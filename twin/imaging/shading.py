@@ -10,74 +10,157 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from twin.imaging.facets import UNIT
+from twin.imaging.materials import add_reflected
 from twin.imaging.powers import LOG2_E, two_to
 
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the transmission tables
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
-RANGE_SCALE_M = 2.0  # scale of the backscatter table, whose steps are even in r / (r + scale), with r the range
+RANGE_SCALE_M = 2.0  # scale of the backscatter table, with equal steps of r / (r + scale), r the range
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def shade(albedo, depth, focal, lamps, beams, transmission, scatter_table, sky, out, lit, scatter_out, first, end):
-    """Fills rows `first` to `end` of `out` (H, W, 3) with radiance.
+def shade(
+    albedo, depth, focal, lamps, beams, soft, transmission, scatter_table, sky, facets, lit, material, out, other, kept,
+    place, first, end,
+):  # fmt: skip
+    """Fills rows `first` to `end` of `out` (H, W, 3) with the light of the floor, and of `other` with the rest.
 
-    If `scatter_out` (H, W, 3) is given, the backscatter is written to it instead of being added to `out`. The compiler
-    removes the code for arguments that are None.
+    The compiler removes the code for arguments that are None.
 
     Args:
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)), 0 to 1.
+        soft: (n, k, l, 4) light of each lamp on the floor, at even steps of sqrt(1 - cos(angle)) and, for a distance d,
+            of d / (d + scale): with shadows or a material, the scattered light alone, else all light; None with single
+            scattering.
         transmission: (3, m) transmission at even steps of path length.
-        scatter_table: (rows, cols, 3, ranges) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
-        sky: illuminance just below the surface (3,) [lx]; attenuation with depth and with range from the camera (2, 3)
-            [1/m]; caustics (m + 1, m + 1) or None; (3, 4) map from a point in the camera axes to column and row in the
-            caustics and depth below the surface.
-        lit: (n, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no shadows.
+        scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
+        sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], light of the sky (3, 10) [lx]
+            and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy, zz,
+            2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and range of the fit (3,) [m]; attenuation with
+            range from the camera (3,) [1/m]; caustics (m + 1, m + 1) or None; (3, 4) map from a point in the camera
+            axes to column and row in the caustics and depth below the surface.
+        facets: triangles of the floor (`facets.FacetView`); None = normals from the depth.
+        lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no
+            shadows.
+        material: reflection of the unscattered light of lamps (`materials.Material`); None = Lambertian.
+        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale); None
+            without blur.
+        place: array to fill with the fractional row of `kept` for every second pixel of every second row.
+        other: (H, W, 3) image for the backscatter, to which the share `kept` of the light of the floor is added; if it
+            is None, the backscatter is added to `out`.
     """
     height, width = depth.shape
-    rows, cols, _, ranges = scatter_table.shape
-    daylight, loss, caustics, surface = sky
+    rows, cols, ranges, _ = scatter_table.shape
+    to_sun, beam, diffuse, change, fitted, loss, caustics, surface = sky
     range_m, normal = np.empty(width, np.float32), np.empty((3, width), np.float32)
     lamp, light = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
-    backscatter, dark = np.zeros((3, width), np.float32), np.zeros((3, width), np.float32)
+    backscatter, reflected = np.zeros((3, width), np.float32), np.zeros((3, width), np.float32)
+    arriving = np.empty((3, width), np.float32)
     cells, parts = np.empty((2, width), np.int32), np.empty((2, width), np.float32)
     lookup = cells[0], cells[1], parts[0], parts[1]
-    row_table = np.empty((cols, 3, ranges), np.float32)
-    sunny = daylight.max() > 0
+    row_table = np.empty((cols, ranges, 4), np.float32)
+    sunny = beam[:, 0].max() > 0 or diffuse.max() > 0
     for v in range(first, end):
         y = (np.float32(v) - np.float32(0.5) * np.float32(height - 1)) / focal
-        _range_and_normal(depth, v, y, focal, range_m, normal)
+        if facets is None:
+            _range_and_normal(depth, v, y, focal, range_m, normal)
+        else:
+            _range_and_facet_normal(facets, depth[v], y, focal, cells, range_m, normal)
         light[:] = np.float32(0.0)
-        if sunny:
-            _sample_caustics(depth[v], y, focal, caustics, surface, lookup, lamp[0])
-            _add_daylight(depth[v], y, focal, daylight, loss, surface, range_m, lamp[0], light)
+        if material is not None:
+            reflected[:] = np.float32(0.0)
         for k in range(lamps.shape[0]):
             _illuminate(lamps[k], depth[v], y, focal, normal, lamp)
+            if soft is not None:
+                _add_soft_lamp(lamps[k], soft[k], lamp, lookup, light)
             if lit is not None:
                 for u in range(width):
                     lamp[0, u] = lamp[0, u] if lit[k, v, u] else np.float32(0.0)
-            _add_lamp(lamps[k], beams[k], transmission, range_m, lamp, lookup, light)
+            if material is not None:
+                arriving[:] = np.float32(0.0)
+                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, arriving)
+                add_reflected(material, lamps[k], albedo[v], depth[v], y, focal, normal, arriving, reflected)
+            elif lit is not None:
+                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
+            elif soft is None:
+                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
+        if lamps.shape[0]:
+            _attenuate(loss, range_m, light)
+            if material is not None:
+                _attenuate(loss, range_m, reflected)
+        if sunny:
+            _sample_caustics(depth[v], y, focal, caustics, surface, lookup, lamp[0])
+            _face_sun(depth[v], y, focal, to_sun, surface, normal, lamp)
+            if lit is not None and lit.shape[0] > lamps.shape[0]:
+                for u in range(width):
+                    lamp[1, u] = lamp[1, u] if lit[lamps.shape[0], v, u] else np.float32(0.0)
+            _add_daylight((beam, diffuse, change, fitted, loss), normal, range_m, lamp, light)
         if ranges:
             _interpolate_rows(scatter_table, np.float32(v) * np.float32(rows - 1) / np.float32(height - 1), row_table)
             _interpolate_backscatter(row_table, range_m, lookup, backscatter)
-        if scatter_out is None:
-            _reflect(albedo[v], light, backscatter, out[v])
+        if other is None:
+            if material is None:
+                _reflect(albedo[v], light, backscatter, out[v])
+            else:
+                reflected += backscatter
+                _reflect(albedo[v], light, reflected, out[v])
         else:
-            _reflect(albedo[v], light, dark, out[v])
-            of_row = scatter_out[v].reshape(-1)
-            for u in range(width):
-                red, green, blue = backscatter[0, u], backscatter[1, u], backscatter[2, u]
-                of_row[3 * u], of_row[3 * u + 1], of_row[3 * u + 2] = red, green, blue
+            _reflect(albedo[v], light, reflected, out[v])
+            _join(out[v], v, kept, place, range_m, backscatter, lookup, other[v])
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _range_and_facet_normal(facets, here, y, focal, cells, range_m, normal):
+    """Computes range and unit normal (3, W) of the facets in a row of pixels; the normals point up in the world.
+
+    Args:
+        facets: `facets.FacetView`; its docstring defines the stored normals that are unpacked here.
+        cells: (2, W) int32 working memory.
+    """
+    normals, origin, grid, turn = facets
+    rows, cols, _ = normals.shape
+    zero, one, two, half, far = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5), np.float32(FAR_M)
+    west, south = -np.float32(origin[0]), -np.float32(origin[1])
+    east, north = west + np.float32(cols - 1), south + np.float32(rows - 1)
+    per_x, per_z, shift = grid[:, 0].copy(), grid[:, 1] * y + grid[:, 2], grid[:, 3].copy()
+    col_x, row_x, col_z, row_z, col_0, row_0 = per_x[0], per_x[1], per_z[0], per_z[1], shift[0], shift[1]
+    per_row, first = np.float32(2 * cols), np.float32(2 * (np.int64(origin[1]) * cols + origin[0]))
+    for u in range(here.size):
+        z = here[u] if here[u] < far else zero
+        x = (np.float32(u) - half * np.float32(here.size - 1)) / focal
+        col, row = z * (col_x * x + col_z) + col_0, z * (row_x * x + row_z) + row_0
+        c, r = min(max(np.floor(col), west), east), min(max(np.floor(row), south), north)
+        north_west = zero if col - c >= row - r else one
+        cells[0, u] = np.int32(r * per_row + (two * c + north_west) + first)  # exact: there are fewer than 2^24 facets
+        range_m[u] = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else far
+    flat = normals.reshape(-1)
+    for u in range(here.size):
+        cells[1, u] = flat[np.uint32(cells[0, u])]
+    bits, unit = np.int32(16), one / np.float32(UNIT)
+    t00, t01, t02, t10, t11, t12 = turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1], turn[1, 2]
+    t20, t21, t22 = turn[2, 0], turn[2, 1], turn[2, 2]
+    for u in range(here.size):
+        stored = cells[1, u]
+        high, low = np.int32(stored >> bits), np.int32(np.int32(stored << bits) >> bits)
+        a, b = np.float32(high) * unit, np.float32(low) * unit
+        square = a * a + b * b
+        per_n = one / (one + square)
+        nx, ny, nz = two * a * per_n, two * b * per_n, (one - square) * per_n
+        normal[0, u] = t00 * nx + t01 * ny + t02 * nz
+        normal[1, u] = t10 * nx + t11 * ny + t12 * nz
+        normal[2, u] = t20 * nx + t21 * ny + t22 * nz
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
     """Computes range and unit normal (3, W) of the floor in a row of pixels; the normal points towards the camera.
 
-    The normal is computed from the depth gradient. In each direction, the smaller of the depth differences to the two
-    neighbours is used, so a depth edge does not tilt the normals next to it.
+    The normal is computed from the depth gradient, for a floor without facets. In each direction, the smaller of the
+    depth differences to the two neighbours is used, so a depth edge does not tilt the normals next to it.
     """
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
@@ -125,21 +208,21 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, attenuated on the path from lamp to floor to camera."""
+def _add_lamp(lamp, beam, transmission, lamplight, lookup, light):
+    """Adds to `light` (3, W) the illuminance by a lamp, attenuated on the path from lamp to floor."""
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
     last = np.int32(transmission.shape[1] - 2)
     at_beam, at_path, part_of_beam, part_of_path = lookup
-    for u in range(range_m.size):
+    for u in range(light.shape[1]):
         at = lamplight[1, u] * steps
         at_beam[u] = min(np.int32(at), last_b)
         part_of_beam[u] = at - np.float32(at_beam[u])
-        at = (lamplight[2, u] + range_m[u]) * per_step
+        at = lamplight[2, u] * per_step
         at_path[u] = min(np.int32(at), last)
         part_of_path[u] = min(at - np.float32(at_path[u]), one)
-    for u in range(range_m.size):
+    for u in range(light.shape[1]):
         i, w = np.uint32(at_beam[u]), part_of_beam[u]
         e = lamplight[0, u] * (beam[i] + w * (beam[i + np.uint32(1)] - beam[i]))
         i, w = np.uint32(at_path[u]), part_of_path[u]
@@ -147,6 +230,45 @@ def _add_lamp(lamp, beam, transmission, range_m, lamplight, lookup, light):
         light[0, u] += e * red * (transmission[0, i] + w * (transmission[0, j] - transmission[0, i]))
         light[1, u] += e * green * (transmission[1, i] + w * (transmission[1, j] - transmission[1, i]))
         light[2, u] += e * blue * (transmission[2, i] + w * (transmission[2, j] - transmission[2, i]))
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
+    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`."""
+    one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
+    red, green, blue = lamp[7], lamp[8], lamp[9]
+    rows, cols = np.float32(soft.shape[0] - 1), np.float32(soft.shape[1] - 1)
+    last_r, last_c, stride = np.int32(soft.shape[0] - 2), np.int32(soft.shape[1] - 2), np.int32(4 * soft.shape[1])
+    cell, _, part_of_row, part_of_col = lookup
+    for u in range(light.shape[1]):
+        at = lamplight[1, u] * rows
+        row = min(np.int32(at), last_r)
+        part_of_row[u] = min(at - np.float32(row), one)
+        at = lamplight[2, u] * cols / (lamplight[2, u] + scale)
+        col = min(np.int32(at), last_c)
+        part_of_col[u] = min(at - np.float32(col), one)
+        cell[u] = row * stride + np.int32(4) * col
+    flat = soft.reshape(-1)
+    for u in range(light.shape[1]):
+        i, w, s, e = np.uint32(cell[u]), part_of_row[u], part_of_col[u], lamplight[0, u]
+        j, k = i + np.uint32(4), i + np.uint32(stride)
+        m = k + np.uint32(4)
+        here = (one - w) * (one - s)
+        further, wider, both = (one - w) * s, w * (one - s), w * s
+        light[0, u] += e * red * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
+        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
+        light[1, u] += e * green * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
+        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
+        light[2, u] += e * blue * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _attenuate(per_m, range_m, light):
+    """Attenuates `light` (3, W) on the path from the floor to the camera, with the coefficients `per_m` (3,)."""
+    for c in range(3):
+        by_range = -np.float32(LOG2_E) * per_m[c]
+        for u in range(range_m.size):
+            light[c, u] *= two_to(by_range * range_m[u])
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -177,70 +299,133 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _add_daylight(here, y, focal, daylight, loss, surface, range_m, share, light):
-    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
+def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
+    """Fills row 1 of `daylight` (3, W) with the cosine to the sun times row 0, and row 2 with the depth [m].
 
-    `share` (W,) is the daylight on the floor relative to its mean, see `_sample_caustics`.
+    Row 0 is the daylight on the floor relative to its mean, see `_sample_caustics`; it is 0 without floor. The normals
+    of pixels without floor are replaced by 0.
     """
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
+    for u in range(here.size):
+        there = here[u] < far
+        z = here[u] if there else zero
+        x = (np.float32(u) - half * np.float32(here.size - 1)) / focal * z
+        nx, ny, nz = normal[0, u], normal[1, u], normal[2, u]
+        nx, ny, nz = nx if there else zero, ny if there else zero, nz if there else zero
+        normal[0, u], normal[1, u], normal[2, u] = nx, ny, nz
+        facing = nx * to_sun[0] + ny * to_sun[1] + nz * to_sun[2]
+        daylight[1, u] = daylight[0, u] * max(facing, zero)
+        deep = surface[2, 0] * x + surface[2, 1] * (y * z) + surface[2, 2] * z + surface[2, 3]
+        daylight[2, u] = max(deep, zero)
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _add_daylight(sky, normal, range_m, daylight, light):
+    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
+
+    `daylight` (3, W) is that of `_face_sun`, with the sun's shadows in row 1.
+    """
+    beam, diffuse, change, fitted, loss = sky
+    per_m, zero = np.float32(LOG2_E), np.float32(0.0)
+    level, low, high = fitted[0], fitted[1], fitted[2]
     for c in range(3):
-        incident, by_depth, by_range = daylight[c], -np.float32(LOG2_E) * loss[0, c], -np.float32(LOG2_E) * loss[1, c]
-        for u in range(here.size):
-            z = here[u] if here[u] < far else zero
-            x = (np.float32(u) - half * np.float32(here.size - 1)) / focal * z
-            deep = max(surface[2, 0] * x + surface[2, 1] * (y * z) + surface[2, 2] * z + surface[2, 3], zero)
-            light[c, u] += share[u] * incident * two_to(by_depth * deep + by_range * range_m[u])
+        sun, by_depth, by_range = beam[c, 0], -per_m * beam[c, 1], -per_m * loss[c]
+        slope, square, form = per_m * change[c, 0], per_m * change[c, 1], diffuse[c]
+        xx, yy, zz, xy, xz = form[0], form[1], form[2], form[3], form[4]
+        yz, x, y, z, one = form[5], form[6], form[7], form[8], form[9]
+        for u in range(range_m.size):
+            nx, ny, nz = normal[0, u], normal[1, u], normal[2, u]
+            rest = nx * (xx * nx + xy * ny + xz * nz + x) + ny * (yy * ny + yz * nz + y) + nz * (zz * nz + z) + one
+            deep, lost = daylight[2, u], by_range * range_m[u]
+            below = deep - level
+            near = min(max(below, low), high)
+            light[c, u] += daylight[1, u] * sun * two_to(by_depth * deep + lost) + daylight[0, u] * max(
+                rest, zero
+            ) * two_to(slope * below + square * near * near + lost)
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_rows(table, row, out):
-    """Fills `out` (cols, 3, ranges) with the backscatter for a row of pixels, interpolated between rows of `table`."""
+    """Fills `out` (cols, ranges, 4) with the backscatter for a row of pixels, interpolated between rows of `table`."""
     j = min(int(row), table.shape[0] - 2)
     w = row - np.float32(j)
-    lower, upper = table[j], table[j + 1]
-    for i in range(lower.shape[0]):
-        for c in range(3):
-            for r in range(lower.shape[2]):
-                out[i, c, r] = lower[i, c, r] + w * (upper[i, c, r] - lower[i, c, r])
+    lower, upper, filled = table[j].reshape(-1), table[j + 1].reshape(-1), out.reshape(-1)
+    for i in range(lower.size):
+        filled[i] = lower[i] + w * (upper[i] - lower[i])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract", "nsz"}, error_model="numpy")
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
-    """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range.
-
-    The bands deliberately differ in the order of operations: another order would change the last bits of the images.
-    """
-    cols, _, ranges = table.shape
+    """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range."""
+    cols, ranges, _ = table.shape
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     n_cols, per_px = np.float32(cols - 1), one / np.float32(range_m.size - 1)
-    last_c, last_r = np.int32(cols - 2), np.int32(ranges - 2)
-    at_col, at_range, part_of_col, part_of_range = lookup
+    last_c, last_r, stride = np.int32(cols - 2), np.int32(ranges - 2), np.int32(4 * ranges)
+    cell, _, part_of_col, part_of_range = lookup
     for u in range(range_m.size):
         at = np.float32(u) * n_cols * per_px
-        at_col[u] = min(np.int32(at), last_c)
-        part_of_col[u] = at - np.float32(at_col[u])
+        col = min(np.int32(at), last_c)
+        part_of_col[u] = at - np.float32(col)
         at = range_m[u] * np.float32(ranges - 1) / (range_m[u] + scale)
-        at_range[u] = min(np.int32(at), last_r)
-        part_of_range[u] = min(at - np.float32(at_range[u]), one)
+        row = min(np.int32(at), last_r)
+        part_of_range[u] = min(at - np.float32(row), one)
+        cell[u] = col * stride + np.int32(4) * row
+    flat = table.reshape(-1)
     for u in range(range_m.size):
-        i, w = np.uint32(at_col[u]), part_of_col[u]
-        k, s = np.uint32(at_range[u]), part_of_range[u]
-        j, m = i + np.uint32(1), k + np.uint32(1)
-        left = table[i, 0, k] + s * (table[i, 0, m] - table[i, 0, k])
-        right = table[j, 0, k] + s * (table[j, 0, m] - table[j, 0, k])
-        backscatter[0, u] = left + w * (right - left)
-        left = table[i, 1, k] + s * (table[i, 1, m] - table[i, 1, k])
-        backscatter[1, u] = left + w * ((table[j, 1, k] - left) + s * (table[j, 1, m] - table[j, 1, k]))
-        left = table[i, 2, k] + s * (table[i, 2, m] - table[i, 2, k])
-        backscatter[2, u] = left + w * ((table[j, 2, k] - left) + s * (table[j, 2, m] - table[j, 2, k]))
+        i, w, s = np.uint32(cell[u]), part_of_col[u], part_of_range[u]
+        j, k = i + np.uint32(4), i + np.uint32(stride)
+        m = k + np.uint32(4)
+        here, further, across, both = (one - w) * (one - s), (one - w) * s, w * (one - s), w * s
+        backscatter[0, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
+        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
+        backscatter[1, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
+        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
+        backscatter[2, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, backscatter, out):
-    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus the backscatter."""
+    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`.
+
+    For a floor of another material, `light` is daylight and the scattered light of the lamps; `backscatter` includes
+    the unscattered light of the lamps that the floor reflects.
+    """
     reflected = np.float32(1 / (255 * np.pi))
     white, filled = albedo.reshape(-1), out.reshape(-1)
     for u in range(out.shape[0]):
         filled[3 * u] = light[0, u] * (reflected * np.float32(white[3 * u])) + backscatter[0, u]
         filled[3 * u + 1] = light[1, u] * (reflected * np.float32(white[3 * u + 1])) + backscatter[1, u]
         filled[3 * u + 2] = light[2, u] * (reflected * np.float32(white[3 * u + 2])) + backscatter[2, u]
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
+    """Fills `out` (W, 3) with the backscatter, plus the share `kept` of the light of the floor (W, 3) if given.
+
+    Fills half a row of `place` if v is even, see `shade`.
+    """
+    of_row, shown = out.reshape(-1), floor.reshape(-1)
+    if kept is None:
+        for u in range(range_m.size):
+            red, green, blue = backscatter[0, u], backscatter[1, u], backscatter[2, u]
+            of_row[3 * u], of_row[3 * u + 1], of_row[3 * u + 2] = red, green, blue
+        return
+    one, scale, steps = np.float32(1.0), np.float32(RANGE_SCALE_M), np.float32(kept.shape[0] - 1)
+    last = np.int32(kept.shape[0] - 2)
+    cell, _, part, _ = lookup
+    for u in range(range_m.size):
+        at = range_m[u] * steps / (range_m[u] + scale)
+        cell[u] = min(np.int32(at), last)
+        part[u] = min(at - np.float32(cell[u]), one)
+    if v % 2 == 0:
+        for u in range(place.shape[1]):
+            place[v // 2, u] = np.float32(cell[2 * u]) + part[2 * u]
+    flat = kept.reshape(-1)
+    for u in range(range_m.size):
+        i, w = np.uint32(4 * cell[u]), part[u]
+        j = i + np.uint32(4)
+        of_row[3 * u] = backscatter[0, u] + shown[3 * u] * (flat[i] + w * (flat[j] - flat[i]))
+        i, j = i + np.uint32(1), j + np.uint32(1)
+        of_row[3 * u + 1] = backscatter[1, u] + shown[3 * u + 1] * (flat[i] + w * (flat[j] - flat[i]))
+        i, j = i + np.uint32(1), j + np.uint32(1)
+        of_row[3 * u + 2] = backscatter[2, u] + shown[3 * u + 2] * (flat[i] + w * (flat[j] - flat[i]))

@@ -13,17 +13,21 @@ depth of a frame refer to mid-exposure of the middle row.
 
 Limits: the flow of a pixel is constant during the exposure time T, so paths are straight (a rotation would bend them by
 less than f (|w| T)^2 / 8); vibration is not modelled. A path is computed with the depth at its own pixel: the blur of a
-near object does not spread over the background. Marine snow, backscatter and the lamp pattern are blurred like the
-floor behind them; backscatter and lamp pattern move with the camera, but hardly vary over a few pixels. Total light is
-conserved only where the flow is uniform. Beyond the image border the last pixel is repeated.
+near object does not spread over the background. Backscatter and the lamp pattern are blurred like the floor behind
+them; they move with the camera, but hardly vary over a few pixels. Marine snow has its own paths, see
+`twin.imaging.snow`. Total light is conserved only where the flow is uniform. Beyond the image border the last pixel is
+repeated.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from twin.imaging.resample import weighted_sum
 from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
@@ -31,6 +35,36 @@ Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
 SHORT_PX = 2.8  # longest path for the 3 x 3 kernel; at sqrt(8) px along a row its three weights are equal
+
+
+class ExposureMotion(NamedTuple):
+    """Motion of a camera during one exposure.
+
+    Args:
+        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        exposure_s: exposure time of each row; 0 = no motion blur.
+        readout_s: time from the first row of the rendered image to the last; 0 = global shutter.
+    """
+
+    twist: Array
+    exposure_s: float
+    readout_s: float
+
+
+def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
+    """Returns the radiance (H, W, 3) recorded by a moving camera, with rolling shutter and motion blur.
+
+    Args:
+        light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
+        depth: (H, W) depth in the same image [m].
+        focal_px: focal length.
+        motion: velocity of the camera and duration of exposure and read-out.
+    """
+    if motion.readout_s:
+        light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
+    if motion.exposure_s:
+        light = blur_by_motion(light, depth, focal_px, motion.twist, motion.exposure_s)
+    return light
 
 
 def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
@@ -67,7 +101,8 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 def _flow(x, y, near, scale, twist):
     """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth.
 
-    The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration."""
+    The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration.
+    """
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
@@ -165,28 +200,36 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
     out[0], out[1], out[2] = max(red, zero), max(green, zero), max(blue, zero)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
     """Fills rows `first` to `end` of `out`; see `apply_rolling_shutter`."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
+    right, low = np.float32(width - 1), np.float32(height - 1)
+    values, x = light.reshape(height, 3 * width), np.empty(width, np.float32)
+    at_u, at_v = np.empty(width, np.float32), np.empty(width, np.float32)
+    for u in range(width):
+        x[u] = (np.float32(u) - half * right) / focal
     for v in range(first, end):
-        delay_s = readout_s * (np.float32(v) / np.float32(height - 1) - half)
-        y = (np.float32(v) - half * np.float32(height - 1)) / focal
+        scale = focal * readout_s * (np.float32(v) / low - half)
+        y, line = (np.float32(v) - half * low) / focal, depth[v]
         for u in range(width):
-            x = (np.float32(u) - half * np.float32(width - 1)) / focal
-            du, dv = _flow(x, y, np.float32(1.0) / depth[v, u], focal * delay_s, twist)
-            at_u = min(max(np.float32(u) - du, zero), np.float32(width - 1))
-            at_v = min(max(np.float32(v) - dv, zero), np.float32(height - 1))
-            j, i = int(at_u), int(at_v)
-            across, down = _cubic(at_u - np.float32(j)), _cubic(at_v - np.float32(i))
-            red = green = blue = zero
-            for b in range(4):
-                row = light[min(max(i + b - 1, 0), height - 1)]
-                for a in range(4):
-                    weight = down[b] * across[a]
-                    pixel = row[min(max(j + a - 1, 0), width - 1)]
-                    red += weight * pixel[0]
-                    green += weight * pixel[1]
-                    blue += weight * pixel[2]
-            out[v, u, 0], out[v, u, 1], out[v, u, 2] = max(red, zero), max(green, zero), max(blue, zero)
+            du, dv = _flow(x[u], y, np.float32(1.0) / line[u], scale, twist)
+            at_u[u] = min(max(np.float32(u) - du, zero), right)
+            at_v[u] = min(max(np.float32(v) - dv, zero), low)
+        for u in range(width):
+            j, i = int(at_u[u]), int(at_v[u])
+            across, down = _cubic(at_u[u] - np.float32(j)), _cubic(at_v[u] - np.float32(i))
+            filled = out[v, u]
+            if 0 < j < width - 2 and 0 < i < height - 2:
+                weighted_sum(values, i - 1, i, i + 1, i + 2, 3 * (j - 1), across, down, filled)
+            else:
+                for band in range(3):
+                    total = zero
+                    for b in range(4):
+                        row = values[min(max(i + b - 1, 0), height - 1)]
+                        for a in range(4):
+                            total += down[b] * across[a] * row[3 * min(max(j + a - 1, 0), width - 1) + band]
+                    filled[band] = total
+            for band in range(3):
+                filled[band] = max(filled[band], zero)

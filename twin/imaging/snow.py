@@ -1,9 +1,15 @@
-"""Marine snow: small white particles that drift with the current through the light of the lamps.
+"""Marine snow: small particles that drift with the current through the light of the lamps.
 
 The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
 side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
-of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Two blurs spread its light: one
-pixel due to the lens, and f A / z due to defocus (a lens with an aperture of diameter A, focused at infinity).
+of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Its image is blurred by one
+pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of diameter A, focused
+at depth s. During the exposure the particle moves through the image; its light is spread evenly along this path, whose
+length is its velocity in the image times the exposure time.
+
+The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
+diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is
+(a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
 """
 
 from __future__ import annotations
@@ -16,8 +22,11 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.lamps import LightSources, beam_share
-from twin.imaging.optics import LAMP_RADIUS_M, Depth, Radiance
+from twin.imaging.lamp_light import LampLight
+from twin.imaging.lens_psf import Defocus
+from twin.imaging.optics import Depth, Radiance
+from twin.imaging.row_parallel import in_row_bands
+from twin.imaging.shutter import ExposureMotion
 from twin.imaging.water import Medium
 from twin.scenario.model import SnowConfig
 
@@ -25,28 +34,43 @@ Array = NDArray[np.float64]
 
 BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible up to half a side from the left camera
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
-APERTURE_M = 0.004  # diameter of the lens aperture
-PIXEL_BLUR_PX = 1.0
+APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
+PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
+BLOCK = 512  # number of particles whose positions are computed at a time
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera: column and row (n, 2) [px], depth (n,) [m], radiance per band (n, 3) [cd/m2]."""
+    """Particles in view of a camera.
+
+    Args:
+        pixel: (n, 2) column and row [px].
+        points_m: (n, 3) positions in the axes of the camera.
+        radiance: (n, 3) radiance per colour band [cd/m2].
+        diameter_m: (n,) diameters.
+    """
 
     pixel: Array
-    depth_m: Array
+    points_m: Array
     radiance: Array
+    diameter_m: Array
+
+    @property
+    def depth_m(self) -> Array:
+        """Returns the depths (n,) [m]."""
+        return np.ascontiguousarray(self.points_m[:, 2])
 
 
 class MarineSnow:
     """Marine snow particles of one survey.
 
     Args:
-        snow: density, size and albedo of the particles.
+        snow: density, sizes and albedo of the particles.
         current_mps: (3,) velocity of the particles in the world.
         rig: the rendered cameras.
         water: optical properties of the water.
-        light_sources: lamps and daylight in the axes of the left and of the right camera.
-        rng: random stream of the particle positions.
+        lamp_light: light of the lamps, and daylight, in the axes of the left and of the right camera.
+        rng: random stream of the particle positions and sizes.
+        defocus: aperture and focus of the lens; None = an aperture of `APERTURE_M`, focused at infinity.
     """
 
     def __init__(
@@ -55,87 +79,217 @@ class MarineSnow:
         current_mps: Array,
         rig: StereoRig,
         water: Medium,
-        light_sources: list[LightSources],
+        lamp_light: list[LampLight],
         rng: np.random.Generator,
+        defocus: Defocus | None = None,
     ):
         self._start_m = rng.uniform(0, BOX_M, (round(snow.density_per_m3 * BOX_M**3), 3))
+        self._diameter_m = diameters(snow, len(self._start_m), rng)
         self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, water
-        self._light_sources = light_sources
+        self._lamp_light = lamp_light
+        self._defocus = Defocus(APERTURE_M, 0.0) if defocus is None else defocus
 
     def positions(self, centre_m: Array, time_s: float) -> Array:
         """Returns the particle positions (n, 3) in the world [m], in the box around a centre (3,)."""
         low = centre_m - BOX_M / 2
         return low + np.mod(self._start_m + self._current_mps * time_s - low, BOX_M)
 
-    def visible_particles(self, world_from_left: Array, camera: int, time_s: float) -> VisibleParticles:
+    def visible_particles(
+        self, world_from_left: Array, camera: int, time_s: float, reach_m: float = 0.0, farthest_m: float = np.inf
+    ) -> VisibleParticles:
         """Returns the particles in view of a camera (0 left, 1 right) with their radiance.
 
         Args:
             world_from_left: (4, 4) pose of the left camera.
             camera: 0 left, 1 right.
             time_s: time since the start of the survey.
+            reach_m: distance outside the view up to which particles are included, as they may move into the view.
+            farthest_m: largest depth.
         """
-        world_from_camera = world_from_left @ (self._rig.left_from_right if camera else np.eye(4))
-        world_m = self.positions(world_from_left[:3, 3], time_s)
-        points = geometry.transform(geometry.inverse(world_from_camera), world_m)
-        points = points[points[:, 2] > NEAREST_M]
-        pixel = self._rig.project(points)
-        margin = np.max(_width_px(self._rig.focal_px, self._snow.diameter_m, NEAREST_M))
-        size = np.array([self._rig.width_px, self._rig.height_px])
-        inside = np.all((pixel > -margin) & (pixel < size + margin), axis=1)
-        points = points[inside]
-        return VisibleParticles(pixel[inside], points[:, 2].copy(), self._radiance(points, self._light_sources[camera]))
+        rig = self._rig
+        world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
+        low = world_from_left[:3, 3] - BOX_M / 2
+        middle = np.array([rig.cx_px, rig.cy_px])
+        size = np.array([rig.width_px, rig.height_px])
+        largest = float(self._diameter_m.max(initial=0.0))
+        margin_px = float(np.max(_width_px(rig.focal_px, largest, NEAREST_M, self._defocus)))
+        view = rig.focal_px, middle, size, margin_px, rig.focal_px * reach_m, farthest_m
+        found, points = _in_view(
+            self._start_m, self._current_mps * time_s - low, low, geometry.inverse(world_from_camera), *view
+        )
+        diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
+        return VisibleParticles(
+            rig.project(points), points, self._radiance(points, self._lamp_light[camera]), diameter_m
+        )
 
-    def draw(self, light: Radiance, depth: Depth, world_from_left: Array, camera: int, time_s: float) -> None:
-        """Draws the particles in front of the floor into the radiance `light` (H, W, 3) of a camera, in place."""
-        particles = self.visible_particles(world_from_left, camera, time_s)
-        width_px = _width_px(self._rig.focal_px, self._snow.diameter_m, particles.depth_m)
-        cover_px2 = np.pi / 4 * (self._rig.focal_px * self._snow.diameter_m / particles.depth_m) ** 2
-        _draw(light, depth, particles.pixel, particles.depth_m, particles.radiance, width_px, cover_px2)
+    def draw(
+        self,
+        light: Radiance,
+        depth: Depth,
+        world_from_left: Array,
+        camera: int,
+        time_s: float,
+        motion: ExposureMotion | None = None,
+    ) -> None:
+        """Draws the particles in front of the floor into the radiance `light` (H, W, 3) of a camera, in place.
 
-    def _radiance(self, points: Array, sources: LightSources) -> Array:
-        """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m]."""
+        Args:
+            light: (H, W, 3) radiance.
+            depth: (H, W) depth of the floor [m].
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            camera: 0 left, 1 right.
+            time_s: time since the start of the survey.
+            motion: motion of the camera during the exposure; None = no motion.
+        """
+        rig, defocus = self._rig, self._defocus
+        farthest_m = float(depth.max())
+        still = motion is None
+        reach_m = 0.0 if still else self._reach_m(motion)
+        seen = self.visible_particles(world_from_left, camera, time_s, reach_m, farthest_m)
+        z = seen.depth_m
+        width_px = _width_px(rig.focal_px, seen.diameter_m, z, defocus)
+        cover_px2 = np.pi / 4 * (rig.focal_px * seen.diameter_m / z) ** 2
+        centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
+        if not still:
+            flow = self._flow(seen.points_m, world_from_left, camera, motion.twist)
+            centre_px = _read_out(centre_px, flow, motion.readout_s, len(light))
+            path_px = flow * motion.exposure_s
+        scene = light, depth, centre_px, path_px, z, seen.radiance, width_px, cover_px2
+        in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
+
+    def _reach_m(self, motion: ExposureMotion) -> float:
+        """Returns the largest distance that a particle near the camera moves in half the exposure and read-out [m]."""
+        speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
+        speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
+        return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
+
+    def _flow(self, points: Array, world_from_left: Array, camera: int, twist: Array) -> Array:
+        """Returns the velocities (n, 2) of particles in the image of a moving camera [px/s]; `points` in its axes."""
+        left_from_camera = self._rig.left_from_right if camera else np.eye(4)
+        drift = (world_from_left @ left_from_camera)[:3, :3].T @ self._current_mps
+        velocity = drift - twist[3:] - np.cross(twist[:3], points)
+        along = points[:, :2] / points[:, 2:]
+        return self._rig.focal_px * (velocity[:, :2] - along * velocity[:, 2:]) / points[:, 2:]
+
+    def _radiance(self, points: Array, lamps: LampLight) -> Array:
+        """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
+
+        Light that is scattered between a particle and the camera is lost.
+        """
         range_m = np.linalg.norm(points, axis=1)[:, None]
-        attenuation = self._water.attenuation_per_m
-        day = sources.daylight
-        lux = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[:, 2:]) * np.exp(-attenuation * range_m)
-        for position, axis, intensity, colour, beam in zip(*sources[:5], strict=True):
-            from_lamp = points - position
-            distance = np.maximum(np.linalg.norm(from_lamp, axis=1), LAMP_RADIUS_M)[:, None]
-            share = colour * beam_share((from_lamp / distance) @ axis, beam)[:, None]
-            lux = lux + intensity * share / distance**2 * np.exp(-attenuation * (distance + range_m))
-        return self._snow.albedo / np.pi * lux
+        day = lamps.sources.daylight
+        lux = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[:, 2:])
+        for lamp in range(len(lamps.sources.intensity_cd)):
+            lux = lux + lamps.lux(lamp, points)[0]
+        return self._snow.albedo / np.pi * lux * np.exp(-self._water.attenuation_per_m * range_m)
 
 
-def _width_px(focal_px: float, diameter_m: float, depth_m: Array | float) -> Array:
+def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
+    """Returns the diameters of n particles [m]: (n,) of the Junge distribution, or (1,) if all are equal.
+
+    Args:
+        snow: exponent and limits of the distribution.
+        n: number of particles.
+        rng: random stream, of which n numbers are drawn if the diameters differ.
+    """
+    if snow.junge_exponent is None:
+        return np.array([snow.diameter_m])
+    power = 1 - snow.junge_exponent
+    low, high = snow.diameter_min_m**power, snow.diameter_max_m**power
+    return (low + rng.uniform(size=n) * (high - low)) ** (1 / power)
+
+
+def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float, defocus: Defocus) -> Array:
     """Returns the diameter of a particle's image [px], including blur."""
-    return np.sqrt((focal_px / np.asarray(depth_m)) ** 2 * (diameter_m**2 + APERTURE_M**2) + PIXEL_BLUR_PX**2)
+    z = np.asarray(depth_m)
+    return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
+
+
+def _read_out(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
+    """Returns the positions (n, 2) at which a rolling shutter records particles [px].
+
+    The row v is read t = readout (v / (n_rows - 1) - 1/2) after mid-exposure; v = v_0 + v' t is solved for v.
+    """
+    row_s = readout_s / (n_rows - 1)
+    delay_s = (pixel[:, 1] * row_s - readout_s / 2) / np.maximum(1 - flow[:, 1] * row_s, 0.1)
+    return pixel + flow * delay_s[:, None]
 
 
 @njit(cache=True, nogil=True)
-def _draw(light, depth, pixel, z, radiance, width, cover):
-    """Draws each particle into `light` as a disc with a soft rim, except where the floor is nearer."""
-    rows, cols = depth.shape
+def _in_view(start, shift, low, camera_from_world, focal, middle, size, margin_px, reach_px_m, farthest_m):
+    """Returns the indices (n,) of the particles in view and their positions (n, 3) in the axes of the camera.
+
+    A particle is in view if its image is at most margin_px + reach_px_m / depth outside the image. `start` are the
+    positions in the box at time 0, to which `shift` is added before they are wrapped into the box at `low`.
+    """
+    found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
+    turn, at, per_box = camera_from_world[:3, :3], camera_from_world[:3, 3], 1 / BOX_M
+    xs, ys, zs = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    for begin in range(0, len(start), BLOCK):
+        block = start[begin : begin + BLOCK]
+        for k in range(len(block)):  # without branches, so that the compiler can vectorize it
+            a, b, c = block[k, 0] + shift[0], block[k, 1] + shift[1], block[k, 2] + shift[2]
+            a = low[0] + a - BOX_M * np.floor(a * per_box)
+            b = low[1] + b - BOX_M * np.floor(b * per_box)
+            c = low[2] + c - BOX_M * np.floor(c * per_box)
+            xs[k] = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + at[0]
+            ys[k] = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + at[1]
+            zs[k] = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + at[2]
+        for k in range(len(block)):
+            z = zs[k]
+            if z <= NEAREST_M or z > farthest_m:
+                continue
+            margin = margin_px * z + reach_px_m
+            u, v = focal * xs[k] + middle[0] * z, focal * ys[k] + middle[1] * z
+            if -margin < u < size[0] * z + margin and -margin < v < size[1] * z + margin:
+                found[n], points[n, 0], points[n, 1], points[n, 2] = begin + k, xs[k], ys[k], z
+                n += 1
+    return found[:n], points[:n]
+
+
+@njit(cache=True, nogil=True)
+def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
+    """Draws each particle into rows `first` to `end` of `light`, except where the floor is nearer.
+
+    A particle is a disc with an antialiased edge that moves along a straight path (n, 2) [px] around its centre.
+    """
+    cols = depth.shape[1]
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5
-        u0, u1 = int(np.ceil(pixel[k, 0] - radius)), int(np.floor(pixel[k, 0] + radius))
-        v0, v1 = int(np.ceil(pixel[k, 1] - radius)), int(np.floor(pixel[k, 1] + radius))
+        reach_u, reach_v = radius + 0.5 * abs(path[k, 0]), radius + 0.5 * abs(path[k, 1])
+        u0, u1 = int(np.ceil(centre[k, 0] - reach_u)), int(np.floor(centre[k, 0] + reach_u))
+        v0, v1 = int(np.ceil(centre[k, 1] - reach_v)), int(np.floor(centre[k, 1] + reach_v))
+        if v1 < first or v0 >= end or u1 < 0 or u0 >= cols:
+            continue
+        steps = int(np.ceil(np.sqrt(path[k, 0] ** 2 + path[k, 1] ** 2))) + 1
+        spacing = 1 / np.sqrt(max(steps * steps - 1, 1))  # positions have the variance of a uniform path
+        step_u, step_v = path[k, 0] * spacing, path[k, 1] * spacing
         total = 0.0
         for v in range(v0, v1 + 1):
             for u in range(u0, u1 + 1):
-                total += _rim(radius, u - pixel[k, 0], v - pixel[k, 1])
+                total += _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
         if total <= 0:
             continue
-        for v in range(max(v0, 0), min(v1 + 1, rows)):
+        for v in range(max(v0, first), min(v1 + 1, end)):
             for u in range(max(u0, 0), min(u1 + 1, cols)):
                 if depth[v, u] < z[k]:
                     continue
-                share = min(cover[k] * _rim(radius, u - pixel[k, 0], v - pixel[k, 1]) / total, 1.0)
+                weight = _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
+                share = min(cover[k] * weight / total, 1.0)
                 for c in range(3):
                     light[v, u, c] += np.float32(share * (radiance[k, c] - light[v, u, c]))
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _swept(radius, du, dv, step_u, step_v, steps):
+    """Returns the mean coverage of a pixel at offset (du, dv) from the middle of `steps` evenly spaced positions."""
+    total, first = 0.0, 0.5 * (1 - steps)
+    for i in range(steps):
+        total += _rim(radius, du - (first + i) * step_u, dv - (first + i) * step_v)
+    return total / steps
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _rim(radius, du, dv):
-    """Returns the coverage of a pixel at offset (du, dv) from the centre of a disc, falling from 1 to 0 at its rim."""
+    """Returns the coverage (0 to 1) of a pixel at offset (du, dv) from the centre of a disc with antialiased edge."""
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

@@ -59,7 +59,7 @@ class CameraModel(NamedTuple):
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water.
 
-        Both are in axes of the believed camera. They are NaN for a pixel without a ray, e.g. if the ray is totally
+        Both are in the axes of the believed camera. They are NaN for a pixel without a ray, e.g. if the ray is totally
         reflected at the port.
         """
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
@@ -70,12 +70,12 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixels (..., 2) that image points (..., 3) [m], given in believed-camera axes.
+        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
 
         NaN for a point that is not imaged, or is too far off the optical axis for the distortion model.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
-        air = ports.air_tangents(self.port, points_m)
+        air = ports.air_coordinates(self.port, points_m)
         if self.port.kind == "none":
             air = air * self.pinhole.focal_ratio
         off_axis = np.hypot(air[..., :1], air[..., 1:])
@@ -123,17 +123,29 @@ class TrueCameras:
     believed: CameraModel
     rectified_depth_m: float
 
-    def sample(self, light: Radiance, depth: Depth, camera: int) -> Radiance:
+    def sample(self, light: Radiance, depth: Depth, camera: int, every_px: int = 1) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
 
         Args:
             light: (H, W, 3) radiance in the rendered image.
             depth: (H, W) depth in the rendered image [m].
             camera: 0 left, 1 right.
+            every_px: number n; only every n-th raw pixel along columns and rows is sampled.
         """
         if self.sampling is None:
-            return light
+            return (
+                light
+                if every_px == 1
+                else np.ascontiguousarray(light[every_px // 2 :: every_px, every_px // 2 :: every_px])
+            )
         positions, parallax = self.sampling[camera]
+        if every_px > 1:
+            positions = np.ascontiguousarray(positions[every_px // 2 :: every_px, every_px // 2 :: every_px])
+            parallax = (
+                None
+                if parallax is None
+                else np.ascontiguousarray(parallax[every_px // 2 :: every_px, every_px // 2 :: every_px])
+            )
         return resample.sample(light, positions if parallax is None else resample.intersect(depth, positions, parallax))
 
     def rectify(self, raw: Image) -> Image:
@@ -149,7 +161,7 @@ class TrueCameras:
         """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points that are not imaged.
 
         Args:
-            points_m: (n, 3) points in axes of the camera that was rendered.
+            points_m: (n, 3) points in the axes of the rendered camera [m].
             camera: 0 left, 1 right.
         """
         rig = self.rendered_rig
@@ -240,8 +252,8 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
     """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], exact for points at `depth_m`."""
-    tangents = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
-    points_m = np.concatenate([tangents, np.ones_like(tangents[..., :1])], axis=-1) * depth_m
+    normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
+    points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
     if not np.isnan(positions).any():
         return positions
@@ -274,7 +286,7 @@ def _or_none(parallax: Array) -> Positions | None:
 
 
 def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
-    """Returns column and row (h, w, 2) of all pixels of an image and its border; (0, 0) is the image's corner pixel."""
+    """Returns column and row (h, w, 2) of all pixels of an image and its border; (0, 0) is its top left pixel."""
     columns = np.arange(-border[0], rig.width_px + border[0])
     rows = np.arange(-border[1], rig.height_px + border[1])
     return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)

@@ -11,31 +11,17 @@ from numpy.typing import NDArray
 
 from twin.core.paths import is_file
 from twin.errors import TwinError
-from twin.scenario.model import WaterConfig
+from twin.imaging.bands import CENTRE_NM, NM, band_weights, effective_per_m
+from twin.imaging.light_spectra import Light, spectrum_of
+from twin.imaging.phase_function import Scatterer, molecular_scattering_per_m
+from twin.imaging.spread import Absorbed
+from twin.imaging.water_tables import water_spectrum
+from twin.scenario.model import ScatteringModel, WaterConfig
 
 Array = NDArray[np.float64]
 
-#: Absorption a and scattering b of Jerlov's water types for R, G, B [1/m] (table of the Stonefish simulator).
-JERLOV_PER_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "clear": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    "I": ((0.4601, 0.0620, 0.0176), (0.0008, 0.0017, 0.0042)),
-    "IA": ((0.4612, 0.0622, 0.0223), (0.0021, 0.0035, 0.0068)),
-    "IB": ((0.4612, 0.0623, 0.0239), (0.0431, 0.0536, 0.0700)),
-    "II": ((0.4622, 0.0622, 0.0247), (0.2498, 0.3580, 0.5236)),
-    "III": ((0.4651, 0.0646, 0.0411), (0.6834, 0.9800, 1.4325)),
-    "1C": ((0.4803, 0.0760, 0.1198), (0.2538, 0.3650, 0.5340)),
-    "3C": ((0.4840, 0.0820, 0.1821), (0.7406, 1.0600, 1.5586)),
-    "5C": ((0.5204, 0.1170, 0.3467), (0.9285, 1.3300, 1.9417)),
-    "7C": ((0.5782, 0.1950, 0.6202), (1.6392, 2.3500, 3.4266)),
-    "9C": ((0.6207, 0.3480, 1.0553), (2.1720, 3.1200, 4.5610)),
-}
-
 #: Largest size of a spectrum file.
 MAX_SPECTRUM_BYTES = 10_000_000
-#: Bands R, G, B [nm] over which a spectrum is averaged.
-BANDS_NM = ((600.0, 700.0), (500.0, 600.0), (400.0, 500.0))
-#: Mean cosine of the scattering angle in sea water, g of the Henyey-Greenstein phase function.
-SEA_WATER_MEAN_COSINE = 0.924
 
 
 class Medium(NamedTuple):
@@ -44,54 +30,93 @@ class Medium(NamedTuple):
     Args:
         absorption_per_m: (3,) absorption coefficient a [1/m].
         scattering_per_m: (3,) scattering coefficient b [1/m].
-        mean_cosine: mean cosine g of the scattering angle.
-        kept_share: fraction k of the scattered light that stays in the beam, i.e. does not count as attenuated.
+        scatterers: for each band, phase function of the particles and molecular share of b.
+        multiple: whether multiple scattering is modelled; else all light that is scattered from its path is lost.
     """
 
     absorption_per_m: Array
     scattering_per_m: Array
-    mean_cosine: float = SEA_WATER_MEAN_COSINE
-    kept_share: float = 0.0
+    scatterers: tuple[Scatterer, ...] = (Scatterer(),) * 3
+    multiple: bool = True
 
     @property
     def attenuation_per_m(self) -> Array:
-        """Effective attenuation coefficient (3,) [1/m]: a + (1 - k) b.
+        """Beam attenuation coefficient c = a + b (3,) [1/m], which counts all scattered light as lost."""
+        return self.absorption_per_m + self.scattering_per_m
 
-        With k = 0 this is the beam attenuation coefficient c = a + b, which counts all scattered light as lost. Most
-        light is scattered by small angles, however, so c overestimates the attenuation of the image signal in turbid
-        water. With k = 0.74, the fraction scattered by less than 15 deg, the coefficient is a + 0.26 b, close to the
-        a + 0.3 b that was measured in range-gated imaging.
-        """
-        return self.absorption_per_m + (1 - self.kept_share) * self.scattering_per_m
+    @property
+    def camera_loss_per_m(self) -> Array:
+        """Loss of light between floor and camera (3,) [1/m]: a if scattered light arrives blurred, else c."""
+        return self.absorption_per_m if self.multiple else self.attenuation_per_m
+
+    @property
+    def bands(self) -> tuple[Absorbed, ...]:
+        """Properties of each band, as hashable records."""
+        rows = zip(self.absorption_per_m.tolist(), self.scattering_per_m.tolist(), self.scatterers, strict=True)
+        return tuple(Absorbed(*row) for row in rows)
 
 
-def medium(water: WaterConfig) -> Medium:
+def medium(
+    water: WaterConfig, scattering: ScatteringModel = "full", *, path_m: float = 0.0, light: Light = "led"
+) -> Medium:
     """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
+
+    Args:
+        water: the water of a scenario.
+        scattering: `imaging.scattering`; with "none", the water does not scatter.
+        path_m: length of the path of the light over which the absorption of a band is effective [m]; 0: mean
+            absorption of the band.
+        light: light whose spectrum weights absorption and scattering in a band.
 
     Raises:
         TwinError: absorption or scattering is missing or given twice, or the spectrum cannot be read.
     """
-    absorption, scattering = _spectrum(water)
-    return Medium(absorption, scattering * water.turbidity, water.mean_cosine, water.kept_share)
+    absorption, per_m = _coefficients(water, path_m, light)
+    per_m = per_m * (water.turbidity if scattering != "none" else 0.0)
+    return Medium(absorption, per_m, scatterers(water, per_m), scattering == "full")
 
 
-def _spectrum(water: WaterConfig) -> tuple[Array, Array]:
+def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, ...]:
+    """Returns phase function of the particles and molecular share for scattering coefficients b (3,) [1/m].
+
+    With the phase function "sea", the molecular scattering coefficient is that of pure sea water (Morel 1974), at most
+    b, and the rest of b is due to particles; otherwise all scattering is due to particles.
+    """
+    if water.phase_function == "sea":
+        molecules = molecular_scattering_per_m(np.array(CENTRE_NM))
+        share = np.minimum(molecules / np.maximum(scattering_per_m, 1e-12), 1.0)
+        return tuple(Scatterer("petzold", float(one)) for one in share)
+    parameters = {
+        "petzold": (),
+        "fournier_forand": (water.particle_index, water.particle_slope),
+        "henyey_greenstein": (water.mean_cosine,),
+    }[water.phase_function]
+    return (Scatterer(water.phase_function, 0.0, parameters),) * 3
+
+
+def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
     """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
-    if water.spectrum_file is not None:
-        if given:
-            raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of them")
-        return read_spectrum(Path(water.spectrum_file))
+    if given and water.spectrum_file is not None:
+        raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of them")
     if len(given) == 1:
         missing = next(key for key in own if key not in given)
         raise TwinError(f"water.{missing}", f"missing, as there is a water.{given[0]}", "both or none")
-    absorption, scattering = own.values() if given else JERLOV_PER_M[water.jerlov]
-    return np.array(absorption), np.array(scattering)
+    if given:
+        return np.array(water.absorption_per_m), np.array(water.scattering_per_m)
+    if water.spectrum_file is not None:
+        absorption, scattering = read_spectrum(Path(water.spectrum_file))
+    elif water.jerlov == "clear":
+        return np.zeros(3), np.zeros(3)
+    else:
+        absorption, scattering, _ = water_spectrum(water.jerlov, water.source)
+    weights = band_weights(spectrum_of(light))
+    return effective_per_m(absorption, weights, path_m), effective_per_m(scattering, weights)
 
 
 def read_spectrum(file: Path) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m], averaged over `BANDS_NM` with linear interpolation between rows.
+    """Returns absorption and scattering (n,) [1/m] at `bands.NM`, with linear interpolation between rows.
 
     Args:
         file: comma-separated rows of wavelength [nm], absorption, scattering [1/m]; # starts a comment.
@@ -115,38 +140,26 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
     nm = table[:, 0]
     if not (np.diff(nm) > 0).all():
         raise TwinError(key, f"{file}: wavelengths do not increase", "strictly increasing [nm]")
-    low, high = min(BANDS_NM)[0], max(BANDS_NM)[1]
+    low, high = NM[0], NM[-1]
     if nm[0] > low or nm[-1] < high:
         raise TwinError(key, f"{file} covers {nm[0]:g} to {nm[-1]:g} nm", f"{low:g} to {high:g} or more")
     if not (np.isfinite(table).all() and (table[:, 1:] >= 0).all()):
         row = int(np.argmin((np.isfinite(table) & (table >= 0)).all(axis=1)))
         raise TwinError(key, f"{file}: negative or not finite at {nm[row]:g} nm", "0 or more [1/m]")
-    absorption, scattering = (np.array([_mean(nm, value, *band) for band in BANDS_NM]) for value in table[:, 1:].T)
+    absorption, scattering = (np.interp(NM, nm, values) for values in table[:, 1:].T)
     return absorption, scattering
 
 
-def _mean(nm: Array, value: Array, low: float, high: float) -> float:
-    """Returns the mean of a piecewise linear function between two wavelengths."""
-    nodes = np.concatenate([[low], nm[(nm > low) & (nm < high)], [high]])
-    return float(np.trapezoid(np.interp(nodes, nm, value), nodes) / (high - low))
+def downwelling_per_m(water: Medium, mean_cosine: float = 1.0) -> Array:
+    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m].
 
-
-def downwelling_per_m(water: Medium) -> Array:
-    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a sun at the zenith.
-
-    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu, G = 0.425 mu - 0.19, mu = 1; a fit to
-    Monte Carlo simulations of multiple scattering. Kd lies between a and c.
-    """
-    a, b = water.absorption_per_m, water.scattering_per_m
-    return np.sqrt(a**2 + 0.235 * a * b)
-
-
-def phase_function(cos_angle: Array, mean_cosine: float = SEA_WATER_MEAN_COSINE) -> Array:
-    """Returns the Henyey-Greenstein (1941) phase function [1/sr]; it integrates to 1 over the sphere.
+    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu0, G = 0.425 mu0 - 0.19; a fit to Monte Carlo
+    simulations of multiple scattering. It is the mean down to the depth that 1 % of the light reaches; `light_field`
+    agrees with it within 4 %.
 
     Args:
-        cos_angle: cosine of the scattering angle; 1 is straight ahead.
-        mean_cosine: mean cosine g of the scattering angle.
+        water: optical properties of the water.
+        mean_cosine: mean cosine of the zenith angle of the light just below the surface, mu0.
     """
-    g = mean_cosine
-    return (1 - g**2) / (4 * np.pi * (1 + g**2 - 2 * g * cos_angle) ** 1.5)
+    a, b = water.absorption_per_m, water.scattering_per_m
+    return np.sqrt(a**2 + (0.425 * mean_cosine - 0.19) * a * b) / mean_cosine

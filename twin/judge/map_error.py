@@ -56,7 +56,7 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
 
 
 def completeness_metric(metric: str) -> str | None:
-    """Returns the completeness metric to report beside a map metric; None for other metrics and for completeness.
+    """Returns the completeness metric to report with a map metric; None for other metrics and for completeness.
 
     A statistic of the height errors does not cover the cells without a height, so it is never reported alone.
     """

@@ -39,7 +39,7 @@ class EvaluationInput:
         result: output of the estimators.
         elevation: elevation map; None if none was built.
         truth: true trajectory and floor, and the reference path.
-        rig: nominal stereo rig.
+        rig: calibration that the estimators use.
         plan: pattern, requested and forecast overlaps of the plan: the argument `planned` of `overlap_metrics`.
         timing: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
         identity: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and the reason for a
@@ -47,7 +47,7 @@ class EvaluationInput:
         require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
         warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
         idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
-        actions: how long the vehicle flew slowly and was stopped because its estimators lost track.
+        actions: times for which the mission slowed and stopped the vehicle because visual measurements failed.
     """
 
     result: SurveyResult

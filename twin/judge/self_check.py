@@ -17,9 +17,10 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     are medians over the stereo pairs: of the row difference of the matched points (right minus left) [px], of the
     standard deviation of this difference divided by the expected one, and of the largest autocorrelation of the left
     image away from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (a fraction of the focal length) are the
-    estimated errors of the rectification. sigma_max_m is the largest 3-D standard deviation (square root of the trace
-    of the covariance) of a keyframe position [m], and frame_sigma_m that of the frames just before the next keyframe
-    relative to the last one, 90th percentile [m].
+    estimated errors of the rectification, with the signs of `calibration_error.right_*`. sigma_max_m is the largest 3-D
+    standard deviation (square root of the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D
+    standard deviation that the position of a frame accumulates by frame-to-frame motion between two consecutive nodes,
+    90th percentile over the nodes [m].
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]

@@ -1,4 +1,4 @@
-"""Renders HTML pages from Jinja templates; all pages share one style sheet, number filters and a list of terms."""
+"""Renders HTML pages from Jinja templates; all pages share a style sheet, number formats and a list of terms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
     """Returns a template rendered as self-contained HTML.
 
     Args:
-        package: package that contains the template; it and the files it includes may also be in `twin.report`.
+        package: package that contains the template and the files that it includes; files that are not in this package
+            are taken from `twin.report`.
         template: file name of the template.
         context: variables of the template.
     """

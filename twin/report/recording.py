@@ -122,7 +122,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time as far as they exist by then."""
+    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each with the part known at that time."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
         for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
@@ -185,7 +185,7 @@ def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: Fram
 
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
-    """Logs the two cameras in axes of the left camera, with the calibration scaled to the size of the logged images."""
+    """Logs the two cameras in the axes of the left one; the calibration is scaled to the size of the logged images."""
     scale = min(1.0, IMAGE_WIDTH_PX / rig.width_px)
     camera = rr.Pinhole(
         image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,

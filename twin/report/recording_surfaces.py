@@ -91,7 +91,7 @@ def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArra
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles that are completely observed for the first time with a given group, and their vertices.
+    """Returns the triangles whose last vertex is first observed by a given group, and their vertices.
 
     Args:
         group: (n,) group of each vertex, as `first_observed` returns it.

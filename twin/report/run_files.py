@@ -31,7 +31,7 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
     """Returns the contents of metrics.json, validated, with None for each missing number.
 
     Raises:
-        ValueError: a value has another type than `twin` writes; the message names its key.
+        ValueError: a value does not have the type that `twin` writes; the message names its key.
     """
     template = empty_metrics()
     texts = dict.fromkeys(("name", "status"), "")
@@ -66,7 +66,7 @@ def checked_scenario(scenario: Any) -> dict[str, Any]:
 
 
 class _OptionalText:
-    """Template of a value that is a text or None."""
+    """Template of a value that is a string or None."""
 
 
 def conform(given: Any, template: Any, key: str = "", complete: bool = False) -> Any:
@@ -74,21 +74,21 @@ def conform(given: Any, template: Any, key: str = "", complete: bool = False) ->
 
     Args:
         given: the value.
-        template: a table (the values of its keys are checked; other keys are accepted unchecked), a list that holds the
-            template of its items or is empty (items are not checked), or the template of a single value: any text,
-            truth value or finite number stands for a value of its type, None for a finite number or None, and NaN for a
-            number, NaN or None.
+        template: a table (the values of its keys are checked; other keys are checked against its key "*", or accepted
+            without one), a list that holds the template of its items or is empty (items are not checked), or the
+            template of a single value: any string, Boolean or finite number stands for a value of its type,
+            `_OptionalText` for a string or None, None for a finite number or None, and NaN for a number, NaN or None.
         key: dotted key of the value, for the message.
-        complete: add the missing keys of tables, with None for numbers and [] for lists; a missing text is an error.
+        complete: add the missing keys of tables, with None for numbers and [] for lists; a missing string is an error.
 
     Raises:
-        ValueError: the value has another structure, or an item of a list lacks a key; the message names the key.
+        ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.
     """
     if isinstance(template, dict):
         _require(isinstance(given, dict), key, given, "a table")
         checked = dict(given)
         for name in template.keys() - given.keys() - {_ANY} if complete else ():
-            _require(template[name] != "", _join(key, name), None, "a text: it is missing")
+            _require(template[name] != "", _join(key, name), None, "a string: it is missing")
             checked[name] = _nothing(template[name])
         for name in given if _ANY in template else given.keys() & template.keys():
             checked[name] = conform(given[name], template.get(name, template.get(_ANY)), _join(key, name), complete)
@@ -110,7 +110,7 @@ def _item(given: Any, template: Any, key: str) -> Any:
 
 
 def _nothing(template: Any) -> Any:
-    """Returns the value for missing contents: None for a number or text, [] for a list, a table of such values."""
+    """Returns the value for missing contents: None for a number or string, [] for a list; a table has one per key."""
     if isinstance(template, dict):
         return {name: _nothing(value) for name, value in template.items() if name != _ANY}
     return [] if isinstance(template, list) else None
@@ -125,9 +125,9 @@ def _scalar_rule(template: Any, given: Any) -> tuple[str, bool]:
     """Returns what the template of a single value allows, in words, and whether the given value is allowed."""
     is_number = isinstance(given, int | float) and not isinstance(given, bool)
     if isinstance(template, str):
-        return "a text", isinstance(given, str)
+        return "a string", isinstance(given, str)
     if template is _OptionalText:
-        return "a text or null", given is None or isinstance(given, str)
+        return "a string or null", given is None or isinstance(given, str)
     if isinstance(template, bool):
         return "true or false", isinstance(given, bool)
     if template is _NAN:

@@ -25,7 +25,7 @@ from twin.scenario import file as scenario_file
 from twin.scenario.model import Scenario
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
-PICTURES = ("report", "recording")
+OPTIONAL_OUTPUTS = ("report", "recording")
 #: Glob patterns of the files that each interruptible stage of the writing creates.
 _FILES = {"maps": ("*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
@@ -65,14 +65,14 @@ class RunFolder:
     Args:
         folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run.
-        outputs: members of `PICTURES` to write at the end; writing them may take longer than a short survey. None: of
-            the results, write the metrics only, without trajectories and maps.
+        outputs: members of `OPTIONAL_OUTPUTS` to write at the end; writing them may take longer than a short survey.
+            None: write only the metrics, without trajectories and maps.
 
     Raises:
         TwinError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, outputs: Collection[str] | None = PICTURES):
+    def __init__(self, folder: Path, scenario: Scenario, outputs: Collection[str] | None = OPTIONAL_OUTPUTS):
         self.path, self._reserve, self._outputs = folder, folder / ".reserve", outputs
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ class RunFolder:
 
         Args:
             record: the results.
-            guard: lets an interrupt end a single stage, and records why the survey ended early, if it did.
+            guard: limits an interrupt to a single stage, and records why the survey ended early, if it did.
         """
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
@@ -119,9 +119,9 @@ class RunFolder:
             if self._outputs is not None:
                 self._write_trajectories(record)
                 self._attempt(guard, "maps", lambda: self._write_maps(record))
-                for name in PICTURES:
+                for name in OPTIONAL_OUTPUTS:
                     if name in self._outputs:
-                        self._attempt(guard, name, lambda name=name: self._write_picture(name, metrics))
+                        self._attempt(guard, name, lambda name=name: self._write_optional_output(name, metrics))
         except OSError as error:
             guard.cause = guard.cause or str(error)
         if guard.reason:
@@ -179,7 +179,7 @@ class RunFolder:
         geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, description, origin)
         mesh.write_glb(self.path / "mesh.glb", elevation)
 
-    def _write_picture(self, name: str, metrics: dict[str, Any]) -> None:
+    def _write_optional_output(self, name: str, metrics: dict[str, Any]) -> None:
         """Writes the report or the recording; the libraries for each are imported only when needed."""
         if name == "report":
             from twin.report import survey_page

@@ -39,7 +39,7 @@ def badge(metrics: Mapping[str, Any] | None) -> Badge:
 
 
 def first_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns the sentences to read before any figure, the most serious first.
+    """Returns the sentences at the top of a report, the most serious first.
 
     They state why a survey is not complete, each requirement missed, each warning, and what the scenario idealises.
     """

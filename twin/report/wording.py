@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from twin.scenario.water_sources import WATER_SOURCES
+
 DASH = "–"  # noqa: RUF001
 
 #: Display names of the processing stages in metrics.json (`timing.stages`) and of the sum of all keyframe stages.
@@ -137,11 +139,12 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns the altitude and the water type of a survey as text."""
+    """Returns the altitude and the water type of a survey, with its source, as text."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")
-    kind = "water with custom optical properties" if custom else f"water of Jerlov type {jerlov}"
+    source = f" ({WATER_SOURCES[water['source']].citation})" if "source" in water else ""
+    kind = "water with custom optical properties" if custom else f"water of Jerlov type {jerlov}{source}"
     if jerlov == "clear" and not custom:
         kind, turbidity = "clear water", 1.0
     scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""

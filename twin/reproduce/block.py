@@ -21,7 +21,7 @@ def block_on_sand(seed: int) -> Terrain:
     """Returns a terrain with the block at its centre, which is the origin; the mean height of the sand is about 0.
 
     Args:
-        seed: seed of the sand relief, the roughness of the block and the grain of the texture.
+        seed: seed of the sand relief, the roughness of the block and the noise of the texture.
     """
     rng = np.random.default_rng(seed)
     x, y = _grid(SPACING_M, edges=True)

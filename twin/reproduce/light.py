@@ -1,8 +1,7 @@
-"""The light model of the images beside the Monte Carlo reference: total light, sharp share, veil and blur.
+"""Comparison of the light model with the Monte Carlo reference: total light, sharp share, veil and blur.
 
-One cell is one water, height, fit of lamps and pixel over a level floor of even albedo, in the green band. Both use the
-same absorption, scattering and lamps; the phase function of the reference is the model's own (Henyey-Greenstein) or
-that of sea water (molecules and Petzold's average particle).
+Each cell of the comparison has one water type, camera height, lamp arrangement and pixel, over a level floor of uniform
+albedo, in the green band. Model and reference use the same absorption, scattering, phase function and lamps.
 """
 
 from __future__ import annotations
@@ -16,12 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
-from twin.imaging.forward_scatter import ForwardScatter, forward_scattering
+from twin.imaging.forward_scatter import ForwardScatter
 from twin.imaging.illumination import illumination_of
 from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.optics import Optics
-from twin.imaging.phase_function import PhaseFunction, henyey_greenstein, sea_water
+from twin.imaging.optics import Optics, range_of
+from twin.imaging.phase_function import PhaseFunction, phase_of
 from twin.imaging.reference.pixel_light import (
     BandWater,
     BatchMean,
@@ -32,7 +30,6 @@ from twin.imaging.reference.pixel_light import (
     lamps_in_world,
     pixel_light,
 )
-from twin.imaging.water import Medium
 from twin.reproduce import light_sheet
 from twin.reproduce.light_cell import LightCell, ModelLight
 from twin.scenario.file import load_scenario
@@ -40,12 +37,12 @@ from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]
 
-GREEN, GREEN_NM, ALBEDO = 1, 550.0, 128
+GREEN, ALBEDO = 1, 128
 WATERS, HEIGHTS_M = ("IB", "II", "III", "1C", "3C"), (1.0, 2.0, 3.0)
 #: Pixels as fractions of image width and height: centre, right of it, lower right corner.
 PIXELS = ((0.5, 0.5), (0.8, 0.5), (0.95, 0.95))
-#: Fits of lamps: those of the demo survey, and narrow beams far from the cameras, panned inwards.
-LAMP_FITS: dict[str, tuple[str, ...]] = {
+#: Lamp arrangements: that of the scenario `quickstart`, and narrow beams far from the cameras, panned inwards.
+LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {
     "leds": (),
     "spots": tuple(
         f"lamps.{k}.{key}"
@@ -62,11 +59,11 @@ WALKS = 40_000
 
 
 class Selection(NamedTuple):
-    """The cells to compute: waters, heights [m], names in `LAMP_FITS`, pixels as in `PIXELS`."""
+    """The cells to compute: water types, camera heights [m], names in `LAMP_ARRANGEMENTS`, pixels as in `PIXELS`."""
 
     waters: tuple[str, ...] = WATERS
     heights_m: tuple[float, ...] = HEIGHTS_M
-    lamp_fits: tuple[str, ...] = tuple(LAMP_FITS)
+    lamp_arrangements: tuple[str, ...] = tuple(LAMP_ARRANGEMENTS)
     pixels: tuple[tuple[float, float], ...] = PIXELS
 
 
@@ -74,38 +71,38 @@ ALL = Selection()
 QUICK = Selection(("IB", "III"), (2.0,), ("leds",), PIXELS[:2])
 
 
-def cells(selection: Selection = ALL, walks: int = WALKS, phase: str = "model") -> Iterable[LightCell]:
+def cells(selection: Selection = ALL, walks: int = WALKS, phase: str = "sea") -> Iterable[LightCell]:
     """Yields the cells of a selection.
 
     Args:
-        selection: which cells.
-        walks: number of pairs of walks of the Monte Carlo in each cell.
-        phase: phase function of the reference: "model", that of the light model, or "sea", that of sea water.
+        selection: the cells to compute.
+        walks: number of pairs of random walks in each cell.
+        phase: phase function of model and reference, a value of `water.phase_function`.
     """
     for water in selection.waters:
-        for fit in selection.lamp_fits:
-            scenario = load_scenario("quickstart", [f"water.jerlov={water}", "sun.illuminance_lx=0", *LAMP_FITS[fit]])
+        for lamps in selection.lamp_arrangements:
+            settings = f"water.jerlov={water}", f"water.phase_function={phase}", "sun.illuminance_lx=0"
+            scenario = load_scenario("quickstart", [*settings, *LAMP_ARRANGEMENTS[lamps]])
             for height_m in selection.heights_m:
                 for place in selection.pixels:
-                    yield _cell(scenario, (water, fit, height_m, place), Effort(walks), phase)
+                    yield _cell(scenario, (water, lamps, height_m, place), Effort(walks))
 
 
-def _cell(
-    scenario: Scenario, key: tuple[str, str, float, tuple[float, float]], effort: Effort, phase: str
-) -> LightCell:
-    water, fit, height_m, place = key
+def _cell(scenario: Scenario, key: tuple[str, str, float, tuple[float, float]], effort: Effort) -> LightCell:
+    """Returns one cell; `key`: water type, name of the lamp arrangement, camera height [m], pixel as in `PIXELS`."""
+    water, lamps, height_m, place = key
     rig, medium = scenario.believed_rig(), illumination_of(scenario).water
     pixel = round(place[0] * (rig.width_px - 1)), round(place[1] * (rig.height_px - 1))
-    light = reference_light(scenario, height_m, pixel, effort, _phase(medium, phase))
+    light = reference_light(scenario, height_m, pixel, effort, phase_of(medium.scatterers[GREEN]))
     shares = light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
     truth = (light.total, light.direct, light.sharp_share, light.veil, light.veil_once, *shares)
-    return LightCell(water, height_m, fit, pixel, model_light(scenario, height_m, pixel), *truth)
+    return LightCell(water, height_m, lamps, pixel, model_light(scenario, height_m, pixel), *truth)
 
 
 def reference_light(
     scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort, phase: PhaseFunction
 ) -> PixelLight:
-    """Returns the green light of a pixel of the left camera, which looks straight down, by Monte Carlo."""
+    """Returns the Monte Carlo estimate of the green light of a pixel of the left camera, which points straight down."""
     rig, illumination = scenario.believed_rig(), illumination_of(scenario)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = height_m
@@ -117,32 +114,34 @@ def reference_light(
 
 
 def model_light(scenario: Scenario, height_m: float, pixel: tuple[int, int]) -> ModelLight:
-    """Returns the green light of a pixel of the left camera, which looks straight down, by the light model."""
+    """Returns the green light of a pixel of the left camera, which points straight down, by the light model."""
     rig, illumination = scenario.believed_rig(), illumination_of(scenario)
     shape = rig.height_px, rig.width_px
-    depth = np.full(shape, height_m, np.float32)
+    depth, albedo = np.full(shape, height_m, np.float32), np.full((*shape, 3), ALBEDO, np.uint8)
     optics = Optics(rig, illumination, scenario.lamps)
-    direct, veil = optics.split(np.full((*shape, 3), ALBEDO, np.uint8), depth, 0)
-    blurred = ForwardScatter(rig, illumination.water).spread(direct, depth)
+    direct, forward, veil = optics.parts(albedo, depth, 0)
     at = pixel[1], pixel[0], GREEN
-    near, beyond = (blur_share(rig, illumination.water, height_m, px) for px in (NEAR_PX, FAR_PX))
-    blur = float(blurred[at]) if scenario.imaging.forward_scatter else 0.0
-    return ModelLight(float(direct[at]), blur, float(veil[at]), near, 1 - beyond)
+    if forward is None:
+        return ModelLight(float(direct[at]), 0.0, float(veil[at]), np.nan, np.nan)
+    blur, range_m = ForwardScatter(rig, illumination.water), range_of(depth, rig)
+    # the light of the floor with the loss by absorption alone
+    floor = (direct * np.exp(illumination.water.scattering_per_m * range_m[..., None])).astype(np.float32)
+    around, place = optics.around(albedo, depth, 0)
+    grid = blur.surroundings
+    away = [
+        np.hypot(*(np.indices(size).T - origin).T * side)
+        for size, origin, side in (
+            (shape, np.array(pixel[::-1]), 1.0),
+            (grid.shape, grid.pad + np.array(pixel[::-1]) / 2**grid.level, 2.0**grid.level),
+        )
+    ]
 
+    def from_within(radius_px: float) -> float:
+        lit = [light * (px <= radius_px)[..., None] for light, px in zip((floor, around), away, strict=True)]
+        return float(blur.spread(lit[0], range_m, (lit[1], place.copy()))[at] / forward[at])
 
-def blur_share(rig: StereoRig, water: Medium, range_m: float, radius_px: float) -> float:
-    """Returns the share of the model's forward-scattered green light within a radius: its kernel is a Gaussian."""
-    lobe = forward_scattering(water.mean_cosine)
-    thickness = lobe.share * float(water.scattering_per_m[GREEN]) * range_m
-    n_scatterings = thickness / -np.expm1(-thickness) if thickness else 1.0
-    variance_px2 = rig.focal_px**2 * lobe.variance_rad2 / 3 * n_scatterings
-    return float(-np.expm1(-(radius_px**2) / (2 * variance_px2)))
-
-
-def _phase(water: Medium, phase: str) -> PhaseFunction:
-    if phase == "sea":
-        return sea_water(float(water.scattering_per_m[GREEN]), GREEN_NM)
-    return henyey_greenstein(water.mean_cosine)
+    near, within = from_within(NEAR_PX), from_within(FAR_PX)
+    return ModelLight(float(direct[at]), float(forward[at]), float(veil[at]), near, 1 - within)
 
 
 #: Columns of the table and of light.csv.
@@ -174,7 +173,7 @@ COLUMNS: tuple[tuple[str, Callable[[LightCell], Any]], ...] = (
 
 
 def table(found: Sequence[LightCell]) -> list[tuple[str, ...]]:
-    """Returns the cells as rows of text, the header first; standard errors after +-."""
+    """Returns the comparison as table rows, a header and one row per `LightCell`; standard errors follow +-."""
     header = (
         "water, height", "lamps, pixel", "total, model / truth", "sharp, truth", "model", "veil, truth / model",
         f"blur < {NEAR_PX:g} px, truth", "model", f"> {FAR_PX:g} px, truth", "model",
@@ -192,11 +191,12 @@ def table(found: Sequence[LightCell]) -> list[tuple[str, ...]]:
 
 
 def _text(truth: BatchMean, unit: float) -> str:
+    """Returns truth / unit with its standard error, as text; "-" if `unit` is 0."""
     return f"{truth.value / unit:.3g} +- {truth.standard_error / unit:.1g}" if unit else "-"
 
 
 def _inverse(truth: BatchMean, model: float) -> str:
-    """Returns model / truth with its standard error."""
+    """Returns model / truth with its standard error, as text."""
     value = model / truth.value
     return f"{value:.3g} +- {value * truth.standard_error / truth.value:.1g}"
 

@@ -1,4 +1,4 @@
-"""Light of one pixel by the light model and by the Monte Carlo reference."""
+"""Records of the light of one pixel by the light model and by the Monte Carlo reference."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ class ModelLight(NamedTuple):
     """Light of a pixel by the light model.
 
     Args:
-        direct: light of the floor without scattering [cd/m2].
+        direct: light of the floor that was not scattered between floor and camera [cd/m2].
         blurred: forward-scattered light of the floor [cd/m2]; 0 if the scenario disables it.
         veil: backscatter [cd/m2].
-        blur_near, blur_far: shares of the kernel of the forward scatter near its centre and far from it.
+        blur_near, blur_far: shares of the forward-scattered light that come from points of the floor within 2 px of the
+            pixel and beyond 40 px.
     """
 
     direct: float
@@ -25,27 +26,28 @@ class ModelLight(NamedTuple):
 
     @property
     def total(self) -> float:
-        """All light [cd/m2]."""
+        """Total radiance [cd/m2]."""
         return self.direct + self.blurred + self.veil
 
     @property
     def sharp_share(self) -> float:
-        """Share of the light that was not scattered between floor and camera."""
+        """Share of the total that comes from the floor and was not scattered between floor and camera."""
         return self.direct / self.total
 
 
 class LightCell(NamedTuple):
-    """One cell of the comparison: key, light of the model, and light of the reference with standard errors.
+    """One cell of the comparison: conditions, light by the model, and light by the reference with standard errors.
 
     Args:
         water: Jerlov type.
         height_m: height of the camera above the floor.
-        lamps: name of the fit of the lamps.
+        lamps: name of the lamp arrangement.
         pixel: (column, row) [px].
         model: light by the model.
         total, direct, veil, veil_once: light by the reference [cd/m2], see `PixelLight`.
-        sharp_share: share of light of the floor that was not scattered between floor and camera.
-        blur_near, blur_far: shares of the blurred light that arrive near the straight image and far from it.
+        sharp_share: share of the total that comes from the floor and was not scattered between floor and camera.
+        blur_near, blur_far: shares of the blurred light whose point of the floor would, without scattering, be imaged
+            within 2 px of the pixel and beyond 40 px.
     """
 
     water: str

@@ -1,4 +1,4 @@
-"""Figure of the light model beside the reference: total light, sharp share, veil and blur against height."""
+"""Figure that compares the light model with the reference: total light and veil over height, sharp share, blur."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from twin.report.style import FIGURE_STYLE
 from twin.reproduce.light_cell import LightCell
 
 MARKERS = {"leds": "o", "spots": "^"}
-OFFSET_M = 0.08  # drawn between the pixels of one height
+OFFSET_M = 0.08  # horizontal distance between the markers of two pixels at the same height
 
 
 def draw(cells: Sequence[LightCell], file: Path) -> Path:
@@ -36,16 +36,18 @@ def draw(cells: Sequence[LightCell], file: Path) -> Path:
 
 
 def _over(model: float, truth: BatchMean) -> BatchMean:
+    """Returns model / truth with its standard error."""
     value = model / truth.value
     return BatchMean(value, value * truth.standard_error / truth.value)
 
 
 def _scaled(truth: BatchMean, model: float) -> BatchMean:
+    """Returns truth / model with its standard error; NaN if the model is 0."""
     return BatchMean(truth.value / model, truth.standard_error / model) if model else BatchMean(np.nan, np.nan)
 
 
 def _series(cells: Sequence[LightCell]) -> list[tuple[str, tuple[float, float, float, float], list[LightCell]]]:
-    """Returns label, colour and cells by water."""
+    """Returns name, colour and cells of each water type."""
     waters = list(dict.fromkeys(cell.water for cell in cells))
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(waters)))
     return [
@@ -65,7 +67,7 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
                 label=water if lamps == "leds" else None,
             )  # fmt: skip
     axes.axhline(1.0, color="#9aa8b0", linewidth=1)
-    axes.set(yscale="log", xlabel="height [m], beside each other: the pixels", ylabel=label, title=label)
+    axes.set(yscale="log", xlabel="height [m], pixels side by side", ylabel=label, title=label)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.legend(fontsize=7, title="circles: LED lamps\ntriangles: spots", title_fontsize=7, loc="center left",
                 bbox_to_anchor=(1.0, 0.5))  # fmt: skip

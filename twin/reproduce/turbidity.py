@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from twin.app.look import image_quality, render_view
 from twin.core.records import StereoRig
-from twin.imaging.forward_scatter import ForwardScatter
 from twin.imaging.illumination import Illumination
 from twin.imaging.optics import Optics
 from twin.reproduce import turbidity_sheet
@@ -34,7 +33,7 @@ ALTITUDE_M = 0.9
 SETTINGS = (
     f"water.jerlov={JERLOV}", f"plan.altitude_m={ALTITUDE_M}", "plan.area_m=[0.2, 0.2]", "plan.tracks=1",
     "plan.speed_mps=0.05", "rig.image_width_px=480", "rig.image_height_px=360", "terrain.kind=flat",
-    "terrain.relief_m=0.0", "imaging.shadows=true", "imaging.forward_scatter=true",
+    "terrain.relief_m=0.0", "imaging.shadows=true",
 )  # fmt: skip
 RANGES_M: Array = np.arange(0.3, 12.01, 0.05)
 
@@ -42,7 +41,7 @@ RANGES_M: Array = np.arange(0.3, 12.01, 0.05)
 def render_levels(
     turbidities: Sequence[float] = TURBIDITIES, settings: Sequence[str] = (), ranges_m: Array = RANGES_M
 ) -> list[TurbidityLevel]:
-    """Returns one level per turbidity: image of the test object, a block on sand, its quality, and contrast over range.
+    """Returns the results at each turbidity: image of a block on sand, its quality, and the contrast at each range.
 
     Args:
         turbidities: values of `water.turbidity`.
@@ -67,7 +66,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     (Duntley 1963, here for lamps that are fixed to the camera).
 
     Args:
-        scenario: source of the lamps and the camera.
+        scenario: settings of the lamps and the camera.
         illumination: water and daylight.
         ranges_m: (n,) ranges at which the contrast is computed.
 
@@ -77,15 +76,13 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     rig: StereoRig = replace(scenario.believed_rig(), width_px=64, height_px=48)
     rig = replace(rig, focal_px=rig.focal_px * 64 / scenario.rig.image_width_px)
     optics = Optics(rig, illumination, scenario.lamps)
-    forward_scatter = ForwardScatter(rig, illumination.water)
     floor = np.full((48, 64, 3), 128, np.uint8)
     contrast = np.empty((len(ranges_m), 3))
     for k, range_m in enumerate(ranges_m):
         depth = np.full(floor.shape[:2], range_m, np.float32)
-        direct, backscatter = optics.split(floor, depth, 0)
-        forward = forward_scatter.spread(direct, depth)
+        direct, forward, backscatter = optics.parts(floor, depth, 0)
         centre = np.s_[20:28, 28:36]
-        parts = (direct, forward + backscatter)
+        parts = (direct, backscatter if forward is None else forward + backscatter)
         signal, scattered = (np.mean(part[centre], axis=(0, 1), dtype=np.float64) for part in parts)
         contrast[k] = signal / (signal + scattered)
     return contrast
@@ -103,7 +100,7 @@ def summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
                 "turbidity": level.scenario.water.turbidity,
                 "attenuation_per_m": level.water.attenuation_per_m.tolist(),
                 "gray_level_sd": (level.image.std(axis=(0, 1)) / 255).tolist(),
-                "sight_m": level.visibility_m,
+                "visibility_m": level.visibility_m,
             }
             | {name: level.quality[name] for name in names}
             for level in levels
@@ -124,7 +121,7 @@ def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
             f"{row['turbidity']:g}", f"{row['attenuation_per_m'][1]:.2f} /m", f"{row['contrast'][1]:.3f}",
             f"{100 * row['veil_share'][1]:.0f} %", f"{255 * row['gray_level_sd'][1]:.1f}",
             f"{row['texture_snr'][1]:.1f}",
-            f"over {max_range_m:.0f} m" if row["sight_m"] is None else f"{row['sight_m']:.2f} m",
+            f"over {max_range_m:.0f} m" if row["visibility_m"] is None else f"{row['visibility_m']:.2f} m",
         )
         for row in summary["levels"]
     ]  # fmt: skip

@@ -26,7 +26,11 @@ _PATH_KEYS = (
     "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.texture_file", "water.spectrum_file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
-_RENAMED_KEYS = {"calibration": "calibration_error", "imaging.calibration": "imaging.error_model"}
+_RENAMED_KEYS = {
+    "calibration": "calibration_error",
+    "imaging.calibration": "imaging.error_model",
+    "imaging.forward_scatter": "imaging.scattering",
+}
 _ABSENT = object()
 #: Largest number of errors of one file that are listed.
 _MAX_ERRORS = 20
@@ -330,7 +334,7 @@ _ALLOWED = {
 
 
 def shown(text: str, longest: int = 200) -> str:
-    """Returns a text for a message, shortened if it has more than `longest` characters."""
+    """Returns a string for an error message, shortened if it has more than `longest` characters."""
     return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
 
 

@@ -36,8 +36,8 @@ def _water(scenario: Scenario) -> list[str]:
     clear = water.jerlov == "clear" and water.absorption_per_m is None and water.spectrum_file is None
     absent = {
         "no absorption": clear,
-        "no scattering": clear or water.turbidity == 0,
-        "no forward scatter": not (clear or scenario.imaging.forward_scatter),
+        "no scattering": clear or water.turbidity == 0 or scenario.imaging.scattering == "none",
+        "no multiple scattering": not clear and scenario.imaging.scattering == "single",
         "no marine snow": scenario.snow.density_per_m3 == 0,
         "no current": not any(scenario.current.velocity_mps),
     }

@@ -16,6 +16,7 @@ from twin.core.paths import path_problem
 from twin.core.records import SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.errors import TwinError
+from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
@@ -26,6 +27,9 @@ Metres = Annotated[float, Field(gt=0, le=1e5)]
 Efficiency = Annotated[float, Field(gt=0, le=1)]
 PerMetre = Annotated[float, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[float, Field(ge=0, le=90)]
+WhiteGain = Annotated[float, Field(ge=1, le=16)]
+BlurPx = Annotated[float, Field(ge=0, le=2)]
+LateralColour = Annotated[float, Field(ge=-0.02, le=0.02)]
 RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -92,6 +96,25 @@ class TerrainConfig(Section):
     texture_px_m: float = Field(
         default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the sea floor [m]"
     )
+    material: Literal["lambert", "oren_nayar", "hapke"] = Field(
+        default="lambert",
+        description="reflection of the light of lamps. lambert: ideally diffuse; oren_nayar: rough, brighter towards "
+        "the light; hapke: a layer of grains with an opposition effect. The texture is the albedo",
+    )
+    roughness_deg: float = Field(
+        default=20.0, ge=0, le=60,
+        description="standard deviation of the slopes too small for the height grid; oren_nayar only [deg]",
+    )  # fmt: skip
+    specular: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="fraction of the light of lamps that is mirrored in highlights, for wet or metallic floors; the "
+        "rest is reflected by the material",
+    )
+    specular_width_deg: float = Field(
+        default=15.0, ge=2, le=45, description="width of the highlights: slope of the mirroring facets (GGX) [deg]"
+    )
 
 
 class VehicleConfig(Section):
@@ -112,8 +135,8 @@ class VehicleConfig(Section):
 class RigConfig(Section):
     """Calibrated stereo pair that looks down, with the top of the image towards the bow."""
 
-    image_width_px: int = Field(default=320, ge=64, le=2048, description="image width [px]")
-    image_height_px: int = Field(default=240, ge=48, le=2048, description="image height [px]")
+    image_width_px: int = Field(default=320, ge=64, le=4096, description="image width [px]")
+    image_height_px: int = Field(default=240, ge=48, le=4096, description="image height [px]")
     hfov_deg: float = Field(default=60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
     baseline_m: float = Field(default=0.15, gt=0.005, le=3, description="distance between the cameras [m]")
     frame_rate_hz: float = Field(
@@ -122,6 +145,10 @@ class RigConfig(Section):
     mount_m: Vector3 = Field(
         default=(0.0, 0.0, -0.15), description="midpoint of the cameras in the body frame: forward, left, up [m]"
     )
+
+
+#: How light is scattered: see `imaging.scattering`.
+ScatteringModel = Literal["full", "single", "none"]
 
 
 class ImagingConfig(Section):
@@ -137,8 +164,8 @@ class ImagingConfig(Section):
     )
     extrapolate: bool = Field(
         default=False,
-        description="fly a surrogate survey that lies outside the range of the error model's fit, with a warning, "
-        "instead of refusing it; set by --extrapolate",
+        description="run a surrogate survey that lies outside the fitted range of its error model, with a warning; "
+        "false: such a survey is refused; set by --extrapolate",
     )
     gray_level: float = Field(
         default=0.45, gt=0.01, lt=1, description="target of auto-exposure: mean image level, a fraction of full scale"
@@ -151,9 +178,12 @@ class ImagingConfig(Section):
         description="shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; "
         "unused with [sensor]",
     )  # fmt: skip
-    shadows: bool = Field(default=False, description="the sea floor casts shadows in the light of each lamp")
-    forward_scatter: bool = Field(
-        default=False, description="light scattered forward on its path to the camera adds a blur that grows with range"
+    shadows: bool = Field(default=False, description="the sea floor casts shadows in the light of lamps and sun")
+    scattering: ScatteringModel = Field(
+        default="full",
+        description="full: multiple scattering, which softens the beams, blurs the image and brightens the "
+        "backscatter; single: light scattered once is the backscatter, all other scattered light is lost; "
+        "none: the water absorbs but does not scatter",
     )
 
 
@@ -195,13 +225,31 @@ class SensorConfig(Section):
     readout_ms: float = Field(
         default=0.0, ge=0, le=1000, description="rolling shutter: first to last row; 0 is a global shutter [ms]"
     )
+    tone_curve: Literal["linear", "srgb", "log"] = Field(
+        default="linear",
+        description="level of the delivered image as a function of the signal: proportional; sRGB (IEC 61966-2-1); or "
+        "logarithmic over 6 stops; imaging.gray_level is the level after the curve",
+    )
+    white_balance: Literal["white_light", "gains", "grey_world", "temperature", "water"] = Field(
+        default="white_light",
+        description="what appears grey: a grey surface in white light; gains: white_gains are set by hand; grey_world: "
+        "the mean of the image; temperature: a grey surface in light of white_temperature_k; water: a grey floor seen "
+        "from the planned altitude in the water of the scenario",
+    )
+    white_gains: tuple[WhiteGain, WhiteGain, WhiteGain] = Field(
+        default=(1.0, 1.0, 1.0), description="gains: factors of the raw signals R, G, B"
+    )
+    white_temperature_k: float = Field(
+        default=6500.0, ge=1000, le=40000, description="temperature: colour temperature of the light [K]"
+    )
 
 
 class LensConfig(Section):
-    """True distortion of both lenses (Brown-Conrady, as in OpenCV); images are rectified with calibrated coefficients.
+    """True distortion and blur of both lenses (Brown-Conrady, as in OpenCV).
 
-    The calibrated coefficients differ from the true ones by `calibration_error.k1_error` and `k2_error`. The image
-    coordinates of the model are tangents of field angles in the air behind the port, or in water if there is no port.
+    Images are rectified with calibrated coefficients, which differ from the true ones by `calibration_error.k1_error`
+    and `k2_error`. The image coordinates of the model are normalised coordinates in the air behind the port, or in
+    water if there is no port.
     """
 
     k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, coefficient of r^2")
@@ -209,6 +257,19 @@ class LensConfig(Section):
     k3: float = Field(default=0.0, ge=-10, le=10, description="radial distortion, coefficient of r^6")
     p1: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the columns")
     p2: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the rows")
+    diffraction: bool = Field(default=False, description="blur by diffraction at sensor.f_number; needs [sensor]")
+    blur_px: tuple[BlurPx, BlurPx, BlurPx] = Field(
+        default=(0.0, 0.0, 0.0),
+        description="blur by aberrations: standard deviation of a Gaussian point spread function for R, G, B [px]",
+    )
+    lateral_colour: tuple[LateralColour, LateralColour] = Field(
+        default=(0.0, 0.0), description="magnification of the images in R and in B relative to that in G, minus 1"
+    )
+    focus_m: float = Field(
+        default=0.0, ge=0, le=1000,
+        description="depth in focus; other depths are blurred by the aperture (sensor.f_number); 0: all depths are in "
+        "focus; needs [sensor] [m]",
+    )  # fmt: skip
 
 
 class PortConfig(Section):
@@ -236,7 +297,7 @@ class PortConfig(Section):
         description="dome: centre relative to the entrance pupil, along right, down, forward [m]",
     )
     glass_index: float = Field(
-        default=1.49, ge=1, le=3, description="refractive index of the port: acrylic 1.49, glass 1.52"
+        default=1.49, ge=1, le=3, description="refractive index of the window of the port: acrylic 1.49, glass 1.52"
     )
     water_index: float = Field(default=1.339, ge=1, le=2, description="refractive index of sea water")
     calibrated_at_m: float = Field(
@@ -274,7 +335,15 @@ class CalibrationErrorConfig(Section):
 class WaterConfig(Section):
     """Inherent optical properties of the water for R, G, B: those of a Jerlov type, or given explicitly."""
 
-    jerlov: JERLOV = Field(default="IB", description="Jerlov water type, or clear (no attenuation, no scattering)")
+    source: WaterSourceName = Field(
+        default="solonenko2015",
+        description="table of absorption and scattering of the Jerlov types: Solonenko & Mobley 2015 (all types, "
+        "derived from measured Kd) or Williamson & Hollins 2022 (IB, II, III, 1C, 3C, 5C; measured), whose scattering "
+        "at 550 nm is 0.29 (III) to 2.3 times (IB) as large",
+    )
+    jerlov: JERLOV = Field(
+        default="IB", description="Jerlov water type of the source, or clear (no attenuation, no scattering)"
+    )
     turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies the scattering coefficient")
     absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
         default=None,
@@ -289,22 +358,49 @@ class WaterConfig(Section):
         description="CSV of wavelength [nm], absorption and scattering [1/m]; replaces the Jerlov type; "
         "${TWIN_DATA} is expanded",
     )
+    phase_function: Literal["sea", "petzold", "fournier_forand", "henyey_greenstein"] = Field(
+        default="sea",
+        description="angular distribution of scattered light: sea (molecules by Morel, the rest of the scattering by "
+        "Petzold's average particle), or one function alone: petzold, fournier_forand, henyey_greenstein",
+    )
+    particle_index: float = Field(
+        default=1.1, gt=1.0, le=1.5,
+        description="fournier_forand: refractive index of the particles relative to water",
+    )  # fmt: skip
+    particle_slope: float = Field(
+        default=3.58, gt=3.0, lt=5.0,
+        description="fournier_forand: exponent of the size distribution of the particles",
+    )  # fmt: skip
     mean_cosine: float = Field(
         default=0.924, ge=0, le=0.99,
-        description="mean cosine of the scattering angle (Henyey-Greenstein's g); 0 is isotropic",
-    )  # fmt: skip
-    kept_share: float = Field(
-        default=0.0, ge=0, le=1,
-        description="fraction k of the scattered light that stays in the beam (multiple scattering): attenuation is "
-        "a + (1 - k) b, from the beam attenuation c (k = 0) to absorption alone (k = 1); k = 0.74 is the fraction "
-        "scattered by less than 15 deg",
+        description="henyey_greenstein: mean cosine g of the scattering angle; 0 is isotropic",
     )  # fmt: skip
 
     @property
     def label(self) -> str:
         """Name of the water in reports."""
         own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
-        return f"{own or self.jerlov}, turbidity {self.turbidity:g}"
+        return f"{own or self._type_label}, turbidity {self.turbidity:g}"
+
+    @property
+    def _type_label(self) -> str:
+        """Name of the Jerlov type with its source, or clear."""
+        return f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
+
+    @property
+    def is_jerlov_type(self) -> bool:
+        """Whether absorption and scattering are those of a Jerlov type."""
+        return self.jerlov != "clear" and self.absorption_per_m is None and self.spectrum_file is None
+
+    @field_validator("jerlov")
+    @classmethod
+    def _require_type_of_source(cls, jerlov: str, info: ValidationInfo) -> str:
+        """Rejects a type that the source does not have."""
+        source = info.data.get("source")
+        if source is None or jerlov in (allowed := ("clear", *WATER_SOURCES[source].types)):
+            return jerlov
+        text = f"{', '.join(allowed)} with source = {source}"
+        raise PydanticCustomError("water_type", "{allowed}", {"allowed": text})
 
 
 class LampConfig(Section):
@@ -312,10 +408,16 @@ class LampConfig(Section):
 
     position_m: Vector3 = Field(description="position in the body frame: forward, left, up [m]")
     tilt_deg: float = Field(
-        default=0.0, ge=-90, le=90, description="tilt of the beam axis from straight down towards the bow [deg]"
+        default=0.0,
+        ge=-90,
+        le=90,
+        description="angle of the beam axis towards the bow, from the vertical plane across the vehicle [deg]",
     )
     pan_deg: float = Field(
-        default=0.0, ge=-90, le=90, description="tilt of the beam axis from straight down towards port [deg]"
+        default=0.0,
+        ge=-90,
+        le=90,
+        description="rotation of the beam axis in the plane across the vehicle, from straight down to port [deg]",
     )
     intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the beam axis [cd]")
     beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(
@@ -330,9 +432,26 @@ class LampConfig(Section):
 
 
 class SunConfig(Section):
-    """Daylight from straight above."""
+    """Daylight of sun and sky through a level water surface."""
 
-    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5, description="illuminance of white daylight [lx]")
+    illuminance_lx: float = Field(
+        default=0.0, ge=0, le=2e5,
+        description="illuminance of a horizontal plane by white daylight, just below the surface [lx]",
+    )  # fmt: skip
+    elevation_deg: float = Field(
+        default=90.0,
+        ge=1,
+        le=90,
+        description="elevation of the sun above the horizon, in air; the surface refracts its light; 90: zenith [deg]",
+    )
+    azimuth_deg: float = Field(
+        default=0.0, ge=-360, le=360, description="direction to the sun, counter-clockwise from x (east) [deg]"
+    )
+    sky_share: float = Field(
+        default=0.2, ge=0, le=1,
+        description="share of the illuminance that is diffuse light of a uniform sky; 0.2: clear sky, high sun; "
+        "1: overcast",
+    )  # fmt: skip
     depth_m: float = Field(
         default=0.0, ge=0, le=500,
         description="depth of the reference plane z = 0 below the water surface; illuminance_lx applies at the surface "
@@ -340,15 +459,32 @@ class SunConfig(Section):
     )  # fmt: skip
     caustics: float = Field(
         default=0.0, ge=0, le=1,
-        description="fraction of the daylight that is direct sunlight, which waves focus into caustics; needs depth_m",
+        description="fraction of the daylight that surface waves focus into caustics; needs depth_m",
+    )  # fmt: skip
+    wind_mps: float = Field(
+        default=5.0, ge=3, le=15,
+        description="wind speed 10 m above the sea, which makes the waves of the caustics; it blows towards east [m/s]",
     )  # fmt: skip
 
 
 class SnowConfig(Section):
-    """Marine snow: white particles that drift with the current through the light."""
+    """Marine snow: particles that drift with the current through the light of lamps and sun."""
 
     density_per_m3: float = Field(default=0.0, ge=0, le=5000, description="particles per cubic metre; 0: none [1/m3]")
-    diameter_m: float = Field(default=0.001, ge=0.0001, le=0.02, description="diameter of a particle [m]")
+    diameter_m: float = Field(
+        default=0.001, ge=0.0001, le=0.02, description="diameter of all particles, without junge_exponent [m]"
+    )
+    junge_exponent: float | None = Field(
+        default=None, gt=1, le=8,
+        description="size distribution: the number of particles per interval of diameter falls as this power of the "
+        "diameter, from diameter_min_m to diameter_max_m (Junge); 3 to 5 in the sea; default: one diameter",
+    )  # fmt: skip
+    diameter_min_m: float = Field(
+        default=0.0003, ge=0.0001, le=0.02, description="smallest diameter of the distribution [m]"
+    )
+    diameter_max_m: float = Field(
+        default=0.01, ge=0.0001, le=0.02, description="largest diameter of the distribution [m]"
+    )
     albedo: float = Field(default=0.5, gt=0, le=1, description="albedo of a particle, the fraction of light reflected")
 
 
@@ -601,6 +737,12 @@ class Scenario(Section):
         """Files, line numbers and overrides that the scenario was read from, for error messages."""
         return self._source
 
+    @property
+    def delivers_linear_images(self) -> bool:
+        """Returns whether images are proportional to the radiance: linear tone curve, white balance for white light."""
+        sensor = self.sensor
+        return sensor is None or (sensor.tone_curve == "linear" and sensor.white_balance == "white_light")
+
     def believed_rig(self) -> StereoRig:
         """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""
         rig = self.rig
@@ -635,7 +777,7 @@ class Scenario(Section):
         return EstimatorSettings(**self.estimate.model_dump())
 
     def fingerprint(self) -> str:
-        """Returns a hash of all values, 16 hexadecimal digits; scenarios with equal hashes give the same survey."""
+        """Returns a hash of all values, 16 hexadecimal digits. Input files enter by path, not by content."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 

@@ -47,7 +47,7 @@ def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> Stere
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators; they know the believed calibration and noise and the planned start, but no truth."""
+    """Returns the estimators; they receive the believed calibration and noise and the planned start, but no truth."""
     scenario = mission.scenario
     return Navigator(
         mission.rig,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,7 +13,10 @@ from twin.report.run_writer import RunFolder
 from twin.session.mission_actions import Action, MissionActions
 from twin.world.mission import Mission
 
-_MAX_BLIND_S = 6.0  # the survey is aborted if vision is lost for longer; the vehicle has then been stopped for a while
+#: Vision is lost, and the survey is aborted, if fewer than the fraction _MIN_MEASURED of the frames of the last
+#: _MAX_BLIND_S seconds were measured; the vehicle has then been stopped for a while. Where no floor is visible, a few
+#: percent of the frames match by chance.
+_MAX_BLIND_S, _MIN_MEASURED = 6.0, 0.1
 _MAX_HELD_S = 60.0  # the survey is aborted if the vehicle is stopped for longer in total
 _MAX_SIGMA = 0.5  # largest ratio of position sigma to shorter side of the footprint; the survey is aborted beyond it
 
@@ -53,7 +57,8 @@ class SurveyMonitor:
             from twin.report.recording import LiveViewer
 
             self.live = LiveViewer(mission.rig)
-        self.n_blind, self.status = 0, "ok"
+        self.status = "ok"
+        self._measured = deque([True] * round(_MAX_BLIND_S * self.rate_hz))
         self.actions = MissionActions(mission, self._log_action)
         self.max_sigma_m = _MAX_SIGMA * min(mission.plan.footprint_m)
 
@@ -61,10 +66,11 @@ class SurveyMonitor:
         """Reports the progress and the vision status of one frame.
 
         Raises:
-            SurveyAborted: vision has been lost for too long, or the position has become too uncertain to find the
-                neighbouring swath.
+            SurveyAborted: vision has been lost for too long, the vehicle has been stopped for too long in total, or the
+                position has become too uncertain to find the neighbouring swath.
         """
-        self.n_blind = 0 if estimate.status == "ok" else self.n_blind + 1
+        self._measured.append(estimate.status == "ok")
+        self._measured.popleft()
         if estimate.status != self.status:
             self.folder.log("vision", time_s=estimate.time_s, status=estimate.status)
             self.status = estimate.status
@@ -72,7 +78,7 @@ class SurveyMonitor:
             self.live.log_frame(frame, estimate)
         share = min((frame.index + 1) / self.n_frames, 1.0)  # a slowed survey has more frames than planned
         self.progress(SurveyProgress(estimate.time_s, self.wall_s, share, estimate.sigma_m, "survey"))
-        if self.n_blind > _MAX_BLIND_S * self.rate_hz:
+        if sum(self._measured) < _MIN_MEASURED * len(self._measured):
             raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
         if self.actions.times.held_s > _MAX_HELD_S:
             raise SurveyAborted(f"the vehicle was stopped for {_MAX_HELD_S:g} s in total because vision was lost")

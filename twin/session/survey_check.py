@@ -14,7 +14,7 @@ from twin.world.mission import Mission
 
 MIN_AREA_MAPPED = 0.9  # smallest fraction of the asked area that the map may cover
 MAX_OFF_COURSE = 0.25  # largest ratio of distance from the planned path to shorter side of the image footprint
-_OFF_COURSE_S = 1.0  # departures from the path that last less long are ignored
+_OFF_COURSE_S = 1.0  # shorter departures from the path are ignored
 
 
 def survey_findings(
@@ -32,7 +32,7 @@ def survey_findings(
 
 
 def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
-    """Returns a sentence on the rectification errors that were estimated and removed; empty if none were."""
+    """Returns one sentence on the rectification errors that were estimated and removed; empty if none were removed."""
     epipolar = result.quality.epipolar
     if epipolar is None or not epipolar.removed.any():
         return []

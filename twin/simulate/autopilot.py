@@ -53,7 +53,7 @@ def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
     """Returns the steady thrust (n,) of the most loaded thruster at each velocity, as a fraction of full thrust.
 
     The hull is level. The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the moments in roll and
-    pitch are left to the righting moment.
+    pitch are assumed to be balanced by the righting moment.
 
     Args:
         vehicle: vehicle settings of the scenario, with the factors on drag and added mass and the buoyancy.

@@ -85,7 +85,7 @@ class NavigationSensors:
         )  # fmt: skip
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Draws the standard normal numbers that `read` would draw for the per-frame sensors in the next frames.
+        """Samples the standard normal numbers that `read` would sample for the per-frame sensors in the next frames.
 
         Returns:
             Numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the Doppler velocity log.
@@ -150,7 +150,7 @@ def read_pressure_and_attitude(
 
     The pressure sensor is in the housing of the left camera and measures the height of this camera; its reading
     therefore needs no lever-arm correction, which attitude errors would affect. The AHRS measures roll, pitch and yaw
-    of the body. Noise is drawn for both sensors even if unused, so that random numbers do not depend on `aiding`.
+    of the body. Noise is sampled for both sensors even if unused, so that random numbers do not depend on `aiding`.
 
     Args:
         world_from_body, body_from_camera: (4, 4) true pose of the body, and pose of the left camera in the body.
@@ -233,7 +233,7 @@ def detect_beacons(
 ) -> tuple[BeaconDetection, ...]:
     """Simulates the detection of beacons in the left image; beacons occluded by the floor are not detected.
 
-    Noise is drawn for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
+    Noise is sampled for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
 
     Args:
         world_from_camera: (4, 4) true pose of the left camera.

@@ -17,7 +17,7 @@ from twin.study.statistics import LEVEL, RESAMPLES, Array, Interval, wilson_inte
 
 FIDELITY = "imaging.fidelity"
 MEDIAN_LIMIT = 0.2  #: largest deviation of the ratio of medians, or of its inverse, from 1
-P_LIMIT = 0.01  #: smallest p of the Kolmogorov-Smirnov test
+P_LIMIT = 0.01  #: smallest p-value of the Kolmogorov-Smirnov test
 PASS_LIMIT = 0.9  #: smallest fraction of pairs with the same verdict
 _FLOWN = ("complete", "degraded")  # statuses of a survey that was flown to its end
 
@@ -33,7 +33,7 @@ class MetricAgreement(NamedTuple):
         surrogate: median over the surrogate surveys.
         ratio: `surrogate` / `rendered`, with its confidence interval (percentile bootstrap of pairs); 1 if both medians
             are infinite or zero.
-        p_value: p of the two-sample Kolmogorov-Smirnov test. The samples are paired, so the test is conservative.
+        p_value: p-value of the two-sample Kolmogorov-Smirnov test. The samples are paired, so the test is conservative.
     """
 
     metric: str
@@ -45,7 +45,7 @@ class MetricAgreement(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Returns whether the ratio of medians and the test keep their limits."""
+        """Returns whether the ratio of medians and the p-value are within their limits."""
         within = 1 / (1 + MEDIAN_LIMIT) <= self.ratio.value <= 1 + MEDIAN_LIMIT
         return bool(within and self.p_value >= P_LIMIT)
 
@@ -69,7 +69,7 @@ class Agreement(NamedTuple):
 
     @property
     def verdicts_agree(self) -> bool:
-        """Returns whether the fraction of equal verdicts keeps its limit."""
+        """Returns whether the fraction of pairs with equal verdicts is at least `PASS_LIMIT`."""
         return self.verdicts.value >= PASS_LIMIT
 
     @property

@@ -38,7 +38,7 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for a text key), explained fraction of rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN for strings), explained fraction of rank variance."""
 
     key: str
     metric: str
@@ -68,7 +68,7 @@ class FailureReason(NamedTuple):
 
 
 class RefusedSample(NamedTuple):
-    """A sample whose scenario cannot be flown: its number, number of surveys, value of each varied key, reason."""
+    """A sample with refused surveys: its number, number of refused surveys, value of each varied key, reason."""
 
     sample: int
     surveys: int
@@ -242,7 +242,7 @@ class StudyAnalysis:
 
     @cached_property
     def answers(self) -> dict[str, list[Answer]]:
-        """Returns, for each key, where the pass probability reaches the required value, is below it, or is undecided.
+        """Returns, for each varied key, whether the pass probability reaches the required value; it may be undecided.
 
         A key with a distribution has one answer per range, a key with listed values one per value; the other keys vary
         as the study specifies. Empty without a required pass probability, or if no survey was evaluated.
@@ -285,7 +285,7 @@ class StudyAnalysis:
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Returns a comparison of passed and other surveys for each numeric key, the best separating key first."""
+        """Returns a comparison of passed and other surveys for each numeric key, the greatest difference first."""
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)

@@ -85,7 +85,7 @@ class PassRecord(NamedTuple):
 
 
 def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
-    """Returns one answer for each distinct value of a key with listed values.
+    """Returns the verdict on the pass probability for each distinct value of a key with listed values.
 
     Args:
         names: (n,) value of the key in each survey, numbers or text.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.errors import ScenarioError, TwinError
 from twin.judge.map_error import INFINITE_WITH_HOLES, with_completeness
@@ -153,7 +154,7 @@ class CandidateSurveys:
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
-        """Returns whether the survey has a result; the hash excludes those of other scenarios with the same key."""
+        """Returns whether the survey has a result; one with a different scenario hash belongs to another scenario."""
         score = self._scores.get(survey.key)
         return score is not None and score.status != "failed" and score.scenario_hash == survey.scenario_hash
 
@@ -219,7 +220,7 @@ class CandidateSurveys:
         return count_similar(reasons)
 
     def evaluate(self, number: int, values: dict[str, Any], correction: PlanCorrection = NO_CORRECTION) -> Candidate:
-        """Returns a candidate with its objectives and pass probability; surveys that failed are not counted.
+        """Returns a candidate with its objectives and pass probability; failed surveys are not counted.
 
         Args:
             number: trial number of the candidate.
@@ -234,8 +235,8 @@ class CandidateSurveys:
             1.0 - passing.value if name == "risk" and scores else self._objective(name, scores, correction)
             for name in self.config.objectives
         )
-        beside = [name for name in with_completeness(self.config.objectives) if name not in self.config.objectives]
-        medians = ((name, median_of(scores, name)) for name in beside)
+        further = [name for name in with_completeness(self.config.objectives) if name not in self.config.objectives]
+        medians = ((name, median_of(scores, name)) for name in further)
         completeness = tuple((name, np.nan if value is None else value) for name, value in medians)
         return Candidate(number, values, objectives, passing, shortfall, completeness)
 
@@ -301,11 +302,20 @@ def cost_index(config: TuningConfig) -> int:
 
 def pareto_front(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
     """Returns the Pareto-optimal candidates among the feasible ones, cheapest first; see `cost_index`."""
-    feasible = [candidate for candidate in candidates if candidate.shortfall <= 0]
-    signs = np.array([-1.0 if more_is_better(name) else 1.0 for name in config.objectives])
-    front = [one for one in feasible if not any(_dominates(other, one, signs) for other in feasible)]
-    cost = cost_index(config)
+    signs, cost = objective_signs(config), cost_index(config)
+    front = non_dominated([candidate for candidate in candidates if candidate.shortfall <= 0], config)
     return sorted(front, key=lambda one: ((signs * one.objectives)[cost], tuple(signs * one.objectives), one.number))
+
+
+def non_dominated(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
+    """Returns the candidates than which no other one is better in some objective and worse in none."""
+    signs = objective_signs(config)
+    return [one for one in candidates if not any(_dominates(other, one, signs) for other in candidates)]
+
+
+def objective_signs(config: TuningConfig) -> NDArray[np.float64]:
+    """Returns the sign (n,) of each objective: -1 if larger values are better, else 1."""
+    return np.array([-1.0 if more_is_better(name) else 1.0 for name in config.objectives])
 
 
 def _dominates(one: Candidate, other: Candidate, signs: Any) -> bool:

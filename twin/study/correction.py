@@ -1,4 +1,4 @@
-"""Correction of a plan's surrogate surveys, learnt from plans that were flown both rendered and with the surrogate."""
+"""Correction of a plan's surrogate results, estimated from plans with both rendered and surrogate surveys."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MISSING = 10.0  # ratio of an error metric without a rendered value, e.g. becau
 
 
 class PlanRatio(NamedTuple):
-    """A plan that was flown both rendered and with the surrogate.
+    """A plan with both rendered and surrogate surveys.
 
     `values` are the searched values, `ratios` the ratio rendered / surrogate of each metric, and `complete` is the
     fraction of the rendered surveys with status "complete".
@@ -57,16 +57,16 @@ def metric_ratio(metric: str, rendered: float | None, surrogate: float | None) -
 def correction_at(
     search: dict[str, Distribution], flown: Sequence[PlanRatio], values: dict[str, Any]
 ) -> PlanCorrection:
-    """Returns the correction of a plan, interpolated between the plans that were verified by rendered surveys.
+    """Returns the correction of a plan, by kernel regression over the plans that were verified by rendered surveys.
 
     The logarithm of each ratio is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of the logarithms of the flown
-    plans and of a prior of 0, with which the correction vanishes far from all flown plans. The pass factor is the same
+    plans and of a prior of 0, so that the ratio tends to 1 far from all flown plans. The pass factor is the same
     mean of the completed fractions, with a prior of 1. The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d
     and the kernel width w.
 
     Args:
         search: distribution of each searched key.
-        flown: plans that were flown both rendered and with the surrogate.
+        flown: plans with both rendered and surrogate surveys.
         values: searched values of the plan to correct.
     """
     if not flown:

@@ -72,7 +72,7 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
-    """Shades where the pass probability reaches the required value (green) or misses it (orange); draws this value."""
+    """Shades the ranges that reach the required pass probability (green) or miss it (orange); draws it as a line."""
     answers = analysis.answers.get(key, [])
     if answers:
         axes.axhline(analysis.required_probability or 0.0, color=LIMIT, linestyle=":", linewidth=1)

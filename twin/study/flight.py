@@ -73,7 +73,7 @@ def row_of(survey: Survey, status: str, reason: str) -> Row:
 
     Args:
         survey: the survey.
-        status: "complete"; "degraded" if the survey was flown to its end but the estimators distrust their own results;
+        status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
             "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
             computer failed. A refused or failed survey has no result.
         reason: why the status is not "complete"; else "".

@@ -34,7 +34,7 @@ class StudyProgress:
         self.total = total
         self._update_bar()
 
-    def tell(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Prints a line on stderr."""
         if self.bar:
             self.bar.console.print(text, markup=False, highlight=False)

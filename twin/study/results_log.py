@@ -112,7 +112,7 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names ordered by section: identity, varied keys, metrics, timing; alphabetical within each."""
+    """Returns the names ordered by section: identity in a fixed order, varied keys, metrics and timing by alphabet."""
     identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 

@@ -56,7 +56,7 @@ def run_study(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> StudyResult:
-    """Flies the surveys for which the folder has no result, and writes results.parquet, study.html and agreement.md.
+    """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
     Ctrl-C ends the study early; the results obtained until then are written.
 
@@ -80,7 +80,7 @@ def run_study(
             log.add(row)
     done = log.done() if refused else done
     if refused:
-        progress.tell(refusal_notice(refused))
+        progress.print_line(refusal_notice(refused))
     progress.begin(len(planned - done))
     missing = (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
     run_times_s: list[float] = []

@@ -21,7 +21,7 @@ from twin.study.study_file import Study, TuningConfig
 
 NAME = "twin"  #: name of the Optuna study in the journal
 ROUND_NUMBERS = 1_000_000  #: difference between the first candidate numbers of successive rounds
-_LEARNT = "learnt"  # marks the trials that were added from earlier rounds
+_EARLIER = "earlier_round"  # marks the trials that were added from earlier rounds
 
 
 class Proposal(NamedTuple):
@@ -42,7 +42,8 @@ class Search:
             study: the study.
             config: its section [tune].
             folder: results folder.
-            search_round: round of the search, from 0; a further round begins with the candidates given to `learn`.
+            search_round: round of the search, from 0; a further round begins with the candidates given to
+                `add_earlier_candidates`.
 
         Raises:
             TwinError: the journal in the folder belongs to another search.
@@ -63,8 +64,8 @@ class Search:
             raise TwinError("--resume", f"{folder} contains another search", "the folder of this search")
         self.optuna_study.set_user_attr("identity", identity)
 
-    def learn(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
-        """Adds candidates evaluated in earlier rounds, from which the sampler proposes the first batch of this round.
+    def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
+        """Adds the candidates of earlier rounds; the sampler proposes the first batch of this round from their results.
 
         Does nothing once this round has candidates of its own. After an interruption, adds the ones still missing.
 
@@ -73,7 +74,7 @@ class Search:
                 every call.
         """
         known = self._trials()
-        if any(_LEARNT not in trial.user_attrs for trial in known):
+        if any(_EARLIER not in trial.user_attrs for trial in known):
             return
         for values, objectives, shortfall in islice(candidates, len(known), None):
             self.optuna_study.add_trial(
@@ -82,7 +83,7 @@ class Search:
                     distributions=self.space,
                     values=list(objectives),
                     constraints={"shortfall": shortfall},
-                    user_attrs={_LEARNT: True},
+                    user_attrs={_EARLIER: True},
                 )
             )
 
@@ -96,14 +97,14 @@ class Search:
         if unfinished := [trial for trial in known if trial.state == TrialState.RUNNING]:
             return [self._proposal(Trial(self.optuna_study, trial._trial_id)) for trial in unfinished]
         self.optuna_study.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
-        own = sum(_LEARNT not in trial.user_attrs for trial in known)
+        own = sum(_EARLIER not in trial.user_attrs for trial in known)
         count = min(self.config.batch, self.n_trials - own)
         return [self._proposal(self.optuna_study.ask(self.space)) for _ in range(count)]
 
     def finished(self) -> list[tuple[int, dict[str, Any]]]:
         """Returns, for every candidate evaluated in this round, its number and the values of the searched keys."""
         complete = [trial for trial in self._trials() if trial.state == TrialState.COMPLETE]
-        return [(self.first_number + t.number, dict(t.params)) for t in complete if _LEARNT not in t.user_attrs]
+        return [(self.first_number + t.number, dict(t.params)) for t in complete if _EARLIER not in t.user_attrs]
 
     def record(self, proposal: Proposal, objectives: Sequence[float], shortfall: float) -> None:
         """Records the evaluation of a candidate.

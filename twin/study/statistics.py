@@ -198,9 +198,9 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
 
 
 class SobolIndex(NamedTuple):
-    """First-order and total Sobol index of one sampled axis.
+    """First-order and total Sobol index of one sampled input: a key, or keys that vary jointly.
 
-    They are the fractions of a metric's variance that the axis explains alone, and together with its interactions.
+    They are the fractions of a metric's variance that the input explains alone, and together with its interactions.
     """
 
     first: Interval

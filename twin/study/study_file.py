@@ -64,7 +64,7 @@ class SamplingConfig(Section):
 
 
 class TuningConfig(Section):
-    """Search of `twin tune`, which flies every survey of the study with each candidate plan."""
+    """Settings of the search by `twin tune`, which flies each candidate plan in every survey of the study."""
 
     search: Annotated[dict[str, Distribution], Field(min_length=1)] = Field(
         description="keys of the scenario to optimise, each with a range (uniform, log_uniform) or values (choice)"
@@ -87,13 +87,13 @@ class TuningConfig(Section):
         description="rendered surveys of a plan, all of which must pass before it is recommended, if the search uses "
         "the surrogate; 0: the recommended plan is not verified",
     )
-    plans: int = Field(default=3, ge=1, le=100, description="largest number of plans flown rendered in a round")
+    plans: int = Field(default=3, ge=1, le=100, description="largest number of plans with rendered surveys in a round")
     rounds: int = Field(
         default=2,
         ge=0,
         le=10,
-        description="largest number of further rounds of search while no plan passes rendered; in these rounds the "
-        "surrogate's results are corrected by those of the rendered surveys",
+        description="largest number of further rounds of search while no plan passes in rendered surveys; in these "
+        "rounds the surrogate's results are corrected by those of the rendered surveys",
     )
     keep: KeepLevel | None = Field(
         default=None, description="files to keep of rendered surveys; default: `keep` of the study"

@@ -8,7 +8,16 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from twin.scenario.model import Scenario
-from twin.study.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
+from twin.study.candidates import (
+    Candidate,
+    CandidateSurveys,
+    check_bounds,
+    cost_index,
+    non_dominated,
+    objective_signs,
+    pareto_front,
+    tuning_config,
+)
 from twin.study.correction import PlanCorrection, correction_at
 from twin.study.engine import Engine
 from twin.study.flight import Row, fly
@@ -29,8 +38,8 @@ class TuningResult(NamedTuple):
             any were flown.
         finalists: plans that were evaluated again with new samples and seeds, without correction.
         verifications: plans that were verified by rendered surveys, in the order of flight.
-        recommended: the cheapest plan that passed rendered or, if plans are not verified, the cheapest plan confirmed
-            with new samples and seeds; None if there is none or the search was interrupted.
+        recommended: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest
+            plan confirmed with new samples and seeds; None if there is none or the search was interrupted.
         scenario: scenario of the recommended plan.
         interrupted: whether Ctrl-C ended the search.
         needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
@@ -145,20 +154,23 @@ class Tuning:
     def run(self) -> None:
         """Runs the rounds of the search until a plan can be recommended, or the rounds are used up.
 
-        Each round evaluates candidates, confirms the cheapest plan with new seeds, and flies it rendered.
+        Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
+        After a plan has passed, cheaper plans that the surrogate rejects are verified until one does not pass.
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
         """
+        search_round = 0
         for search_round in range(1 + self.config.rounds):
             self._search(search_round)
             self._verify_front(search_round)
             if self.recommended or not self.verifications:
-                return
+                break
+        self._verify_cheaper(search_round)
 
     @property
     def recommended(self) -> Candidate | None:
-        """Returns the cheapest plan that passed rendered or, if plans are not verified, the cheapest confirmed plan."""
+        """Returns the cheapest plan that passed verification; the cheapest confirmed plan if plans are not verified."""
         if not self.is_verifying:
             return self.confirmed
         passed = [v.surrogate._replace(shortfall=0.0) for v in self.verifications.values() if v.passed]
@@ -188,7 +200,7 @@ class Tuning:
         """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
         search = Search(self.study, self.config, self.folder, search_round)
         if search_round:
-            search.learn((c.values, c.objectives, c.shortfall) for c in self._candidates())
+            search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
         while batch := search.next_batch():
             self.flights.fly(self.trials, {proposal.number: proposal.values for proposal in batch})
             for proposal in batch:
@@ -197,21 +209,58 @@ class Tuning:
         self.plans |= dict(search.finished())
 
     def _verify_front(self, search_round: int) -> None:
-        """Flies the cheapest confirmed plan rendered, corrects the predictions of all plans by the result, and repeats.
+        """Verifies the cheapest confirmed plan by rendered surveys and corrects all plans by their results; repeats.
 
-        Ends when the cheapest confirmed plan has already passed rendered, when no plan is confirmed, or after
+        Ends when the cheapest confirmed plan has already passed verification, when no plan is confirmed, or after
         `config.plans` plans.
         """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
             if chosen is None or not self.is_verifying or chosen.number in self.verifications:
                 return
-            self._announce(chosen, (self.config.rounds - search_round + 1) * self.config.plans - k)
-            self.flights.fly(self.rendered, {chosen.number: chosen.values})
-            surrogate = self.finalists[chosen.number]
-            verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
-            self.verifications[chosen.number] = verification
-            self.flights.progress.tell(verification.notice())
+            self._verify(chosen, (self.config.rounds - search_round + 2) * self.config.plans - k, search_round)
+
+    def _verify_cheaper(self, search_round: int) -> None:
+        """Verifies cheaper plans than the recommended one, until one does not pass or after `config.plans` plans.
+
+        The surrogate may be pessimistic, so a plan that it rejects can still pass.
+        """
+        for k in range(self.config.plans if self.is_verifying else 0):
+            if (cheaper := self._next_cheaper()) is None:
+                return
+            self._confirm(cheaper)
+            self._verify(cheaper, self.config.plans - k, search_round)
+            if not self.verifications[cheaper.number].passed:
+                return
+
+    def _next_cheaper(self) -> Candidate | None:
+        """Returns the cheaper plan than the recommended one that is most likely to pass; None if there is none.
+
+        It is one of the plans that no other cheaper plan dominates: the one with the smallest shortfall of the pass
+        probability, and the most expensive one of several with the same shortfall.
+        """
+        if self.recommended is None:
+            return None
+        sign, cost = objective_signs(self.config), cost_index(self.config)
+        most = self.recommended.objectives[cost] * sign[cost]
+        cheaper = [c for c in self._candidates() if c.objectives[cost] * sign[cost] < most]
+        front = [one for one in non_dominated(cheaper, self.config) if one.number not in self.verifications]
+        return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)
+
+    def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
+        """Flies the rendered surveys of a confirmed plan and compares them with its surrogate surveys.
+
+        Args:
+            plan: the plan.
+            most_plans: largest number of plans still to be verified in the search, including this one.
+            search_round: round of the search, from 0.
+        """
+        self._announce(plan, most_plans)
+        self.flights.fly(self.rendered, {plan.number: plan.values})
+        surrogate = self.finalists[plan.number]
+        verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
+        self.verifications[plan.number] = verification
+        self.flights.progress.print_line(verification.notice())
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
         """Prints how many rendered surveys of a plan are to be flown, and their expected run time.
@@ -222,27 +271,31 @@ class Tuning:
         """
         if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
             times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
-            self.flights.progress.tell(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
+            self.flights.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
 
     def _cheapest_confirmed(self) -> Candidate | None:
         """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
 
-        Bisects the front, as a more expensive plan usually has a higher pass probability; flies the surveys it needs.
-        Returns None if no plan that it tried reaches the required pass probability.
+        Bisects the front, because a more expensive plan usually has a higher pass probability, and flies the surveys
+        that this requires. Returns None if no plan evaluated in the bisection reaches the required pass probability.
         """
         front, found = pareto_front(self._candidates(), self.config), None
         first, end = 0, len(front)
         while first < end:
             middle = (first + end) // 2
-            number, values = front[middle].number, front[middle].values
-            self.flights.fly(self.confirmation, {number: values})
-            self.finalists[number] = self.confirmation.evaluate(number, values)
-            confirmed = self._evaluate(self.confirmation, number, values)
+            confirmed = self._confirm(front[middle])
             if confirmed.shortfall <= 0:
                 found, end = confirmed, middle
             else:
                 first = middle + 1
         return found
+
+    def _confirm(self, plan: Candidate) -> Candidate:
+        """Flies a plan with new samples and seeds, adds it to the finalists, and returns its corrected evaluation."""
+        number, values = plan.number, plan.values
+        self.flights.fly(self.confirmation, {number: values})
+        self.finalists[number] = self.confirmation.evaluate(number, values)
+        return self._evaluate(self.confirmation, number, values)
 
     def _candidates(self) -> list[Candidate]:
         """Returns all candidates evaluated so far, corrected by the rendered surveys."""

@@ -26,7 +26,7 @@ from twin.study.tuning import TuningResult
 from twin.study.verification import Verification
 
 NOT_VERIFIED = (
-    "Not verified: the plan was not flown rendered (verify = 0), and the surrogate's prediction may not hold."
+    "Not verified: the plan has no rendered surveys (verify = 0), and the surrogate's prediction may not hold."
 )
 _LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
 FRONT, FEASIBLE, INFEASIBLE = COLOURS["final"], COLOURS["link"], COLOURS["f2f"]
@@ -63,8 +63,8 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
 def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
     """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
     count = f"{len(result.candidates)} plans were evaluated"
-    if flown := len(result.verifications):
-        count += f", {flown} of them also flown rendered"
+    if n_rendered := len(result.verifications):
+        count += f", {n_rendered} of them also in rendered surveys"
     if (chosen := result.recommended) is None:
         return f"No plan is recommended: {_missing_plan(study, result, count)}"
     values = ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
@@ -82,7 +82,7 @@ def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
         for name, (surrogate, rendered) in verification.medians.items()
     )
     return (
-        f"Recommended plan: {values}. Flown rendered, {verification.n_passed} of {verification.surveys} surveys were "
+        f"Recommended plan: {values}. {verification.n_passed} of {verification.surveys} rendered surveys were "
         f"completed and met every requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
         f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
     )
@@ -105,12 +105,12 @@ def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
     if result.verifications:
         surveys = sum(v.surveys - v.n_failed for v in result.verifications)
         passed = sum(v.n_passed for v in result.verifications)
-        unflown = sum(v.n_failed for v in result.verifications)
+        n_failed = sum(v.n_failed for v in result.verifications)
         failed = (
-            f"; {unflown} more failed because of the computer or the program, --resume flies them" if unflown else ""
+            f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
         )
         return (
-            f"no plan of the search passed when flown rendered. {count}; {passed} of {surveys} rendered surveys "
+            f"no plan of the search passed in rendered surveys. {count}; {passed} of {surveys} rendered surveys "
             f"passed{failed}."
         )
     required = f"the required pass probability of {percent(required_probability(study))}"
@@ -118,18 +118,18 @@ def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
 
 
 def warnings(result: TuningResult) -> list[str]:
-    """Returns the warnings of a search: unverified plan, errors of the surrogate, refused plans, and the surveys'."""
+    """Returns the warnings of a search: unverified plan, surrogate errors, refused plans, warnings of surveys."""
     texts = []
     if result.recommended and result.needs_rendering and result.recommended_verification is None:
         texts.append(NOT_VERIFIED)
-    flown = [result.recommended_verification] if result.recommended_verification else result.verifications
-    for verification in flown:
+    verified = [result.recommended_verification] if result.recommended_verification else result.verifications
+    for verification in verified:
         for name, ratio in verification.ratio.ratios.items():
             if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
                 surrogate, rendered = (_metric(name, value) for value in verification.medians[name])
                 texts.append(
                     f"Plan {verification.surrogate.number}: the surrogate is wrong about the "
-                    f"{wording.metric_name(name)}: {surrogate} expected, {rendered} flown rendered."
+                    f"{wording.metric_name(name)}: {surrogate} expected, {rendered} in rendered surveys."
                 )
         texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
     texts += [
@@ -154,7 +154,7 @@ def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[st
         "candidates": len(result.candidates),
         "interrupted": result.interrupted,
         "recommended": recommended,
-        "flown_rendered": [_rendered(one) for one in result.verifications],
+        "verifications": [_rendered(one) for one in result.verifications],
         "warnings": warnings(result),
         "headline": headline(study, config, result),
     }

@@ -47,7 +47,7 @@ class Verification(NamedTuple):
     def notice(self) -> str:
         """Returns the result in one line."""
         failed = f", {self.n_failed} failed because of the computer or the program" if self.n_failed else ""
-        return f"Plan {self.surrogate.number} flown rendered: {self.n_passed} of {self.surveys} surveys passed{failed}"
+        return f"Plan {self.surrogate.number}: {self.n_passed} of {self.surveys} rendered surveys passed{failed}"
 
 
 def verification_of(

@@ -79,7 +79,7 @@ def confidence(interval: Interval) -> str:
 def headline(study: Study, analysis: StudyAnalysis) -> str:
     """Returns the main results of a study: passing values of the `seek` key, pass probability, requirement met or not.
 
-    Names the surveys that are left out.
+    Also states the numbers of surveys that are not counted.
     """
     n = int(analysis.evaluated.sum())
     left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)

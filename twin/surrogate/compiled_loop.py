@@ -12,7 +12,7 @@ from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist,
 from twin.simulate.sensors import read_per_frame_sensors
 from twin.surrogate.sampling import sample_f2f_motion
 from twin.surrogate.vision import SurrogateVision
-from twin.world.mission import Course
+from twin.world.mission import FrameSequence
 from twin.world.pilot import RovPilot, steer
 from twin.world.world import FastForward, World
 
@@ -23,18 +23,19 @@ def compiled_loop(
     """Returns a function that runs the compiled closed loop from a given frame to the next keyframe.
 
     It performs the same operations with the same random numbers as the loop in `survey.fly`, so the results are equal.
-    It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no frames.
+    It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no frames. If the
+    physics diverges, it keeps the frames up to the one at which this was detected, and raises SurveyAborted.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
     sensors, n_steps = world.sensors.per_frame_sensors(), round(interval_s / vehicle.state.timestep_s)
 
-    def fast_forward(course: Course, first: int) -> int:
-        errors, ahead = vision.frame_errors, course.keyframe[first:]
+    def fast_forward(sequence: FrameSequence, first: int) -> int:
+        errors, ahead = vision.frame_errors, sequence.keyframe[first:]
         end = first + (int(np.argmax(ahead)) if ahead.any() else len(ahead))
         if errors is None or end == first:
             return first
-        n, reference = end - first, tuple(np.asarray(part)[first:end] for part in course.reference)
+        n, reference = end - first, tuple(np.asarray(part)[first:end] for part in sequence.reference)
         numbers = vision.draw_normals(n), *world.sensors.draw_noise(n)
         with world.stopwatch("physics"):
             n, state, true, f2f, online = _fly(
@@ -48,7 +49,7 @@ def compiled_loop(
         navigator.set_dead_reckoning(state)
         navigator.log.append(times_s, f2f[:n], online[:n])
         vehicle.advance_clock(n / rate_hz)
-        return end
+        return first + n
 
     return fast_forward
 
@@ -59,7 +60,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
 
     Returns:
         Number of simulated frames (fewer than n if the vehicle's state diverged), dead-reckoning state after the last
-        frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated from F2F alone, and online estimates.
+        frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated from F2F alone, and online estimates;
+        only the simulated frames are set.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals

@@ -23,8 +23,8 @@ class Quantity(NamedTuple):
         label: name in messages.
         unit: unit in messages, with a leading space; "" for a ratio.
         factor: factor by which a value may lie outside the fitted range.
-        limits: sides of the fitted range on which a survey may not leave it. On the other side, the functions of the
-            error model approach a limit that the surveys of the fit determine, e.g. that of noise-free images.
+        limits: ends of the fitted range that restrict the use of the error model. Beyond the other end, the functions
+            of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free images.
     """
 
     label: str
@@ -33,10 +33,10 @@ class Quantity(NamedTuple):
     limits: Literal["both", "lower", "upper"] = "both"
 
 
-#: Quantities that an error model may be limited in, by name. A name in the table [fitted_range] of the file must be one
-#: of these, and `survey_conditions` must return it.
+#: Quantities whose fitted range may restrict the use of an error model, by name. A name in the table [fitted_range] of
+#: the file must be one of these, and `survey_conditions` must return it.
 QUANTITIES = {
-    "bound_px": Quantity("matching precision at medium depth (Cramer-Rao bound)", " px", 1.5, "upper"),
+    "bound_px": Quantity("matching precision at medium depth (Cramér-Rao bound)", " px", 1.5, "upper"),
     "unevenness_px": Quantity(
         "unevenness of the floor under a patch", " px per unit of baseline / depth", 1.5, "upper"
     ),
@@ -51,7 +51,7 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
 
     Args:
         mission: the survey.
-        matchability: precision of matching on its floor.
+        matchability: matchability of its floor.
     """
     bound_px = matchability.bound_at(float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1])))
     overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
@@ -65,8 +65,8 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
     }
 
 
-class Departure(NamedTuple):
-    """Quantity whose values in a survey lie outside the range that the error model may be used in.
+class QuantityOutsideFit(NamedTuple):
+    """Quantity whose values in a survey lie outside the range in which the error model may be used.
 
     Args:
         quantity: the quantity.
@@ -92,12 +92,12 @@ class Departure(NamedTuple):
         return f"{side} {self.allowed[self.quantity.limits == 'upper']:.3g}{self.quantity.unit}"
 
 
-def departures(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[Departure]:
-    """Returns the quantities of a survey that lie outside the fitted range by more than their factor.
+def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
+    """Returns the quantities of a survey outside the fitted range, extended by `Quantity.factor` at its `limits`.
 
     Args:
         conditions: smallest and largest value of each quantity in the survey, by name.
-        fitted: smallest and largest value of each limited quantity in the surveys of the fit, by name.
+        fitted: smallest and largest value of each quantity in the surveys of the fit, by name.
     """
     found = []
     for name in [name for name in fitted if name in conditions]:
@@ -106,11 +106,11 @@ def departures(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> 
         highest = math.inf if quantity.limits == "lower" else largest * quantity.factor
         allowed = lowest, highest
         if not allowed[0] <= low <= high <= allowed[1]:
-            found.append(Departure(quantity, (low, high), allowed))
+            found.append(QuantityOutsideFit(quantity, (low, high), allowed))
     return found
 
 
 def _text(values: Range) -> str:
-    """Returns a range as text, or its only value."""
+    """Returns a range as text; one number if both ends are equal when rounded."""
     low, high = (f"{value:.3g}" for value in values)
     return low if low == high else f"{low} to {high}"

@@ -1,6 +1,6 @@
 """Error model of the surrogate: standard deviations and success rates of the image measurements of a survey.
 
-Most of them are functions of the Cramer-Rao lower bound on the standard deviation of a matched patch's position (see
+Most of them are functions of the Cramér-Rao lower bound on the standard deviation of a matched patch's position (see
 `matchability`). The parameters are fitted to rendered surveys.
 """
 
@@ -14,7 +14,7 @@ from twin.core.geometry import Array
 
 
 class SigmaLaw(NamedTuple):
-    """Standard deviation as a function of the Cramer-Rao bound c [px]: sqrt(floor_px^2 + (slope c)^2).
+    """Standard deviation as a function of the Cramér-Rao bound c [px]: sqrt(floor_px^2 + (slope c)^2).
 
     Args:
         floor_px: standard deviation in noise-free images [px].
@@ -25,12 +25,12 @@ class SigmaLaw(NamedTuple):
     slope: float
 
     def __call__(self, bound_px: float) -> float:
-        """Returns the standard deviation [px] at a Cramer-Rao bound [px]."""
+        """Returns the standard deviation [px] at a Cramér-Rao bound [px]."""
         return float(np.hypot(self.floor_px, self.slope * bound_px))
 
 
 class FractionLaw(NamedTuple):
-    """Fraction as a function of the Cramer-Rao bound c [px]: maximum / (1 + (c / half_px)^exponent).
+    """Fraction as a function of the Cramér-Rao bound c [px]: maximum / (1 + (c / half_px)^exponent).
 
     Args:
         maximum: fraction in noise-free images.
@@ -43,25 +43,79 @@ class FractionLaw(NamedTuple):
     exponent: float
 
     def __call__(self, bound_px: float) -> float:
-        """Returns the fraction (0 to 1) at a Cramer-Rao bound [px]."""
+        """Returns the fraction (0 to 1) at a Cramér-Rao bound [px]."""
         return float(self.maximum / (1 + (bound_px / self.half_px) ** self.exponent))
 
 
-class ViewsLaw(NamedTuple):
-    """Variance after n keyframes, relative to that of one keyframe: common + (1 - common) / (1 + gain (n - 1)).
+class DepthLaw(NamedTuple):
+    """Standard deviation of a pixel's depth from the Kalman depth filter.
+
+    One keyframe gives a depth from stereo, with the standard deviation of `sigma_px`. Each further one adds a depth
+    from stereo and one from the motion between the keyframes. The shorter their distance B, the less depth from motion
+    adds. With n keyframes, the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
+    g = gain B^2 / (B^2 + half_step^2).
 
     Args:
+        floor_px: standard deviation from one keyframe in noise-free images [px of disparity].
+        slope: ratio of that standard deviation to the Cramer-Rao bound for large bounds.
+        lamp_growth: the part that grows with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2), where
+            lamp_share is the fraction of the reflected light that comes from the lamps.
         common: fraction of the variance that all keyframes share.
-        gain: information that each further keyframe adds, relative to the first one. The first one gives a depth from
-            stereo; each further one gives a depth from stereo and one from the motion between the keyframes.
+        gain: information that each further keyframe adds, relative to the first one, if keyframes are far apart.
+        half_step: distance between keyframes at which it adds half of that [stereo baselines].
     """
 
+    floor_px: float
+    slope: float
+    lamp_growth: float
     common: float
     gain: float
+    half_step: float
 
-    def __call__(self, n_views: Array) -> Array:
-        """Returns the relative variance for numbers of keyframes (any shape)."""
-        return self.common + (1 - self.common) / (1 + self.gain * (n_views - 1))
+    def sigma_px(self, bound_px: Array | float, lamp_share: Array | float) -> Array:
+        """Returns the standard deviation from one keyframe [px of disparity].
+
+        Args:
+            bound_px: Cramer-Rao bound [px].
+            lamp_share: fraction of the reflected light that comes from the lamps.
+        """
+        noise_px = self.slope * np.asarray(bound_px) * np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
+        return np.hypot(self.floor_px, noise_px)
+
+    def relative_variance(self, n_views: Array | float, step_baselines: Array | float) -> Array:
+        """Returns the variance after n keyframes, divided by that of one keyframe.
+
+        Args:
+            n_views: number of keyframes.
+            step_baselines: distance between consecutive keyframes [stereo baselines].
+        """
+        squared = np.square(step_baselines)
+        gain = self.gain * squared / np.maximum(squared + self.half_step**2, 1e-12)
+        return self.common + (1 - self.common) / (1 + gain * (np.asarray(n_views) - 1))
+
+
+class BorderLaw(NamedTuple):
+    """Fraction of cells without a height near the border of the images: share exp(-b sqrt(n) / width).
+
+    b is the largest distance of a cell from the border over the n consecutive keyframes that observed it. Matching
+    windows at the border lack a part, so their disparities are more often too uncertain for the map.
+
+    Args:
+        share: fraction at the border.
+        floor_px: width in noise-free images [px].
+        slope: width per Cramer-Rao bound, for large bounds.
+        lamp_growth: growth of the part of the width that increases with the bound; see `DepthLaw`.
+    """
+
+    share: float
+    floor_px: float
+    slope: float
+    lamp_growth: float
+
+    def width_px(self, bound_px: Array | float, lamp_share: Array | float) -> Array:
+        """Returns the width [px] at a Cramer-Rao bound [px] and a fraction of light from the lamps."""
+        noise_px = self.slope * np.asarray(bound_px) * np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
+        return np.hypot(self.floor_px, noise_px)
 
 
 class ErrorModel(NamedTuple):
@@ -72,7 +126,7 @@ class ErrorModel(NamedTuple):
     the reported one.
 
     Args:
-        bound_range_px: smallest and largest Cramer-Rao bound of the surveys to which the model was fitted.
+        bound_range_px: smallest and largest Cramér-Rao bound of the surveys to which the model was fitted.
         point_fraction: number of matched stereo points of a keyframe, as a fraction of the number that the scenario
             asks for (`estimate.points`).
         match_sigma_px: reported standard deviation of a patch's position in one image.
@@ -84,7 +138,7 @@ class ErrorModel(NamedTuple):
         match_parallax_px: parallax of the relief within a patch, i.e. its unevenness times distance / depth, at which
             half of the points that could be matched between two keyframes are matched. The fraction is
             1 / (1 + (parallax / match_parallax_px)^2), because the patch then looks different from the two keyframes.
-            Not fitted: the parallaxes of the surveys of the fit are too small to determine it.
+            Not fitted, because the surveys of the fit give contradictory values.
         match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
             correlated; see `matching.variance_inflation`.
         match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
@@ -110,17 +164,20 @@ class ErrorModel(NamedTuple):
             deviation of one flow vector if the registration were estimated from as many flow vectors as F2F, times the
             fraction of the field of view that the mosaic covers.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_sigma_px: reported standard deviation of a pixel's depth from the Kalman depth filter, if only one
-            keyframe observed the pixel [px of disparity].
-        depth_error_views: decrease of the true variance of a pixel's depth with the number of keyframes.
-        depth_sigma_views: the same for the reported variance.
-        depth_error_ratio: ratio of the true to the reported standard deviation of a pixel's filtered depth.
+        depth_error: true standard deviation of a pixel's depth from the Kalman depth filter.
+        depth_error_scatter: standard deviation, over surveys, of the logarithm of the true standard deviation of depth
+            about `depth_error`: what distinguishes floors and images beyond the conditions that the model knows.
+        depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter.
         lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
-        map_completeness: fraction of the smooth map cells in view for which the Kalman depth filter provides a depth.
-        edge_error_gain: true standard deviation of the height error due to the roughness of a cell, per unresolved
-            roughness. The roughness is the RMS deviation of the floor from a plane within the window of dense matching;
-            see `map_model.EDGE_PX` for the unresolved part. The error is common to all views of the cell: at an edge,
-            the matching window shows two surfaces.
+        map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
+            Kalman depth filter provides a depth.
+        border_holes: fraction of the cells without a depth near the borders of the images.
+        relief_error_gain: true standard deviation of the height error due to the roughness of a cell, per roughness.
+            The roughness is the RMS deviation of the floor from a plane within the window of dense matching. The error
+            is common to all views of the cell.
+        relief_error_limit_px: limit of this standard deviation for large roughness [px of disparity].
+        edge_error_gain: the same at edges, where the matching window shows two surfaces, per unresolved roughness; see
+            `map_model.EDGE_PX` for the unresolved part.
         edge_sigma_gain: reported standard deviation of the height due to roughness, per unresolved roughness.
         edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
@@ -142,12 +199,14 @@ class ErrorModel(NamedTuple):
     f2f_anticorrelation: float = 0.3
     mosaic_sigma_px: SigmaLaw = SigmaLaw(0.2, 1.0)
     mosaic_error_ratio: float = 2.0
-    depth_sigma_px: SigmaLaw = SigmaLaw(0.05, 1.0)
-    depth_error_ratio: float = 1.0
-    depth_error_views: ViewsLaw = ViewsLaw(0.3, 1.0)
-    depth_sigma_views: ViewsLaw = ViewsLaw(0.3, 1.0)
+    depth_error: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 4.0, 1.5)
+    depth_error_scatter: float = 0.0
+    depth_sigma: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 3.0, 1.0)
     lateral_sigma_px: float = 0.2
     map_completeness: FractionLaw = FractionLaw(0.999, 2.0, 4.0)
+    border_holes: BorderLaw = BorderLaw(0.5, 1.0, 80.0, 1.3)
+    relief_error_gain: float = 0.3
+    relief_error_limit_px: float = 0.1
     edge_error_gain: float = 0.3
     edge_sigma_gain: float = 0.3
     edge_half_px: float = 10.0

@@ -1,4 +1,4 @@
-"""TOML file of an error model: fitted parameters, number of surveys used for the fit, and residuals of the fit."""
+"""TOML file of an error model: fitted parameters, number of surveys of the fit, its misfit, and the fitted range."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 from twin.core.paths import is_file
 from twin.errors import TwinError
 from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
-from twin.surrogate.coverage import QUANTITIES, Departure, Range, departures
-from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw, ViewsLaw
+from twin.surrogate.coverage import QUANTITIES, QuantityOutsideFit, Range, quantities_outside_fit
+from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, FractionLaw, SigmaLaw
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
+_LAWS = (SigmaLaw, FractionLaw, DepthLaw, BorderLaw)
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
@@ -33,8 +34,10 @@ _RENAMED = {
     "f2f_undone": "f2f_anticorrelation",
     "mosaic_px": "mosaic_sigma_px",
     "mosaic_excess": "mosaic_error_ratio",
-    "depth_px": "depth_sigma_px",
-    "depth_excess": "depth_error_ratio",
+    "depth_px": "depth_sigma",
+    "depth_sigma_px": "depth_sigma",
+    "depth_excess": "depth_error",
+    "depth_error_ratio": "depth_error",
     "lateral_px": "lateral_sigma_px",
     "complete": "map_completeness",
     "floor": "floor_px",
@@ -51,10 +54,10 @@ class FittedErrorModel:
     Args:
         model: fitted parameters.
         n_surveys: number of rendered surveys to which the model was fitted.
-        misfit: root mean square over the surveys of ln(reported / modelled standard deviation), for each fitted
+        misfit: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted
             parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
-        fitted_range: smallest and largest value in these surveys of further quantities, by name (a subset of
-            `coverage.QUANTITIES`); the Cramer-Rao bound's is `ErrorModel.bound_range_px`.
+        fitted_range: smallest and largest value of each quantity in these surveys, by name (names of
+            `coverage.QUANTITIES`), without the Cramér-Rao bound, whose range is `ErrorModel.bound_range_px`.
     """
 
     model: ErrorModel
@@ -62,13 +65,13 @@ class FittedErrorModel:
     misfit: Mapping[str, float]
     fitted_range: Mapping[str, Range] = field(default_factory=dict)
 
-    def departures(self, conditions: Mapping[str, Range]) -> list[Departure]:
-        """Returns the quantities of a survey in which it lies outside the range of the fit.
+    def quantities_outside_fit(self, conditions: Mapping[str, Range]) -> list[QuantityOutsideFit]:
+        """Returns the quantities of a survey that lie outside the range in which the model may be used.
 
         Args:
             conditions: smallest and largest value of each quantity in the survey (`coverage.survey_conditions`).
         """
-        return departures(conditions, {"bound_px": self.model.bound_range_px, **self.fitted_range})
+        return quantities_outside_fit(conditions, {"bound_px": self.model.bound_range_px, **self.fitted_range})
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
@@ -101,7 +104,7 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
         "# Error model of the surrogate, fitted to rendered surveys by `twin fit-surrogate`; see error_model.py.",
         f"n_surveys = {fitted.n_surveys}",
         "",
-        "[misfit]  # root mean square of ln(measured / model)",
+        "[misfit]  # root mean square of ln(reported / fitted)",
         *(f"{name} = {value:.4g}" for name, value in fitted.misfit.items()),
         *_range_lines(fitted.fitted_range),
         "",
@@ -148,13 +151,13 @@ def _invalid(path: Path, problem: str) -> TwinError:
 def _value(name: str, given: Any) -> Any:
     """Converts a TOML value to the type of the parameter `name`."""
     kind = type(ErrorModel._field_defaults[name])
-    if kind in (SigmaLaw, FractionLaw, ViewsLaw):
+    if kind in _LAWS:
         return kind(**{key: float(given[key]) for key in kind._fields})
     return tuple(map(float, given)) if kind is tuple else float(given)
 
 
 def _text(value: Any) -> str:
     """Returns the value of a parameter in TOML syntax."""
-    if isinstance(value, SigmaLaw | FractionLaw | ViewsLaw):
+    if isinstance(value, _LAWS):
         return "{ " + ", ".join(f"{key} = {number:.4g}" for key, number in value._asdict().items()) + " }"
     return str([float(f"{v:.4g}") for v in value]) if isinstance(value, tuple) else f"{value:.4g}"

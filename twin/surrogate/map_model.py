@@ -22,15 +22,18 @@ from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
-from twin.surrogate.error_model import ViewsLaw
+from twin.surrogate.error_model import DepthLaw
 from twin.surrogate.measured_view import IDEAL_TABLE, ViewTable, measure_point
 from twin.world.coverage import DEPTH_TOLERANCE
 
 Map = NDArray[np.float32]
 WINDOW_PX = 11  #: side of the window of dense matching, over which the roughness of a cell is computed
-#: Roughness [px of disparity] at which matching follows half of it: dense matching resolves smaller deviations from the
-#: plane of the window, while at larger ones the window shows two surfaces.
+#: Roughness [px of disparity] of which half is unresolved: dense matching resolves smaller deviations from the plane of
+#: the window, while at larger ones the window shows two surfaces.
 EDGE_PX = 0.5
+#: Law of a depth that more keyframes do not improve.
+ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+_NO_CELLS = np.zeros((0, 0), np.float32)
 _HIDING_SLOPE = 1.0  # rise over run: a floor below this line from a cell cannot hide it from a camera that looks down
 
 
@@ -38,19 +41,24 @@ class CellErrors(NamedTuple):
     """Errors of the filtered depth: random numbers and standard deviations.
 
     Args:
-        lateral_noise: (rows, cols) standard normal numbers of the lateral error, shared by all views of a cell.
-        edge_noise: (rows, cols) standard normal numbers of the error due to roughness, shared by all views of a cell.
+        lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
+        edge_noise: (rows, cols) standard normal samples of the error due to roughness, shared by all views of a cell;
+            see `window_noise`.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths of the tabulated values below [m].
+        depths_m: (m,) ascending depths at which the next three fields are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
         completeness: (m,) fraction of the level cells in view for which the filter provides a depth.
-        error_views: `ErrorModel.depth_error_views`.
-        sigma_views: `ErrorModel.depth_sigma_views`.
+        error_law: decrease of the true variance with the number of keyframes.
+        sigma_law: decrease of the reported variance with the number of keyframes.
+        relief_error_gain: `ErrorModel.relief_error_gain`.
+        relief_error_limit_px: `ErrorModel.relief_error_limit_px`.
         edge_error_gain: `ErrorModel.edge_error_gain`.
         edge_sigma_gain: `ErrorModel.edge_sigma_gain`.
         edge_half_px: `ErrorModel.edge_half_px`.
+        border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
+        border_width_px: (m,) distance from the border over which this fraction decreases to 1 / e [px].
     """
 
     lateral_noise: Map
@@ -61,11 +69,33 @@ class CellErrors(NamedTuple):
     depth_error_px: Array
     depth_sigma_px: Array
     completeness: Array
-    error_views: ViewsLaw = ViewsLaw(1.0, 0.0)
-    sigma_views: ViewsLaw = ViewsLaw(1.0, 0.0)
+    error_law: DepthLaw = ONE_KEYFRAME
+    sigma_law: DepthLaw = ONE_KEYFRAME
+    relief_error_gain: float = 0.0
+    relief_error_limit_px: float = 1.0
     edge_error_gain: float = 0.0
     edge_sigma_gain: float = 0.0
     edge_half_px: float = np.inf
+    border_share: float = 0.0
+    border_width_px: Array = np.ones(2)
+
+
+class ObservedCells(NamedTuple):
+    """Cells that both cameras of a keyframe see, in a rectangular window of the grid.
+
+    Args:
+        row, col: grid position of the first (north-west) cell of the window.
+        depth_m: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen.
+        border_px: (rows, cols) distance of this point from the nearest border of the two images [px].
+        true, estimated: (4, 4) poses of the keyframe.
+    """
+
+    row: int
+    col: int
+    depth_m: Map
+    border_px: Map
+    true: Array
+    estimated: Array
 
 
 class MapModel:
@@ -75,7 +105,7 @@ class MapModel:
         grid: grid of the map.
         height_m: (rows, cols) true height at the cell centres [m].
         rig: believed calibration.
-        floor: the same floor as a height field, for ray casting.
+        floor: the true floor as a height field, for ray casting.
         depth_m: typical depth of the floor along the optical axis [m].
         view: positions at which true points are measured.
 
@@ -85,6 +115,9 @@ class MapModel:
         window_cells: side of the matching window [cells].
         views: (rows, cols) number of consecutive keyframes whose depths were fused in the latest height of the cell;
             updated by `sample_patch`.
+        step_baselines: (rows, cols) RMS distance between these keyframes, in stereo baselines; 0 for one keyframe.
+        border_px: (rows, cols) largest distance of the cell from the image border over consecutive keyframes, times the
+            square root of their number [px].
     """
 
     def __init__(
@@ -104,7 +137,9 @@ class MapModel:
         self._floor, self._may_be_hidden = floor, _may_be_hidden(height_m, grid.cell_m)
         self.window_cells = max(round(WINDOW_PX * depth_m / rig.focal_px / grid.cell_m), 1)
         self.roughness_m = roughness(height_m, WINDOW_PX * depth_m / rig.focal_px / grid.cell_m)
-        self.views, self._views_until_now = (np.zeros(height_m.shape, np.int16) for _ in range(2))
+        self.views, run = (np.zeros(height_m.shape, np.int16) for _ in range(2))
+        self.step_baselines, self.border_px, *rest = (np.zeros(height_m.shape, np.float32) for _ in range(4))
+        self._runs = _Runs(run, *rest)
         self._geotransform = (grid.west_m, grid.north_m, grid.cell_m)
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px - 1), float(rig.height_px - 1), rig.baseline_m,
@@ -120,28 +155,44 @@ class MapModel:
         """Marks the cells that both cameras see from the true pose (4, 4) of a keyframe."""
         window = self._window(world_from_camera)
         floor, cells = (self._floor, self._may_be_hidden), (self.height_m, self._geotransform)
-        _mark(
-            self.seen, *cells, self._camera, _cameras_of([world_from_camera], self._rig.baseline_m)[0], floor, *window
-        )
+        _mark(self.seen, *cells, self._camera[:6], self._camera[6], self._poses_of(world_from_camera), floor, *window)
+
+    def observe(self, true: Array, estimated: Array) -> ObservedCells:
+        """Returns the cells that a keyframe observes, with their depths and distances from the image border.
+
+        Args:
+            true: (4, 4) true pose of the keyframe.
+            estimated: (4, 4) estimated pose of the keyframe. With calibration errors, it determines which floor point
+                is mapped to a cell.
+        """
+        row, end_row, col, end_col = self._window(true)
+        shape = max(end_row - row, 0), max(end_col - col, 0)
+        observed = ObservedCells(
+            row, col, np.full(shape, -1, np.float32), np.zeros(shape, np.float32), true, estimated
+        )  # fmt: skip
+        camera, cells = self._camera[:6], (self.height_m, self._slope, self._geotransform)
+        _observe(
+            observed.depth_m, observed.border_px, row, col, cells, camera, self._camera[6], self._poses_of(true),
+            estimated @ geometry.inverse(true), (self._floor, self._may_be_hidden),
+        )  # fmt: skip
+        return observed
 
     def sample_patch(
         self,
-        true: Array,
-        next_true: Array | None,
-        estimated: Array,
+        observed: ObservedCells,
+        following: ObservedCells | None,
         cov: Array,
         errors: CellErrors,
         rng: np.random.Generator,
     ) -> HeightPatch | None:
         """Samples the height patch of a keyframe: the heights of the cells that it sees and the next keyframe does not.
 
-        The keyframes must be passed in the order of the path, from the first to the last one: the number of consecutive
-        keyframes that observed a cell determines the standard deviation of its height.
+        The keyframes must be passed in the order of the path, from the first to the last one: the consecutive keyframes
+        that observed a cell determine the standard deviation of its height and whether it has one.
 
         Args:
-            true: (4, 4) true pose of the keyframe.
-            next_true: (4, 4) true pose of the next keyframe; None for the last one.
-            estimated: (4, 4) estimated pose of the keyframe.
+            observed: cells that the keyframe observes.
+            following: cells that the next keyframe observes; None for the last one.
             cov: (6, 6) covariance of the estimated pose, in camera axes.
             errors: distribution of the depth errors, and their part that is common to all keyframes.
             rng: random generator of the depth errors that are independent between keyframes.
@@ -149,24 +200,30 @@ class MapModel:
         Returns:
             The patch, or None if the field of view does not overlap the grid.
         """
-        row, end_row, col, end_col = self._window(true)
-        if row >= end_row or col >= end_col:
+        shape, true, estimated = observed.depth_m.shape, observed.true, observed.estimated
+        if not observed.depth_m.size:
             return None
-        shape = (end_row - row, end_col - col)
         height = np.full(shape, np.nan, np.float32)
         variance, systematic = height.copy(), height.copy()
-        is_last = next_true is None
-        cameras = _cameras_of([true, true if is_last else next_true], self._rig.baseline_m)
-        estimated_from_true = estimated @ geometry.inverse(true)
+        step = 0.0 if following is None else float(np.linalg.norm(following.true[:3, 3] - true[:3, 3]))
         rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
+        next_cells = (0, 0, _NO_CELLS) if following is None else following[:3]
         depth_m = _sample_patch(
-            height, variance, systematic, self.height_m, self._slope, self.roughness_m, self.views,
-            self._views_until_now, self._geotransform, self._camera, cameras, (self._floor, self._may_be_hidden),
-            is_last, estimated_from_true, estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
-            rng.standard_normal(shape, np.float32), errors, row, col,
+            height, variance, systematic, (self.height_m, self._slope, self.roughness_m, self._geotransform),
+            self._runs, (self.views, self.step_baselines, self.border_px), observed[:4], next_cells,
+            step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
+            estimated @ geometry.inverse(true), estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
+            rng.standard_normal(shape, np.float32), errors,
         )  # fmt: skip
         lateral = surface.LATERAL_SIGMA_PX * depth_m / self._rig.focal_px
-        return HeightPatch(row, col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral)
+        return HeightPatch(
+            observed.row, observed.col, height, variance, systematic, np.zeros((*shape, 2), np.float32), lateral
+        )
+
+    def _poses_of(self, true: Array) -> Array:
+        """Returns (3, 4, 4): the inverse of a pose (4, 4) of the left camera, the pose, and that of the right one."""
+        right_from_left = geometry.pose(np.eye(3), np.array([self._rig.baseline_m, 0.0, 0.0]))
+        return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
         """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
@@ -200,78 +257,69 @@ def _window(pose, camera, geotransform, lowest, size):
     return first_row, end_row, first_col, end_col
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _depth_in(camera_from_world, camera, x, y, z):
-    """Returns the depth of a world point in the left camera; -1 if the point is behind it or outside either image."""
-    focal, cx, cy, right, bottom, baseline, view = camera
-    m = camera_from_world
-    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    if not depth > 0:
-        return -1.0
-    true_x = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-    true_y = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-    seen_x, seen_y, disparity = measure_point(view, true_x, true_y, baseline / depth)
-    u, v = focal * seen_x + cx, focal * seen_y + cy
-    if 0 <= v <= bottom and u <= right and u - focal * disparity >= 0:
-        return depth
-    return -1.0
+def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
+    """Returns standard normal numbers (rows, cols) that are correlated over a matching window, as its errors are.
+
+    Args:
+        shape: number of rows and columns.
+        window_cells: side of the window [cells].
+        rng: random generator.
+    """
+    noise = rng.standard_normal(shape, np.float32)
+    return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _source(camera_from_world, camera, estimated_from_true, point, slope):
+def _border_of(camera, x, y, disparity):
+    """Returns the distance of a normalised (x, y, disparity) from the nearest border of the two images [px]."""
+    focal, cx, cy, right, bottom, _ = camera
+    u, v = focal * x + cx, focal * y + cy
+    return min(min(v, bottom - v), min(right - u, u - focal * disparity))
+
+
+@njit(cache=True, nogil=True)
+def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
     """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre less the error of its mapping.
 
-    Without calibration errors this is the centre itself; pose errors are much smaller than a cell.
+    Pose errors are much smaller than a cell, so only calibration errors matter here.
     """
     x, y, z = point
-    if camera[6].values.size == 0:
-        return x, y, z
-    px, py, _ = _estimated_position(camera_from_world, camera, estimated_from_true, x, y, z)
+    px, py, _ = _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z)
     return 2 * x - px, 2 * y - py, z + slope[0] * (x - px) + slope[1] * (y - py)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _estimated_position(camera_from_world, camera, estimated_from_true, x, y, z):
-    """Returns the estimated world position of a world point that the camera sees from its true pose."""
-    m = estimated_from_true
-    qx, qy, qz = _measured_position(camera_from_world, camera, x, y, z)
+@njit(cache=True, nogil=True)
+def _transformed(m, x, y, z):
+    """Returns the point (x, y, z) transformed by a pose (4, 4)."""
     return (
-        m[0, 0] * qx + m[0, 1] * qy + m[0, 2] * qz + m[0, 3],
-        m[1, 0] * qx + m[1, 1] * qy + m[1, 2] * qz + m[1, 3],
-        m[2, 0] * qx + m[2, 1] * qy + m[2, 2] * qz + m[2, 3],
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3],
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _measured_position(camera_from_world, camera, x, y, z):
-    """Returns the world position at which a world point is measured from the true pose of the camera."""
-    baseline, view, m = camera[5], camera[6], camera_from_world
-    if view.values.size == 0:
-        return x, y, z
-    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    true_x = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-    true_y = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-    seen_x, seen_y, disparity = measure_point(view, true_x, true_y, baseline / depth)
+@njit(cache=True, nogil=True)
+def _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z):
+    """Returns the estimated world position of a world point that the camera sees from its true pose."""
+    baseline, m = camera[5], camera_from_world
+    true_x, true_y, depth = _transformed(m, x, y, z)
+    seen_x, seen_y, disparity = measure_point(view, true_x / depth, true_y / depth, baseline / depth)
     far = baseline / disparity
     cx, cy, cz = far * seen_x - m[0, 3], far * seen_y - m[1, 3], far - m[2, 3]
-    return (
+    return _transformed(
+        estimated_from_true,
         m[0, 0] * cx + m[1, 0] * cy + m[2, 0] * cz,
         m[0, 1] * cx + m[1, 1] * cy + m[2, 1] * cz,
         m[0, 2] * cx + m[1, 2] * cy + m[2, 2] * cz,
     )
 
 
-def _cameras_of(poses: list[Array], baseline_m: float) -> Array:
-    """Returns (n, 3, 4, 4): for each left pose (4, 4), its inverse, the pose itself, and that of the right camera."""
-    right_from_left = geometry.pose(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
-    return np.stack([np.stack([geometry.inverse(pose), pose, pose @ right_from_left]) for pose in poses])
-
-
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
-    """Returns the mask (rows, cols) of the cells above whose `_HIDING_SLOPE` line some floor rises.
+    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast.
 
-    Only these cells can be hidden by relief; for the others, no rays are cast. The floor is examined in rings with
-    radii that double, up to the one at which the relief cannot reach the line.
+    A cell may be hidden if part of the floor rises above the line that starts at the cell with slope `_HIDING_SLOPE`.
+    The floor is searched in square windows whose size doubles, up to the distance at which the range of the heights is
+    too small to reach the line.
     """
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
@@ -284,7 +332,7 @@ def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
 def roughness(height_m: Map, window_cells: float) -> Map:
     """Returns the RMS deviation (rows, cols) of the floor from its best-fit plane within a square window [m].
 
-    The variance of the heights minus the part that a linear regression on the two coordinates explains.
+    Its square is the variance of the heights minus the part that a linear regression on both coordinates explains.
 
     Args:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
@@ -306,88 +354,133 @@ def roughness(height_m: Map, window_cells: float) -> Map:
     return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _observed_depth(poses, camera, floor, x, y, z, i, j):
-    """Returns the depth of the floor point of cell (i, j) in the left camera; -1 if not both cameras see the point."""
-    field, may_be_hidden = floor
-    depth = _depth_in(poses[0], camera, x, y, z)
-    if depth < 0 or not may_be_hidden[i, j]:
-        return depth
-    m = poses[0]
-    a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-    b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+@njit(cache=True, nogil=True)
+def _is_hidden(poses, baseline, field, x, y, depth):
+    """Returns whether relief hides the floor point at normalised (x, y) and `depth` from either camera."""
     nearest = (1 - DEPTH_TOLERANCE) * depth
-    if cast_camera_ray(field, poses[1], a, b) < nearest:
-        return -1.0
-    if cast_camera_ray(field, poses[2], a - camera[5] / depth, b) < nearest:
-        return -1.0
-    return depth
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _is_left(next_poses, camera, floor, cell, source, i, j):
-    """Returns whether cell (i, j) is left to the next keyframe.
-
-    Calibration errors may map another point to the cell there, so both the cell and its source have to be in view.
-    """
-    if _observed_depth(next_poses, camera, floor, source[0], source[1], source[2], i, j) < 0:
-        return False
-    return camera[6].values.size == 0 or _depth_in(next_poses[0], camera, cell[0], cell[1], cell[2]) > 0
+    if cast_camera_ray(field, poses[1], x, y) < nearest:
+        return True
+    return cast_camera_ray(field, poses[2], x - baseline / depth, y) < nearest
 
 
 @njit(cache=True, nogil=True)
-def _mark(seen, height, geotransform, camera, poses, floor, row, end_row, col, end_col):
+def _mark(seen, height, geotransform, camera, view, poses, floor, row, end_row, col, end_col):
     """Sets `seen` for the cells of a window that both cameras see."""
-    west, north, cell = geotransform
+    (west, north, cell), (field, may_be_hidden), baseline = geotransform, floor, camera[5]
     for i in range(row, end_row):
         y = north - (i + 0.5) * cell
         for j in range(col, end_col):
-            if not seen[i, j]:
-                x = west + (j + 0.5) * cell
-                seen[i, j] = _observed_depth(poses, camera, floor, x, y, height[i, j], i, j) > 0
+            if seen[i, j]:
+                continue
+            a, b, depth = _transformed(poses[0], west + (j + 0.5) * cell, y, height[i, j])
+            if not depth > 0:
+                continue
+            seen_a, seen_b, disparity = a / depth, b / depth, baseline / depth
+            if view.values.size:
+                seen_a, seen_b, disparity = measure_point(view, seen_a, seen_b, disparity)
+            if _border_of(camera, seen_a, seen_b, disparity) >= 0:
+                hidden = may_be_hidden[i, j] and _is_hidden(poses, baseline, field, a / depth, b / depth, depth)
+                seen[i, j] = not hidden
+
+
+@njit(cache=True, nogil=True)
+def _observe(out, border, row, col, cells, camera, view, poses, estimated_from_true, floor):
+    """Compiled kernel of `MapModel.observe`; writes to `out` and `border`."""
+    height, slope, (west, north, cell) = cells
+    (field, may_be_hidden), m, ideal, baseline = floor, poses[0], view.values.size == 0, camera[5]
+    for i in range(out.shape[0]):
+        y = north - (row + i + 0.5) * cell
+        for j in range(out.shape[1]):
+            x, z = west + (col + j + 0.5) * cell, np.float64(height[row + i, col + j])
+            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            if not depth > 0:
+                continue
+            if ideal:
+                a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+                b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+                border_px = _border_of(camera, a, b, baseline / depth)
+            else:
+                s = slope[row + i, col + j]
+                a, b, depth = _transformed(m, *_source(m, camera, view, estimated_from_true, (x, y, z), (s[0], s[1])))
+                a, b = a / depth, b / depth
+                seen_a, seen_b, disparity = measure_point(view, a, b, baseline / depth)
+                border_px = _border_of(camera, seen_a, seen_b, disparity)
+            if not border_px >= 0:
+                continue
+            if may_be_hidden[row + i, col + j] and _is_hidden(poses, baseline, field, a, b, depth):
+                continue
+            out[i, j], border[i, j] = depth, border_px
+
+
+class _Runs(NamedTuple):
+    """Consecutive keyframes that observe each cell, up to the current one.
+
+    Args:
+        views: (rows, cols) number of these keyframes.
+        squared_steps: (rows, cols) sum of the squared distances between them, in squared stereo baselines.
+        border_px: (rows, cols) largest distance from the image border over these keyframes [px].
+    """
+
+    views: NDArray[np.int16]
+    squared_steps: Map
+    border_px: Map
 
 
 @njit(cache=True, nogil=True)
 def _sample_patch(
-    out, variance, systematic, height, slope, roughness, views, views_until_now, geotransform, camera, cameras, floor,
-    is_last, estimated_from_true, position, cov, depth_noise, errors, row, col,
+    out, variance, systematic, floor, runs, fused, observed, following, step, camera, view,
+    camera_from_world, estimated_from_true, position, cov, depth_noise, errors,
 ):  # fmt: skip
     """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
 
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
     the lateral error and the roughness to `systematic`.
     """
-    (west, north, cell), m = geotransform, estimated_from_true
+    (height, slope, roughness, (west, north, cell)), (row, col, depth_m, border_px) = floor, observed
+    (next_row, next_col, next_depth_m), (views, step_baselines, best_border_px) = following, fused
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
         y = north - (i + 0.5) * cell
         for j in range(col, col + out.shape[1]):
-            x, z = west + (j + 0.5) * cell, height[i, j]
-            sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
-            tx, ty, tz = _source(cameras[0, 0], camera, m, (x, y, z), (sx, sy))
-            depth = _observed_depth(cameras[0], camera, floor, tx, ty, tz, i, j)
+            depth = np.float64(depth_m[i - row, j - col])
             if depth < 0:
                 continue
-            views_until_now[i, j] += 1
-            if not is_last and _is_left(cameras[1], camera, floor, (x, y, z), (tx, ty, tz), i, j):
+            runs.views[i, j] += 1
+            runs.border_px[i, j] = max(runs.border_px[i, j], border_px[i - row, j - col])
+            p, q = i - next_row, j - next_col
+            if 0 <= p < next_depth_m.shape[0] and 0 <= q < next_depth_m.shape[1] and next_depth_m[p, q] > 0:
+                runs.squared_steps[i, j] += step * step
                 continue
-            views[i, j], views_until_now[i, j] = views_until_now[i, j], 0
+            n_views, border = runs.views[i, j], runs.border_px[i, j] * np.sqrt(runs.views[i, j])
+            mean_step = np.sqrt(runs.squared_steps[i, j] / max(n_views - 1, 1))
+            views[i, j], step_baselines[i, j] = n_views, mean_step
+            best_border_px[i, j] = max(best_border_px[i, j], border)
+            runs.views[i, j], runs.squared_steps[i, j], runs.border_px[i, j] = 0, 0.0, 0.0
             k, fraction = _interval(errors.depths_m, depth)
             per_px = depth * depth / (camera[0] * camera[5])
             rough_px = roughness[i, j] / per_px
             complete = _interpolate(errors.completeness, k, fraction) / (1 + (rough_px / errors.edge_half_px) ** 2)
+            complete *= 1 - errors.border_share * np.exp(-border / _interpolate(errors.border_width_px, k, fraction))
             if errors.dropout[i, j] > complete:
                 continue
-            error_share = _relative_variance(errors.error_views, views[i, j])
-            sigma_share = _relative_variance(errors.sigma_views, views[i, j])
+            error_share = _relative_variance(errors.error_law, n_views, mean_step)
+            sigma_share = _relative_variance(errors.sigma_law, n_views, mean_step)
             # estimated position of the floor at this cell, and the height of its tangent plane at the cell's centre
-            px, py, pz = _estimated_position(cameras[0, 0], camera, m, tx, ty, tz)
+            sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
+            x, z = west + (j + 0.5) * cell, np.float64(height[i, j])
+            if view.values.size:
+                source = _source(camera_from_world, camera, view, estimated_from_true, (x, y, z), (sx, sy))
+                px, py, pz = _estimated_position(camera_from_world, camera, view, estimated_from_true, *source)
+            else:
+                px, py, pz = _transformed(estimated_from_true, x, y, z)
             value = pz - sx * (px - x) - sy * (py - y)
             steep = np.sqrt(sx * sx + sy * sy)
             error_px = np.sqrt(error_share) * _interpolate(errors.depth_error_px, k, fraction)
             value += per_px * error_px * depth_noise[i - row, j - col]
-            unresolved_m = roughness[i, j] * rough_px**2 / (rough_px**2 + EDGE_PX**2)
-            value += unresolved_m * errors.edge_error_gain * errors.edge_noise[i, j]
+            rough_error_px = roughness_error_px(
+                rough_px, errors.relief_error_gain, errors.relief_error_limit_px, errors.edge_error_gain
+            )
+            value += per_px * rough_error_px * errors.edge_noise[i, j]
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
             sigma_px = _interpolate(errors.depth_sigma_px, k, fraction)
@@ -396,16 +489,33 @@ def _sample_patch(
                 x - position[0], y - position[1], z - position[2], sx, sy, cov
             )
             systematic[i - row, j - col] += (surface.LATERAL_SIGMA_PX * depth / camera[0] * steep) ** 2
-            systematic[i - row, j - col] += (unresolved_m * errors.edge_sigma_gain) ** 2
+            rough_sigma_px = roughness_error_px(rough_px, 0.0, 1.0, errors.edge_sigma_gain)
+            systematic[i - row, j - col] += (per_px * rough_sigma_px) ** 2
             total += depth
             count += 1
     return total / max(count, 1)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _relative_variance(law, n_views):
-    """Compiled form of `ViewsLaw.__call__`."""
-    return law.common + (1 - law.common) / (1 + law.gain * (n_views - 1))
+@njit(cache=True, nogil=True)
+def roughness_error_px(rough_px, relief_gain, relief_limit_px, edge_gain):
+    """Returns the standard deviation of a height error due to roughness [px of disparity].
+
+    Args:
+        rough_px: roughness of the cell [px of disparity].
+        relief_gain, relief_limit_px, edge_gain: see `ErrorModel`.
+    """
+    relief = (relief_gain * rough_px) ** 2
+    relief = relief / (1 + relief / max(relief_limit_px, 1e-9) ** 2)
+    edge = edge_gain * rough_px**3 / (rough_px**2 + EDGE_PX**2)
+    return np.sqrt(relief + edge**2)
+
+
+@njit(cache=True, nogil=True)
+def _relative_variance(law, n_views, step_baselines):
+    """Compiled form of `DepthLaw.relative_variance`."""
+    squared = step_baselines * step_baselines
+    gain = law.gain * squared / (squared + law.half_step**2) if squared > 0 else 0.0
+    return law.common + (1 - law.common) / (1 + gain * (n_views - 1))
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -1,8 +1,8 @@
-"""Matchability of the floor: the Cramer-Rao bound of image matching, and the unevenness of the floor under a patch.
+"""Matchability of the floor: the Cramér-Rao bound of image matching, and the unevenness of the floor under a patch.
 
 The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. Let g be
 the gradient of the grey image along a row, and s the standard deviation of the image noise. The standard deviation of
-the measured shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramer-Rao bound).
+the measured shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound).
 
 Matching models the floor under a patch as a plane. Relief above or below that plane causes parallax and thus a matching
 error. The unevenness is the RMS of this parallax in a typical patch, in pixels per unit of baseline / depth. Patches
@@ -33,7 +33,7 @@ _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in to
 
 
 class Matchability:
-    """Cramer-Rao bound of image matching and unevenness of the floor, tabulated over the camera's depth range.
+    """Cramér-Rao bound of image matching and unevenness of the floor, tabulated over the range of floor depths.
 
     Args:
         scenario: description of the survey.
@@ -43,10 +43,10 @@ class Matchability:
 
     Attributes:
         depths_m: (m,) ascending depths of the floor along the optical axis [m].
-        bounds_px: (m,) Cramer-Rao bound c at these depths [px].
+        bounds_px: (m,) Cramér-Rao bound c at these depths [px].
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
-        clear_share: (m,) fraction of the matches that marine snow leaves, at these depths.
+        clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
     """
 
     def __init__(
@@ -63,14 +63,14 @@ class Matchability:
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
         self.bounds_px, self.clear_share = precision(scenario, illumination, terrain, self.depths_m)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate)
-        self.lamp_share = lamp_share(scenario, illumination, terrain)
+        self.lamp_share = lamp_share(scenario, illumination)
 
     def bound_at(self, depth_m: float) -> float:
-        """Returns the Cramer-Rao bound of a patch's position [px] at a depth [m]."""
+        """Returns the Cramér-Rao bound of a patch's position [px] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.bounds_px))
 
     def clear_share_at(self, depth_m: float) -> float:
-        """Returns the fraction of the matches that marine snow leaves, at a depth."""
+        """Returns the fraction of the matches that remain in the presence of marine snow, at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.clear_share))
 
     def unevenness_at(self, depth_m: float) -> float:
@@ -79,24 +79,25 @@ class Matchability:
 
 
 def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array) -> Array:
-    """Returns the Cramer-Rao bound (n,) [px] at depths (n,) [m]."""
+    """Returns the Cramér-Rao bound (n,) [px] at depths (n,) [m]."""
     return precision(scenario, illumination, terrain, depths_m)[0]
 
 
 def precision(
     scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array
 ) -> tuple[Array, Array]:
-    """Returns the Cramer-Rao bound [px] and the fraction of matches that marine snow leaves (n,) at depths (n,) [m]."""
+    """Returns the Cramér-Rao bound (n,) [px] and the fraction (n,) of matches that remain in snow, at depths (n,)."""
+    scenario = _with_linear_images(scenario)
     clear = _without_unmodelled_effects(scenario)
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
-    formation = ImageFormation(clear, illumination, terrain, rng)
+    formation = ImageFormation(clear, illumination, None, rng)
     texture, texel_m = _texture(scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
     albedos = [_albedo(texture, texel_m, rig, z) for z in depths_m]
     if not scenario.snow.density_per_m3:
         bounds = [_bound_px(clear, rig, formation, albedo, z, rng) for albedo, z in zip(albedos, depths_m, strict=True)]
         return np.array(bounds), np.ones(len(depths_m))
     with_snow = scenario.model_copy(update={"imaging": clear.imaging})
-    formations = formation, ImageFormation(with_snow, illumination, terrain, rng)
+    formations = formation, ImageFormation(with_snow, illumination, None, rng)
     both = [_in_snow(scenario, rig, formations, albedo, z) for albedo, z in zip(albedos, depths_m, strict=True)]
     return np.array([bound for bound, _ in both]), np.array([share for _, share in both])
 
@@ -104,7 +105,7 @@ def precision(
 def _in_snow(
     scenario: Scenario, rig: StereoRig, formations: tuple[ImageFormation, ImageFormation], albedo: Image, depth_m: float
 ) -> tuple[float, float]:
-    """Returns the Cramer-Rao bound [px] and the fraction of matches that marine snow leaves, at one depth.
+    """Returns the Cramér-Rao bound [px] and the fraction of matches that remain in marine snow, at one depth.
 
     Args:
         scenario: description of the survey.
@@ -129,23 +130,23 @@ def _in_snow(
     return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 
-def lamp_share(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
+def lamp_share(scenario: Scenario, illumination: Illumination) -> float:
     """Returns the fraction of the light reflected by a level floor at the planned altitude that is due to the lamps."""
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
     without_lamps = scenario.model_copy(update={"lamps": ()})
-    sunlit, both = (_reflected_radiance(s, illumination, terrain) for s in (without_lamps, scenario))
+    sunlit, both = (_reflected_radiance(s, illumination) for s in (without_lamps, scenario))
     return 1 - sunlit / max(both, np.finfo(float).tiny)
 
 
-def _reflected_radiance(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> float:
+def _reflected_radiance(scenario: Scenario, illumination: Illumination) -> float:
     """Returns the image signal due to light reflected by a white floor at the planned altitude [cd/m2].
 
     It is the difference between the images of a white and a black floor, which removes the veil, averaged over pixels
     and colour channels.
     """
     scenario = _without_unmodelled_effects(scenario)
-    formation = ImageFormation(scenario, illumination, terrain, np.random.default_rng(0))
+    formation = ImageFormation(scenario, illumination, None, np.random.default_rng(0))
     depth, camera_pose = _level_floor(scenario, scenario.plan.altitude_m)
     albedos = (np.full((*depth.shape, 3), level, np.uint8) for level in (255, 0))
     white, black = (formation.radiance(albedo, depth, 0, camera_pose) for albedo in albedos)
@@ -160,6 +161,14 @@ def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose
     rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
     world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
     return np.full((rig.height_px, rig.width_px), depth_m, np.float32), StampedPose(world_from_left, 0.0)
+
+
+def _with_linear_images(scenario: Scenario) -> Scenario:
+    """Returns the scenario without tone curve and white balance, which scale texture and noise of a pixel alike."""
+    if scenario.sensor is None:
+        return scenario
+    linear = {"tone_curve": "linear", "white_balance": "white_light"}
+    return scenario.model_copy(update={"sensor": scenario.sensor.model_copy(update=linear)})
 
 
 def _without_unmodelled_effects(scenario: Scenario) -> Scenario:
@@ -177,16 +186,16 @@ def unevenness_px(
 ) -> Array:
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], the median over the planned area.
 
-    It is the parallax relative to the best-fit plane, in pixels per unit of baseline / depth: f rms(z) / depth, with z
-    the height above that plane [m] and f the focal length [px]. The median over the patches leaves out those with an
-    edge: they are not matched or are rejected as outliers.
+    It is the RMS parallax relative to the best-fit plane, in pixels per unit of baseline / depth: f rms(z) / depth,
+    with z the height above that plane [m] and f the focal length [px]. The median over the patches is insensitive to
+    those with an edge, which are not matched or are rejected as outliers.
 
     Args:
         scenario: description of the survey.
         terrain: true floor.
         depths_m: depths of the floor along the optical axis.
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
-            centre, to scene points (..., 2) [m]; None: the area is centred at the origin, with legs along x.
+            centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
     """
     focal_px, patch_px = scenario.believed_rig().focal_px, scenario.estimate.patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
@@ -213,7 +222,7 @@ def _bound_px(
     depth_m: float,
     rng: np.random.Generator,
 ) -> float:
-    """Returns the Cramer-Rao bound [px] for a level floor at the given depth, with the given albedo image."""
+    """Returns the Cramér-Rao bound [px] for a level floor at the given depth, with the given albedo image."""
     depth, camera_pose = _level_floor(scenario, depth_m)
     radiance = formation.radiance(albedo, depth, 0, camera_pose)
     sensor = sensor_of(scenario, rig)

@@ -1,8 +1,9 @@
-"""Row differences of the stereo matches of a survey whose calibration is wrong, and the conclusions drawn from them.
+"""Row differences of the stereo matches of a survey with calibration errors, and the estimates computed from them.
 
-The deterministic row differences that remain after the removal of pitch, roll and row offset (`measured_view`) scatter
-in addition to the noise. The estimators see this scatter, enlarge their covariances by it (`stereo.row_noise_ratio`),
-and estimate the yaw of the right camera from it (`epipolar_calibration`); the self-check judges both.
+The deterministic row differences that remain after the removal of pitch, roll and row offset (`measured_view`)
+increase the scatter of the measured row differences beyond that of the noise. The estimators measure this scatter,
+increase their covariances accordingly (`stereo.row_noise_ratio`), and estimate the yaw of the right camera from the row
+differences (`epipolar_calibration`); the self-check compares both with limits.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.surrogate.measured_view import MeasuredView
 
 _MAD_TO_SIGMA = 1.4826
-_SIGNIFICANT = 2 * 1.17  # standard errors of the scatter times the root of the number of points
+_SIGNIFICANT = 2 * 1.17  # two standard errors of the noise ratio, times the root of the number of points
 
 
 class MeasuredRows:
@@ -50,7 +51,7 @@ class MeasuredRows:
         The noise ratio is the one of `stereo.row_noise_ratio`.
 
         Args:
-            observation: the stereo pair.
+            observation: stereo observation of the pair, without row differences.
             points: (n, 3) true points that are matched; they represent `observation.n_points` points.
             sigma_px: standard deviation of a match in one image.
         """

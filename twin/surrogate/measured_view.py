@@ -19,15 +19,14 @@ from numba import njit
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
-from twin.estimate.vision.epipolar_calibration import NOTICEABLE_PX
+from twin.estimate.vision.epipolar_calibration import CORRECTED, NOTICEABLE_PX, row_jacobian
 from twin.imaging.true_cameras import TrueCameras
 
 _SHAPE = (5, 31, 41)  # grid points along disparity, y and x
 _MARGIN = 1.3  # extent of the grid, in units of the image
-_STEP_DEPTHS = 0.01  # displacement of the camera for the Jacobian of the image motion, in depths and radians
+_STEP_DEPTHS = 0.01  # step of the camera for the numerical Jacobian of the image motion, in units of depth and in rad
 _FIT_ITERATIONS = 3
 _INVERSE_ITERATIONS = 8
-_COLUMNS = np.array([True, False, True, True])  # pitch, roll and row offset are removed, yaw is not
 
 
 class ViewTable(NamedTuple):
@@ -35,7 +34,7 @@ class ViewTable(NamedTuple):
 
     Args:
         values: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are
-            measured where they are.
+            measured at their true positions.
         first: (3,) true disparity, y and x of the first grid point.
         step: (3,) spacing of the grid.
     """
@@ -49,11 +48,12 @@ IDEAL_TABLE = ViewTable(np.zeros((0, 0, 0, 3)), np.zeros(3), np.ones(3))
 
 
 class MeasuredView(NamedTuple):
-    """Measured positions of true points, and the rectification errors that cause them.
+    """Measured positions and row differences of true points after the estimators have removed rectification errors.
 
     Args:
-        table: measured positions after the removal of rectification errors.
-        row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, on the grid of `table`.
+        table: measured positions.
+        row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of
+            `table`.
         removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove.
     """
 
@@ -63,7 +63,7 @@ class MeasuredView(NamedTuple):
 
     @property
     def is_ideal(self) -> bool:
-        """Returns whether all points are measured where they are."""
+        """Returns whether all points are measured at their true positions."""
         return not self.table.values.size
 
     def measure(self, points: Array) -> Array:
@@ -71,7 +71,7 @@ class MeasuredView(NamedTuple):
         return measure_all(self.table, points)
 
     def row_difference(self, points: Array) -> Array:
-        """Returns the row differences (n,) after rectification, right minus left, of true points (n, 3)."""
+        """Returns the remaining row differences (n,), right minus left (normalised), of true points (n, 3)."""
         rows = ViewTable(np.repeat(self.row_table[..., None], 3, axis=-1), self.table.first, self.table.step)
         return measure_all(rows, points)[:, 0]
 
@@ -88,8 +88,8 @@ class MeasuredView(NamedTuple):
     def motion_gain(self, points: Array, baseline_m: float) -> Array:
         """Returns the (6, 6) matrix from the true small motion to the one estimated from image motion and stereo depth.
 
-        The motion of the left image is estimated by least squares from the measured points; see
-        `sampling.unit_motion_cov`. Empty if all points are measured where they are.
+        The motion of the left camera is estimated by least squares from the measured points; see
+        `sampling.unit_motion_cov`. Empty if all points are measured at their true positions.
 
         Args:
             points: (n, 3) true points.
@@ -108,7 +108,7 @@ IDEAL_VIEW = MeasuredView(IDEAL_TABLE, np.zeros((0, 0, 0)), np.zeros(4))
 
 
 def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> MeasuredView:
-    """Returns the view of a stereo camera.
+    """Returns the measured view of a stereo rig.
 
     Args:
         cameras: geometry of the true cameras.
@@ -128,7 +128,7 @@ def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> Meas
 
 
 def _axes(rig: StereoRig, depths_m: Array) -> tuple[Array, Array, Array]:
-    """Returns the grid's values of disparity, y and x."""
+    """Returns the normalised values of disparity, y and x at the grid points, each (n,)."""
     disparity = np.linspace(rig.baseline_m / (1.5 * depths_m[-1]), rig.baseline_m / (0.7 * depths_m[0]), _SHAPE[0])
     sides = ((rig.height_px, rig.cy_px), (rig.width_px, rig.cx_px))
     y, x = (
@@ -139,7 +139,7 @@ def _axes(rig: StereoRig, depths_m: Array) -> tuple[Array, Array, Array]:
 
 
 def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, Array]:
-    """Returns the normalised positions (..., 2) of points (..., 3) in the rectified left and right image."""
+    """Returns the normalised positions (..., 2) of points (..., 3) in the left and the right rectified image."""
     depth_m = rig.baseline_m / grid[..., 2:]
     points_m = (np.concatenate([grid[..., :2], np.ones_like(depth_m)], axis=-1) * depth_m).reshape(-1, 3)
     to_right_m = np.array([cameras.rendered_rig.baseline_m, 0.0, 0.0])
@@ -151,10 +151,10 @@ def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, A
 
 
 def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
-    """Returns the errors (4,) of the right image that the estimators remove, in the order of `EpipolarCalibration`.
+    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`.
 
-    They are fitted to the row differences of points within both images at the middle of the disparities; none if they
-    change no row by a noticeable amount.
+    They are fitted to the row differences of the points at the middle disparity that lie inside both images. They are
+    zero if there are too few points, or if they change no row by more than `NOTICEABLE_PX`.
     """
     middle = _SHAPE[0] // 2
     left, right = left[middle].reshape(-1, 2), right[middle].reshape(-1, 2)
@@ -167,8 +167,8 @@ def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
     for _ in range(_FIT_ITERATIONS):
         corrected = _without(right, removed)
         x, y = corrected.T
-        jacobian = np.column_stack([-(1 + y**2), x * y, x, np.ones_like(x)])
-        change = np.linalg.lstsq(jacobian, corrected[:, 1] - left[:, 1], rcond=None)[0] * _COLUMNS
+        jacobian = row_jacobian(x, y)
+        change = np.linalg.lstsq(jacobian, corrected[:, 1] - left[:, 1], rcond=None)[0] * CORRECTED
         removed = removed + change
     shift = np.abs(_without(right, removed)[:, 1] - right[:, 1]).max()
     return removed if shift * rig.focal_px > NOTICEABLE_PX else np.zeros(4)
@@ -176,7 +176,7 @@ def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
 
 def _without(right: Array, removed: Array) -> Array:
     """Returns the normalised positions (..., 2) in the right image after `EpipolarCalibration.rectify`."""
-    rotation = geometry.so3_exp(removed[:3])
+    rotation = geometry.so3_exp(-removed[:3])
     rays = np.concatenate([right - [0.0, removed[3]], np.ones_like(right[..., :1])], axis=-1) @ rotation
     return rays[..., :2] / rays[..., 2:]
 
@@ -227,7 +227,10 @@ def measure_point(table, x, y, disparity):
 
 @njit(cache=True, nogil=True, inline="always")
 def _interval(position, n):
-    """Returns the index of the interval of a grid of n points that contains a position, and the position within it."""
+    """Returns the index of the grid interval that contains a position, and the relative position in it.
+
+    The grid has n points. The relative position is 0 to 1 inside the grid, and below 0 or above 1 outside.
+    """
     k = min(max(int(np.floor(position)), 0), n - 2)
     return k, position - k
 

@@ -1,4 +1,4 @@
-"""Model of the mosaic: stores for each floor cell the first keyframe that shows it, as the mosaic keeps the oldest."""
+"""Model of the mosaic: for each floor cell, the first keyframe that shows it, as later ones do not replace it."""
 
 from __future__ import annotations
 

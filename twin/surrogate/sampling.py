@@ -12,7 +12,7 @@ from twin.estimate.vision.two_view_motion import CUTOFF, HUBER
 from twin.surrogate.measured_view import measure_point
 
 MIN_POINTS = 6  # smallest number of points from which a motion is estimated
-_MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are not measured where they are
+_MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are not measured at their true positions
 
 
 @njit(cache=True, nogil=True)
@@ -45,14 +45,14 @@ def sample_link(
 
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
-        later_noise: (n, 3) standard normal numbers of the later stereo pair's errors at these points.
-        earlier_noise: (rows, cols, 3) standard normal numbers of the earlier stereo pair's biases, on a raster over its
+        later_noise: (n, 3) standard normal samples of the later stereo pair's errors at these points.
+        earlier_noise: (rows, cols, 3) standard normal samples of the earlier stereo pair's biases, on a raster over its
             image.
-        relief_noise: (f, f, 2) standard normal numbers of the errors due to relief; they repeat every f floor cells.
-        normals: (n + 1, 3) standard normal numbers of this link alone: n for its points, one for their common bias.
+        relief_noise: (f, f, 2) standard normal samples of the errors due to relief; they repeat every f floor cells.
+        normals: (n + 1, 3) standard normal samples of this link alone: n for its points, one for their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
-        camera: focal length, principal point x and y, image width and height, border [px]; baseline [m]; table of the
-            measured positions of true points (`measured_view.ViewTable`).
+        camera: focal length, principal point x and y, image width and height, margin along the border [px]; baseline
+            [m]; table of the measured positions of true points (`measured_view.ViewTable`).
         cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
         error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
         bias_fraction: `match_bias_fraction` of the `ErrorModel`.
@@ -118,7 +118,7 @@ def sample_link(
 
 @njit(cache=True, nogil=True)
 def _robust_weights(normalised_residual, noise_share):
-    """Returns the Huber weights (n,) that single matches would have, as in `two_view_motion.pair_motion`.
+    """Returns the weights (n,) that single matches would have in `two_view_motion.pair_motion`: Huber, with a cutoff.
 
     Args:
         normalised_residual: (n,) residuals relative to the covariance of the points.
@@ -161,7 +161,7 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
 def measured_motion(points, earlier_pose, later_pose, camera, cov):
     """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`.
 
-    It is the true motion if all points are measured where they are, or if too few of them are in both views.
+    It is the true motion if all points are measured at their true positions, or if too few of them are in both views.
     """
     if not camera[-1].values.size:
         return geometry.inverse(earlier_pose) @ later_pose

@@ -1,9 +1,9 @@
 """Effect of marine snow on matching, from images of a level floor with and without snow.
 
 A flake changes the grey levels n of a patch with gradient g along the rows. Least-squares matching then shifts the
-patch by sum(g n) / sum(g^2), summed over its pixels, and sees a larger residual, which reduces its weight in proportion
-to 1 / variance. A patch that flakes change too much is not matched: its correlation with the same floor without these
-flakes is too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
+patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its weight, 1 / variance, is
+smaller. A patch that flakes change too much is not matched: its correlation with the same floor without these flakes is
+too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class SnowEffect(NamedTuple):
     """Effect of marine snow on the matching of patches between two images.
 
     Args:
-        variance_px2: mean variance of a weighted match, noise included [px^2].
+        variance_px2: variance of the weighted mean of n matches, times n [px^2]; includes the image noise.
         matched_share: fraction of the patches that are matched in spite of the snow.
     """
 
@@ -38,7 +38,7 @@ class SnowEffect(NamedTuple):
 
 
 def snow_poses(pose: StampedPose) -> list[StampedPose]:
-    """Returns poses of the camera that show different flakes: shifted by fractions of the box that repeats."""
+    """Returns poses of the camera that show different flakes, shifted by fractions of the periodic snow box."""
     poses = []
     for k in range(_VIEWS):
         shifted = pose.world_from_left.copy()
@@ -75,7 +75,7 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
 def _patches(
     clean: Gray, snow: tuple[Gray, Gray], noise: float, patch_px: int
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Returns variance [px^2], error due to snow [px] and match mask of all patches of an image.
+    """Returns variance [px^2], error due to snow [px] and match mask, each (n,), of patches at every second pixel.
 
     Args:
         clean: noise-free image without snow.

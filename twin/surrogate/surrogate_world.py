@@ -17,7 +17,7 @@ from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.surrogate.compiled_loop import compiled_loop
-from twin.surrogate.coverage import Departure, survey_conditions
+from twin.surrogate.coverage import QuantityOutsideFit, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
@@ -88,22 +88,22 @@ class SurrogateWorld(World):
 
 def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
     """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`."""
-    found = fitted.departures(survey_conditions(mission, matchability))
+    found = fitted.quantities_outside_fit(survey_conditions(mission, matchability))
     if not found:
         return ()
     if not mission.scenario.imaging.extrapolate:
         source = mission.scenario.source
-        raise ScenarioError([source.describe(_refusal(departure)) for departure in found])
+        raise ScenarioError([source.describe(_refusal(quantity)) for quantity in found])
     texts = [f"{one.value_text} ({one.allowed_text})" for one in found]
     return (f"The surrogate extrapolates outside the range of its error model: {'; '.join(texts)}.",)
 
 
-def _refusal(departure: Departure) -> TwinError:
+def _refusal(quantity: QuantityOutsideFit) -> TwinError:
     """Returns the error of a survey outside the range of the fit."""
     return TwinError(
         "imaging.fidelity",
-        f"the error model of the surrogate does not hold for a {departure.value_text}",
-        f'{departure.allowed_text}, or imaging.fidelity = "rendered", or --extrapolate',
+        f"the error model of the surrogate does not hold for this survey: {quantity.value_text}",
+        f'{quantity.allowed_text}, or imaging.fidelity = "rendered", or --extrapolate',
     )
 
 

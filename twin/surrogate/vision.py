@@ -35,7 +35,7 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import CellErrors, MapModel
+from twin.surrogate.map_model import CellErrors, MapModel, window_noise
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
@@ -45,7 +45,7 @@ _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
-#: Largest growth of the squared median residual of a link by relief: matches that relief shifts by more are outliers.
+#: Largest relative increase of a link's squared median residual due to relief: matches shifted more are outliers.
 _RESIDUAL_GROWTH = 2.0
 
 
@@ -54,17 +54,17 @@ class _KeyframeTruth(NamedTuple):
 
     Args:
         pose: (4, 4) true pose.
-        points: (n, 3) raster points that show the floor in both images: true normalised (x, y, disparity).
+        points: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images.
         raster_indices: (n,) index of each point in the raster.
-        noise: (rows, cols, 3) standard normal numbers of the stereo errors of the raster points.
-        bound_px: Cramer-Rao bound of a patch's position [px].
+        noise: (rows, cols, 3) standard normal samples of the stereo errors of the raster points.
+        bound_px: Cramér-Rao bound of a patch's position [px].
         unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
         n_points: number of matched points that the raster points represent.
         unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
         unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
         cells: (n,) floor cells of the points.
         measured: (n, 3) positions at which the points are measured without noise; see `measured_view`.
-        clear_share: fraction of the matches that marine snow leaves.
+        clear_share: fraction of the matches that remain in the presence of marine snow.
         noise_ratio: ratio of the scatter of the row differences to that expected from noise (`measured_rows`).
     """
 
@@ -90,7 +90,8 @@ class FrameErrors(NamedTuple):
         root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
         cov: (6, 6) reported covariance of a motion.
         anticorrelation: fraction of the independent error of a motion that the next motion cancels.
-        gain: (6, 6) matrix from the true motion to the measured one, which calibration errors cause; empty without any.
+        gain: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration
+            errors and an approximated port; empty without these.
     """
 
     root: Array
@@ -105,8 +106,8 @@ class TrueScene(NamedTuple):
     Args:
         left_camera: function that returns the current true pose (4, 4) of the left camera.
         floor: ray caster against the true floor.
-        matchability: Cramer-Rao bound and unevenness of the floor.
-        map_model: true heights on the grid of the map.
+        matchability: Cramér-Rao bound and unevenness of the floor.
+        map_model: model of the elevation map, with the true heights on its grid.
         view: positions at which the estimators measure true points.
     """
 
@@ -121,7 +122,7 @@ class SurrogateVision:
     """Implementation of `Vision` that samples measurements from an error model.
 
     Args:
-        rig: true calibration.
+        rig: calibration that the estimators use.
         settings: settings of the estimators.
         model: error model of the measurements.
         scene: true scene.
@@ -130,7 +131,7 @@ class SurrogateVision:
 
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
-        last_normals: (6,) standard normal numbers of the last frame-to-frame motion; 0 after each keyframe.
+        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after each keyframe.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
@@ -153,7 +154,7 @@ class SurrogateVision:
         )  # fmt: skip
         self._pixels = _raster(rig, margin_px)
         middle = rig.baseline_m / float(np.median(scene.matchability.depths_m))
-        self._rays = scene.view.true_directions(rig.normalised(self._pixels), middle)  # true ones
+        self._rays = scene.view.true_directions(rig.normalised(self._pixels), middle)  # of the true points
         self._true_pixels = self._rays * rig.focal_px + [rig.cx_px, rig.cy_px]
         self._rows = None if scene.view.is_ideal else MeasuredRows(scene.view, rig, settings.patch_px, rng)
         self.last_pose: Array | None = None
@@ -177,7 +178,7 @@ class SurrogateVision:
 
     @property
     def bounds_px(self) -> tuple[float, float]:
-        """Returns the smallest and the largest Cramer-Rao bound of matching over the range of floor depths [px]."""
+        """Returns the smallest and the largest Cramér-Rao bound of matching over the range of floor depths [px]."""
         bounds_px = self.scene.matchability.bounds_px
         return float(bounds_px.min()), float(bounds_px.max())
 
@@ -188,7 +189,7 @@ class SurrogateVision:
 
     @property
     def bound_px(self) -> float:
-        """Returns the Cramer-Rao bound of a patch's position in the last keyframe [px]."""
+        """Returns the Cramér-Rao bound of a patch's position in the last keyframe [px]."""
         assert self._latest is not None
         return self._latest.bound_px
 
@@ -204,7 +205,7 @@ class SurrogateVision:
         return _parallax_px(self._latest, earlier_pose, self.rig.baseline_m)
 
     def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the length of a motion's translation in units of depth: times the last keyframe's mean inverse depth.
+        """Returns the length of a motion's translation multiplied by the mean inverse depth of the last keyframe.
 
         Args:
             a_from_b: (4, 4) motion.
@@ -282,13 +283,13 @@ class SurrogateVision:
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
-        """Returns the fraction of the raster points in the left image that satisfy the epipolar constraint."""
+        """Returns the fraction of the raster points with these indices that satisfy the epipolar constraint."""
         if self._rows is None:
             return 1.0
         return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the raster points whose patches lie inside both images, with a margin.
+        """Returns the mask (n,) of the raster points that lie inside both images and satisfy the epipolar constraint.
 
         Args:
             indices: (n,) indices of the points in the raster.
@@ -377,8 +378,9 @@ class SurrogateVision:
     ) -> Motion | None:
         """Samples the motion between two keyframes; None if too few points would be matched.
 
-        The motion is estimated from noisy points, in one least-squares iteration that starts at the true motion. The
-        random numbers depend only on the two keyframe numbers, not on the order in which links are measured.
+        The motion is estimated from noisy points by least squares, starting at the true motion: in one iteration, or in
+        several if `TrueScene.view` is not ideal. The random numbers that belong to the link alone depend only on the
+        two keyframe numbers, not on the order in which links are measured.
 
         Args:
             later, earlier: the two keyframes.
@@ -408,16 +410,17 @@ class SurrogateVision:
         return Motion(motion, cov * growth, n_matched, float(residual))
 
     def _relief_growth(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
-        """Returns the factor on the reported covariance of a link by which the residuals grow due to relief.
+        """Returns the factor by which relief increases the residuals' variance and the reported covariance of a link.
 
-        It is the variance of a match with relief, divided by that without: two image positions without relief.
+        It is the variance of the difference between the two image positions of a match, divided by this variance
+        without relief, 2 sigma^2.
         """
         bound_px = max(later.bound_px, earlier.bound_px)
         relief_px = model.relief_gain * _parallax_px(later, earlier.pose, self.rig.baseline_m)
         return 1 + relief_px**2 / (2 * model.match_sigma_px(bound_px) ** 2)
 
     def _match_fraction(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
-        """Returns the fraction of the points of a keyframe in view of an earlier one that are matched there."""
+        """Returns the fraction of a keyframe's points in the field of view of an earlier one that are matched there."""
         parallax = _parallax_px(later, earlier.pose, self.rig.baseline_m) / model.match_parallax_px
         clear_share = min(later.clear_share, earlier.clear_share)
         return clear_share * model.match_fraction(max(later.bound_px, earlier.bound_px)) / (1 + parallax**2)
@@ -432,26 +435,35 @@ class SurrogateVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        model, mapper, shape = self.model, elevation.ElevationMapper(grid), (grid.rows, grid.cols)
-        lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
-        edge_noise = self._rng.standard_normal(shape, np.float32)
+        model, mapper, map_model = self.model, elevation.ElevationMapper(grid), self.scene.map_model
+        errors = self._cell_errors(model, (grid.rows, grid.cols))
         estimated = result.final.world_from_camera[result.keyframe_rows]
-        true = [self._poses[k] for k in range(len(estimated))]
-        depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
-        sigma_px = np.array([model.depth_sigma_px(b) for b in bounds_px])
-        completeness = np.array([model.map_completeness(b) for b in bounds_px])
-        errors = CellErrors(
-            lateral_noise, edge_noise, dropout, model.lateral_sigma_px, depths_m, sigma_px * model.depth_error_ratio,
-            sigma_px, completeness, model.depth_error_views, model.depth_sigma_views, model.edge_error_gain,
-            model.edge_sigma_gain, model.edge_half_px,
-        )  # fmt: skip
-        for k, (pose, next_pose) in enumerate(zip(true, [*true[1:], None], strict=True)):
-            node_cov, map_model = result.node_cov[k], self.scene.map_model
-            patch = map_model.sample_patch(pose, next_pose, estimated[k], node_cov, errors, self._rng)
+        following = None
+        for k, pose in enumerate(estimated):
+            observed = map_model.observe(self._poses[k], pose) if following is None else following
+            is_last = k == len(estimated) - 1
+            following = None if is_last else map_model.observe(self._poses[k + 1], estimated[k + 1])
+            patch = map_model.sample_patch(observed, following, result.node_cov[k], errors, self._rng)
             if patch is not None:
                 mapper.fuse(patch)
             progress(k + 1)
         return mapper.result()
+
+    def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
+        """Returns the errors of the filtered depth of a map with (rows, cols) cells."""
+        lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
+        edge_noise = window_noise(shape, self.scene.map_model.window_cells, self._rng)
+        scatter = float(np.exp(model.depth_error_scatter * self._rng.standard_normal()))
+        depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
+        return CellErrors(
+            lateral_noise, edge_noise, dropout, model.lateral_sigma_px, depths_m,
+            model.depth_error.sigma_px(bounds_px, self.lamp_share) * scatter,
+            model.depth_sigma.sigma_px(bounds_px, self.lamp_share),
+            np.array([model.map_completeness(b) for b in bounds_px]),
+            model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
+            model.edge_error_gain, model.edge_sigma_gain, model.edge_half_px, model.border_holes.share,
+            model.border_holes.width_px(bounds_px, self.lamp_share),
+        )  # fmt: skip
 
     def draw_normals(self, n: int) -> Array:
         """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""
@@ -473,7 +485,7 @@ def _raster(rig: StereoRig, margin_px: float) -> Array:
 
     Args:
         rig: calibration, for the image size.
-        margin_px: smallest distance of a matched patch from the image border.
+        margin_px: smallest distance of the centre of a matched patch from the image border.
     """
     sides = (rig.height_px, rig.width_px)
     rows, cols = (

@@ -24,17 +24,25 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.surrogate.error_model import ErrorModel, SigmaLaw
+from twin.surrogate.error_model import DepthLaw, ErrorModel
 from twin.surrogate.map_model import EDGE_PX
 from twin.surrogate.vision import SurrogateVision
 
-_MIN_CELLS = 300  # a map statistic needs more cells than this
-_LEVEL_SLOPE, _STEEP_SLOPE = 0.3, 0.6  # rise over run: level cells have less than the first, steep more than the second
-_FEW_VIEWS, _MANY_VIEWS = 2, 4  # most and fewest views of the level cells of the classes "few" and "many"
+_MIN_CELLS = 200  # a map statistic needs at least this many cells
+_STEEP_SLOPE = 0.6  # rise over run that level cells do not reach
+_VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells
+_ROUGH_PX = 0.25  # roughness that level cells do not reach
+#: Classes of level cells by name, with the first and the last roughness.
+_RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.08, _ROUGH_PX)}
+_WALL_SLOPE = 1.0  # rise over run: cells near steeper ones belong to no class but edges
 _ROUGHNESS_BINS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
-_VIEW_QUANTILES = (np.arange(20) + 0.5) / 20  # of the number of views of the cells of a class
+_BORDER_BINS_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 20.0)  # see `MapModel.border_px`
 _P90 = 1.645  # 90th percentile of the absolute value of a standard normal variable
-_NEGLIGIBLE = SigmaLaw(1e-4, 0.0)
+_NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
+UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
+#: Quantities of a class of map cells, in the order of the statistic `map_<error or sigma>_<class>`: variances of the
+#: maps from images and sampled maps [m^2], and conditions of the class.
+MAP_STATISTICS = ("images", "pose", "depth", "lateral", "edge", "views", "step_baselines", "roughness_px")
 #: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
 
@@ -179,59 +187,73 @@ class ComparisonVision:
         """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
         There are four sampled maps: with pose errors alone, and with pose errors and one of depth errors, lateral
-        errors and errors due to roughness.
+        errors and errors due to roughness, each with a unit standard deviation.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         none = model._replace(
-            depth_sigma_px=_NEGLIGIBLE, lateral_sigma_px=0.0, edge_error_gain=0.0, edge_sigma_gain=0.0
-        )
+            depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0, edge_error_gain=0.0,
+            edge_sigma_gain=0.0, depth_error_scatter=0.0,
+        )  # fmt: skip
+        unit = _NONE._replace(floor_px=UNIT_PX)
         models = {
             "pose": none,
-            "depth": none._replace(depth_sigma_px=model.depth_sigma_px),
-            "lateral": none._replace(lateral_sigma_px=model.lateral_sigma_px),
+            "depth": none._replace(depth_error=unit, depth_sigma=unit),
+            "lateral": none._replace(lateral_sigma_px=1.0),
             "edge": none._replace(edge_error_gain=1.0, edge_sigma_gain=1.0),
         }
-        for name, single_error in models.items():
-            self.surrogate.model = single_error
-            self._compare_map(name, self.surrogate.build_map(result, grid, step_cov, lambda _: None))
+        maps = {"images": elevation}
+        for name, self.surrogate.model in models.items():
+            maps[name] = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
         self.surrogate.model = model
-        self._compare_map("images", elevation)
+        for name, cells in self._cell_classes().items():
+            self._compare_maps(name, cells, maps)
         self._count_holes(elevation)
         return elevation
 
-    def _compare_map(self, source: str, elevation: ElevationMap) -> None:
-        """Adds the robust variance of a map's height errors and its median reported variance [m^2], by class of cells.
+    def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
+        """Adds the statistics `MAP_STATISTICS` of a class of cells: of height errors, and of reported variances.
 
-        The robust variance is that of a normal distribution with the same 90th percentile of the absolute error.
+        The variance of errors is the robust one: that of a normal distribution with the same 90th percentile of the
+        absolute error. The reported one is the mean without the largest 5 %.
 
         Args:
-            source: name of the map in the statistics.
-            elevation: the map to compare with the true heights.
+            name: name of the class.
+            cells: (rows, cols) mask of the cells.
+            maps: map from images and sampled maps, by name.
         """
         map_model = self.surrogate.scene.map_model
-        error = elevation.height_m - map_model.height_m
-        for name, cells in self._cell_classes().items():
-            known = cells & map_model.seen & np.isfinite(error)
-            if known.sum() > _MIN_CELLS:
-                residual = error[known] - np.median(error[known])
-                robust = float(np.percentile(np.abs(residual), 90) / _P90) ** 2
-                self.statistics[f"map_error_{name}_{source}"].append(robust)
-                self.statistics[f"map_sigma_{name}_{source}"].append(float(np.median(elevation.sigma_m[known]) ** 2))
-                views = np.quantile(np.maximum(map_model.views[known], 1), _VIEW_QUANTILES, method="nearest")
-                self.statistics[f"map_views_{name}_{source}"] = views.tolist()
+        heights = np.array([elevation.height_m for elevation in maps.values()])
+        known = cells & map_model.seen & np.isfinite(heights).all(axis=0)
+        if known.sum() < _MIN_CELLS:
+            return
+        errors = (heights - map_model.height_m)[:, known]
+        sizes = np.abs(errors - np.median(errors, axis=1, keepdims=True))
+        variances = np.square(np.percentile(sizes, 90, axis=1) / _P90)
+        reported = [_trimmed_mean(elevation.sigma_m[known] ** 2) for elevation in maps.values()]
+        conditions = [
+            float(np.mean(map_model.views[known])), float(np.median(map_model.step_baselines[known])),
+            float(np.sqrt(np.mean(self._roughness_px()[known] ** 2))),
+        ]  # fmt: skip
+        self.statistics[f"map_error_{name}"] = [*variances.tolist(), *conditions]
+        self.statistics[f"map_sigma_{name}"] = [*reported, *conditions]
 
     def _cell_classes(self) -> dict[str, np.ndarray]:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
 
-        "few" and "many" are level cells that few and many consecutive keyframes observed; "edge" are the rough cells.
-        Cells within a matching window of an edge belong to no other class.
+        Level cells are divided by roughness and by the number of consecutive keyframes that observed them. Cells within
+        a matching window of an edge, and cells near the image border, belong to the class "edge" or to none.
         """
-        map_model = self.surrogate.scene.map_model
-        edge = self._roughness_px() > EDGE_PX
-        level, steep = map_model.steepness < _LEVEL_SLOPE, map_model.steepness > _STEEP_SLOPE
-        margin = np.asarray(maximum_filter(edge, 2 * map_model.window_cells + 1), np.bool_)
-        few, many = map_model.views <= _FEW_VIEWS, map_model.views >= _MANY_VIEWS
-        return {"few": level & few & ~margin, "many": level & many & ~margin, "steep": steep & ~margin, "edge": edge}
+        map_model, rough = self.surrogate.scene.map_model, self._roughness_px()
+        edge, steepness, views = rough > EDGE_PX, map_model.steepness, map_model.views
+        wall = (rough > _ROUGH_PX) | (steepness > _WALL_SLOPE)
+        near_edge = np.asarray(maximum_filter(wall, 2 * map_model.window_cells + 1), np.bool_)
+        plain = ~near_edge & (map_model.border_px > _BORDER_BINS_PX[-1])
+        classes = {"edge": edge, "steep": plain & (steepness > _STEEP_SLOPE) & (rough < _RELIEF_BINS_PX["smooth"][1])}
+        for name, (smoothest, roughest) in _RELIEF_BINS_PX.items():
+            level = plain & (steepness < _STEEP_SLOPE) & (rough >= smoothest) & (rough < roughest)
+            for low, high in pairwise(_VIEW_BINS):
+                classes[f"{name}{low}"] = level & (views >= low) & (views < high)
+        return classes
 
     def _roughness_px(self) -> np.ndarray:
         """Returns the roughness of the map cells (rows, cols) at the typical depth of the floor [px of disparity]."""
@@ -239,18 +261,27 @@ class ComparisonVision:
         return map_model.roughness_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells, the fraction with a height and the roughness, by bins of roughness."""
-        seen, roughness = self.surrogate.scene.map_model.seen, self._roughness_px()
-        for low, high in pairwise(_ROUGHNESS_BINS_PX):
-            cells = seen & (roughness >= low) & (roughness < high)
-            if cells.sum() > _MIN_CELLS / 10:
-                self.statistics["hole_cells"].append(float(cells.sum()))
-                self.statistics["hole_known"].append(float(np.isfinite(elevation.height_m[cells]).mean()))
-                self.statistics["hole_roughness_px"].append(float(np.median(roughness[cells])))
+        """Adds the number of observed cells and the fraction with a height, by roughness and by distance from borders.
+
+        Distances from the border of the images are those of smooth cells, and the roughness is that of cells far from
+        the border.
+        """
+        map_model, roughness = self.surrogate.scene.map_model, self._roughness_px()
+        seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)
+        inner, smooth = seen & (border > _BORDER_BINS_PX[-1]), seen & (roughness < _ROUGH_PX)
+        for name, values, cells, bins in (
+            ("hole", roughness, inner, _ROUGHNESS_BINS_PX), ("border", border, smooth, _BORDER_BINS_PX),
+        ):  # fmt: skip
+            for low, high in pairwise(bins):
+                chosen = cells & (values >= low) & (values < high)
+                if chosen.sum() > _MIN_CELLS / 10:
+                    self.statistics[f"{name}_cells"].append(float(chosen.sum()))
+                    self.statistics[f"{name}_known"].append(float(known[chosen].mean()))
+                    self.statistics[f"{name}_px"].append(float(np.median(values[chosen])))
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
-    """Returns two error models by name, for links: "patches" without errors due to relief, "relief" without any others.
+    """Returns two error models for links: "patches" without errors due to relief, "relief" with these errors alone.
 
     The other parameters are those of `model`.
     """
@@ -260,6 +291,11 @@ def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
         ),
         "relief": model._replace(match_error_ratio=0.0, relief_gain=RELIEF_GAIN, common_bias_px=0.0),
     }
+
+
+def _trimmed_mean(values: np.ndarray) -> float:
+    """Returns the mean of values (n,) without the largest 5 %."""
+    return float(np.sort(values)[: len(values) - len(values) // 20].mean(dtype=np.float64))
 
 
 def _chi2(error: Array, cov: Array) -> float:

@@ -1,24 +1,27 @@
 """Fit of the error model to the statistics of rendered surveys.
 
 The functions that model reported standard deviations (`SigmaLaw`) are fitted to the ratios of the standard deviations
-reported for image measurements and by the surrogate. The error ratios are fitted to squared errors normalised by the
-reported covariance. Medians and trimmed means make the fit robust against a few failed measurements. Every survey has
-the same weight.
+reported for image measurements to those reported by the surrogate. The error ratios are fitted to squared errors
+normalised by the reported covariance. Medians and trimmed means make the fit robust against a few failed measurements.
+Every survey has the same weight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from twin.surrogate.error_model import ErrorModel, FractionLaw, SigmaLaw, ViewsLaw
-from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN
+from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate.map_model import roughness_error_px
+from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, UNIT_PX
 
-_CELL_CLASSES = ("few", "many", "steep", "edge")  # see `ComparisonVision`
-_NOTICEABLE = 0.1  # smallest fraction of the variance of a class of cells that determines a factor
-_SMOOTH_PX = 0.25  # roughness [px of disparity] that no class of cells of a smooth floor reaches
+_NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute value
+_PRIOR = 0.01  # weight of the departure of a parameter from the compared model's, relative to it or to a typical value
+_HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a bin of cells has less weight
+_OUTLIER = 0.3  # residual of a log variance beyond which a class of cells has less weight
 _SOURCES = ("images", "patches", "relief")
 _RELATIVE_SIGMA = 0.1  # assumed relative standard error of the mean squared error over a third of a survey's links
 
@@ -50,12 +53,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     match_error_ratio, lamp_error_growth = _fit_lamp_growth(
         patch_ratios / median("match_sigma_ratio"), median("lamp_share")
     )
-    error_views, errors = _fit_map_variances(surveys, "error", compared.depth_error_views)
-    sigma_views, reported = _fit_map_variances(surveys, "sigma", compared.depth_sigma_views)
-    smooth = _is_smooth(surveys)
-    depth_sigmas_px = np.array([compared.depth_sigma_px(b) for b in bounds]) * np.sqrt(reported[:, 0])
-    depth_sigmas_px = np.maximum(depth_sigmas_px, np.median(depth_sigmas_px[smooth]) / 10)
-    depth_ratios = np.sqrt(errors[:, 0] / np.maximum(reported[:, 0], 1e-6))
+    errors, reported = (_fit_map_variances(surveys, quantity, compared) for quantity in ("error", "sigma"))
     known_fractions = np.array([s["hole_known"][0] for s in surveys])
     match_fractions = [compared.match_fraction(b) for b in bounds]
     mosaic_chi2 = median("mosaic_difference_nees") - compared.mosaic_error_ratio**2
@@ -75,14 +73,16 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         f2f_error_ratio=compared.f2f_error_ratio * float(np.median(f2f_ratios)),
         f2f_anticorrelation=float(np.median([_fit_anticorrelation(s) for s in surveys])),
         mosaic_sigma_px=mosaic_sigma_px,
-        depth_sigma_px=_fit_sigma_law(bounds[smooth], depth_sigmas_px[smooth]),
-        depth_error_ratio=compared.depth_error_ratio * float(np.median(depth_ratios[smooth])),
-        depth_error_views=error_views,
-        depth_sigma_views=sigma_views,
-        lateral_sigma_px=compared.lateral_sigma_px * _root_median(errors[:, 1], 1.0),
-        map_completeness=_fit_fraction_law(bounds[smooth], known_fractions[smooth]),
-        edge_error_gain=_root_median(errors[:, 2], compared.edge_error_gain),
-        edge_sigma_gain=_root_median(reported[:, 2], compared.edge_sigma_gain),
+        depth_error=errors.depth,
+        depth_error_scatter=errors.scatter,
+        depth_sigma=reported.depth,
+        lateral_sigma_px=errors.lateral_sigma_px,
+        map_completeness=_fit_fraction_law(bounds, known_fractions, _HOLE_OUTLIER / 10),
+        border_holes=_fit_border_holes(surveys),
+        relief_error_gain=errors.relief_gain,
+        relief_error_limit_px=errors.relief_limit_px,
+        edge_error_gain=errors.edge_gain,
+        edge_sigma_gain=reported.edge_gain,
         edge_half_px=_fit_edge_holes(surveys, compared.edge_half_px),
         mosaic_error_ratio=float(np.sqrt(np.median(np.maximum(mosaic_chi2, 0.01) / median("mosaic_sigma_ratio") ** 2))),
     )
@@ -115,7 +115,7 @@ def _rms_log_ratio(surveys: Sequence[SurveyStatistics], ratio: str, compared: Si
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Fits a `SigmaLaw` to standard deviations (n,) [px] at Cramer-Rao bounds (n,) [px]; residuals are log ratios."""
+    """Fits a `SigmaLaw` to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px]; residuals are log ratios."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
@@ -124,15 +124,18 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
     return SigmaLaw(float(solution.x[0]), float(solution.x[1]))
 
 
-def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray) -> FractionLaw:
-    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px] by least squares."""
+def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float = 1.0) -> FractionLaw:
+    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px].
+
+    Residuals much larger than `outlier` have less weight.
+    """
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
 
-    start = [min(float(fractions.max()), 0.999), np.log(4 * bounds.max())]
+    start = [min(float(fractions.max()), 0.9999), np.log(4 * bounds.max())]
     limits = ([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())])
-    solution = least_squares(residuals, start, bounds=limits)
+    solution = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=outlier)
     return FractionLaw(float(solution.x[0]), float(np.exp(solution.x[1])), 4.0)
 
 
@@ -154,10 +157,10 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
     Errors due to relief grow with the distance between the keyframes; errors of patch matching do not. The links of
     each survey are therefore sorted by distance and divided into thirds, and one relief gain is fitted to the mean
     squared errors of all thirds of all surveys. Over a smooth floor the errors do not determine the relief gain, so
-    the gain of the compared model, or a larger minimum value, is added as an observation.
+    the gain of the compared model, or a minimum value if that is larger, is added as an observation.
 
     A keyframe's bias makes the errors of two consecutive links cancel partly, because the keyframe ends the first link
-    and starts the second. Relief makes the two errors equal. The bias fraction is fitted to the scalar products of the
+    and starts the second. Relief adds equal errors to both. The bias fraction is fitted to the scalar products of the
     errors of consecutive links.
     (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated errors.)
 
@@ -259,7 +262,7 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
     roughness, fractions, weights = [], [], []
     for s in surveys:
         known = np.array(s["hole_known"]) / max(s["hole_known"][0], 1e-6)
-        roughness.append(np.array(s["hole_roughness_px"])[1:])
+        roughness.append(np.array(s["hole_px"])[1:])
         fractions.append(np.minimum(known[1:], 1.0))
         weights.append(np.sqrt(np.array(s["hole_cells"])[1:] / np.sum(s["hole_cells"])))
     r, known, weight = (np.concatenate(part) for part in (roughness, fractions, weights))
@@ -270,63 +273,98 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
     return float(half[np.argmin(misfit)])
 
 
-def _fit_map_variances(
-    surveys: Sequence[SurveyStatistics], quantity: str, compared: ViewsLaw
-) -> tuple[ViewsLaw, np.ndarray]:
-    """Fits the variances of the maps from images, in all classes of cells, by those of the sampled maps.
+def _fit_border_holes(surveys: Sequence[SurveyStatistics]) -> BorderLaw:
+    """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border.
 
-    The decrease of the variance due to depth with the number of keyframes is common to all surveys and found by a grid
-    search; for each `ViewsLaw`, the other variances of each survey follow by non-negative least squares of relative
-    residuals.
+    The fractions are relative to the cells of the same survey away from the border. Every survey has the same weight.
+    """
+    rows: list[tuple[float, ...]] = []
+    for s in surveys:
+        cells = np.array(s.get("border_cells", ()))
+        for distance, known, weight in zip(s.get("border_px", ()), s.get("border_known", ()), cells, strict=True):
+            hole = 1 - min(known / max(s["hole_known"][0], 1e-6), 1.0)
+            conditions = float(np.median(s["bound_px"])), float(np.median(s["lamp_share"]))
+            rows.append((distance, hole, float(np.sqrt(weight / cells.sum())), *conditions))
+    if not rows:
+        return BorderLaw(0.0, 1.0, 0.0, 0.0)
+    distance, hole, weight, bounds, lamps = np.array(rows).T
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return weight * (x[0] * np.exp(-distance / BorderLaw(*x).width_px(bounds, lamps)) - hole)
+
+    limits = [0.0, 0.05, 1.0, 0.0], [1.0, 20.0, 1000.0, 3.0]
+    x = least_squares(residuals, [0.5, 1.0, 50.0, 1.0], bounds=limits, loss="soft_l1", f_scale=_HOLE_OUTLIER).x
+    return BorderLaw(*x.tolist())
+
+
+class _MapErrors(NamedTuple):
+    """Parameters of the errors of a map, or of its reported variances.
+
+    Args:
+        depth: law of the depth.
+        lateral_sigma_px: standard deviation of the lateral shift [px].
+        relief_gain: standard deviation per roughness of a cell.
+        relief_limit_px: limit of this standard deviation for large roughness [px].
+        edge_gain: standard deviation per unresolved roughness.
+        scatter: standard deviation over surveys of the logarithm of measured / modelled standard deviation.
+    """
+
+    depth: DepthLaw
+    lateral_sigma_px: float
+    relief_gain: float
+    relief_limit_px: float
+    edge_gain: float
+    scatter: float
+
+
+def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
+    """Fits the variances of maps from images, over all classes of cells, by those of the sampled maps.
+
+    The variance of a class is that of the map with pose errors alone, plus that of the depth by `DepthLaw`, of a
+    lateral shift, of the relief in a window and of edges, each the effect of a unit error times a square to be found.
+    Residuals are those of the logarithms; every survey has the same weight. The reported variances contain the effects
+    of a lateral shift and of relief already in the map with pose errors alone.
 
     Args:
         surveys: statistics of n surveys.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-        compared: the law of the error model with which the surveys were compared.
-
-    Returns:
-        The law; and factors (n, 3) on the variances of one keyframe's depth, of the lateral shift and, for a gain of 1,
-        of roughness. A factor on the lateral shift or on roughness that a survey does not determine, because its cells
-        have no such error, is NaN.
+        compared: error model with the values towards which parameters are drawn that the surveys do not determine.
     """
-    laws = [ViewsLaw(float(r), float(g)) for r in np.linspace(0.0, 0.9, 19) for g in np.geomspace(0.1, 20.0, 24)]
-    smooth = [s for s, is_smooth in zip(surveys, _is_smooth(surveys), strict=True) if is_smooth]
-    misfits = [sum(_fit_survey(s, quantity, compared, law)[1] for s in smooth) for law in laws]
-    best = laws[int(np.argmin(misfits))]
-    return best, np.array([_fit_survey(s, quantity, compared, best)[0] for s in surveys])
+    rows, conditions, weights, numbers = [], [], [], []
+    for number, s in enumerate(surveys):
+        classes = [name for name in s if name.startswith(f"map_{quantity}_")]
+        rows += [s[name] for name in classes]
+        conditions += [(float(np.median(s["bound_px"])), float(np.median(s["lamp_share"])))] * len(classes)
+        weights += [1 / np.sqrt(max(len(classes), 1))] * len(classes)
+        numbers += [number] * len(classes)
+    images, pose, depth, lateral, edge, views, step, rough = np.array(rows).T
+    (bounds, lamps), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
+    of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
+    per_px2 = of_depth / UNIT_PX**2
 
+    def variance(x: np.ndarray) -> np.ndarray:
+        law = DepthLaw(*x[:6])
+        depth_px2 = law.sigma_px(bounds, lamps) ** 2 * law.relative_variance(views, step)
+        relief_px2 = roughness_error_px(rough, x[7], x[8], 0.0) ** 2
+        common = per_px2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
+        return pose + per_px2 * depth_px2 + common + x[9] ** 2 * of_edge
 
-def _is_smooth(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
-    """Returns the mask (n,) of the surveys without edges, to which the depth of smooth cells is fitted.
+    gains = (compared.relief_error_gain, compared.relief_error_limit_px, compared.edge_error_gain)
+    gains = gains if is_error else (*gains[:2], compared.edge_sigma_gain)
+    law = compared.depth_error if is_error else compared.depth_sigma
+    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.01, 0.0])
+    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 5.0, 3.0, 1.0, 10.0])
+    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 0.2, 0.5, 0.05, 1.0])
+    start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + 1e-3, highest - 1e-3)
 
-    Next to walls, the cells with few views are those that a wall hid from the other keyframes: their errors are not
-    those of cells with few views elsewhere. If all surveys have edges, the mask is True for all.
-    """
-    rough_px = [max(s.get("hole_roughness_px", (0.0,))) for s in surveys]
-    smooth = np.array(rough_px) < _SMOOTH_PX
-    return smooth if smooth.any() else ~smooth
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.concatenate(
+            [weight * np.log(variance(x) / images) / 2, _PRIOR * (x - start) / np.maximum(start, typical)]
+        )
 
-
-def _fit_survey(
-    statistics: SurveyStatistics, quantity: str, compared: ViewsLaw, law: ViewsLaw
-) -> tuple[np.ndarray, float]:
-    """Returns the factors (3,) of `_fit_map_variances` for one survey and a law, and the norm of the residuals."""
-    names = [name for name in _CELL_CLASSES if f"map_{quantity}_{name}_images" in statistics]
-    images, pose, depth, lateral, edge = (
-        np.array([statistics[f"map_{quantity}_{name}_{source}"][0] for name in names])
-        for source in ("images", "pose", "depth", "lateral", "edge")
-    )
-    views = [np.array(statistics[f"map_views_{name}_images"]) for name in names]
-    factor = np.array([np.mean(law(n)) / np.mean(compared(n)) for n in views])
-    effects = np.stack([(depth - pose) * factor, lateral - pose, edge - pose], axis=1) / images[:, None]
-    effects = np.maximum(effects, 0)
-    factors, misfit = nnls(effects, np.maximum(1 - pose / images, 0))
-    determined = effects.max(axis=0) > _NOTICEABLE
-    determined[0] = True
-    return np.where(determined, factors, np.nan), float(misfit)
-
-
-def _root_median(factors: np.ndarray, default: float) -> float:
-    """Returns the root of the median of the factors (n,) on a variance, without NaN; `default` if all are NaN."""
-    known = factors[np.isfinite(factors)]
-    return float(np.sqrt(np.median(known))) if len(known) else default
+    limits = lowest, highest
+    found = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER)
+    ratios = np.log(images / variance(found.x)) / 2
+    means = [float(np.mean(ratios[np.array(numbers) == number])) for number in sorted(set(numbers))]
+    x = found.x.tolist()
+    return _MapErrors(DepthLaw(*x[:6]), *x[6:], scatter=float(_NORMAL_MAD * np.median(np.abs(means))))

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+
+import numpy as np
 
 from twin import survey
 from twin.core.timing import Stopwatch
@@ -14,6 +19,7 @@ from twin.session.assembly import image_vision, navigator_with
 from twin.surrogate.coverage import QUANTITIES, Range, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
+from twin.surrogate.matchability import Matchability
 from twin.surrogate.surrogate_world import surrogate_vision
 from twin.surrogate_fit.comparison import ComparisonVision
 from twin.surrogate_fit.fit import SurveyStatistics, fit_error_model, log_misfit
@@ -22,6 +28,9 @@ from twin.world.rendered_world import RenderedWorld
 
 _FILE = "surrogate_comparison.json"
 _MIN_SURVEYS = 2
+_MAX_LOST = 0.2  # largest fraction of lost frames of a survey to which the model is fitted
+#: Cramer-Rao bound [px] above which no survey is flown: at 0.26 px, three quarters of the frames were lost.
+_MAX_BOUND_PX = 0.2
 _CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
 
 
@@ -35,7 +44,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     Raises:
         TwinError: fewer than two surveys have complete statistics.
     """
-    complete = [s for s in surveys if "consecutive_product_images" in s and _has_map(s)]
+    complete = [s for s in surveys if _is_complete(s)]
     if len(complete) < _MIN_SURVEYS:
         raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
     fitted = fit_error_model(complete, compared)
@@ -48,15 +57,39 @@ def _fitted_range(surveys: Sequence[SurveyStatistics]) -> dict[str, Range]:
     return {name: (min(found), max(found)) for name, found in values.items() if found}
 
 
-def _has_map(statistics: SurveyStatistics) -> bool:
-    """Returns whether the statistics include errors of level cells of the map."""
-    return any(f"map_error_{name}_images" in statistics for name in ("few", "many"))
+def _is_complete(statistics: SurveyStatistics) -> bool:
+    """Returns whether a survey has links and a map, and lost few frames.
+
+    A map of rough ground may have no level cells, and thus no statistics of height errors.
+    """
+    has_both = "consecutive_product_images" in statistics and "hole_known" in statistics
+    return has_both and float(np.mean(statistics["frame_lost"])) <= _MAX_LOST
+
+
+def all_statistics(
+    surveys: Sequence[tuple[Scenario, Path]], compared: ErrorModel, jobs: int = 1
+) -> Iterator[SurveyStatistics]:
+    """Yields the statistics of rendered surveys in their order, flown in `jobs` processes; see `survey_statistics`.
+
+    Args:
+        surveys: description and run folder of each survey.
+        compared: error model of the surrogate to compare with.
+        jobs: number of processes; 1: the surveys are flown in this process.
+    """
+    scenarios, folders = [scenario for scenario, _ in surveys], [folder for _, folder in surveys]
+    one = partial(survey_statistics, compared=compared)
+    if jobs == 1:
+        yield from map(one, scenarios, folders)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(one, scenarios, folders)
 
 
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
     """Returns the statistics of a rendered survey's comparison with the surrogate.
 
-    Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey.
+    Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey. A
+    survey whose water is too turbid for any matches is not flown, and has no statistics.
 
     Args:
         scenario: description of the survey.
@@ -79,6 +112,10 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
     """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted."""
     mission, stopwatch = prepare(scenario), Stopwatch()
+    matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
+    conditions = survey_conditions(mission, matchability)
+    if conditions["bound_px"][1] > _MAX_BOUND_PX:
+        return {}
     folder.mkdir(parents=True, exist_ok=True)
     with RenderedWorld(mission, stopwatch) as world:
 
@@ -94,7 +131,6 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
                 navigator.build_map(result, mission.grid, lambda _: None)
             except SurveyAborted:
                 pass
-    conditions = survey_conditions(mission, surrogate.scene.matchability)
     vision.statistics |= {_CONDITION + name: list(values) for name, values in conditions.items()}
     saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": vision.statistics}
     (folder / _FILE).write_text(json.dumps(saved), encoding="utf-8")

@@ -67,7 +67,7 @@ class FloorForecast:
 
 
 class PlannedOverlap(NamedTuple):
-    """Median overlap over the floor along and across the swaths of the planned path; None if there are no pairs."""
+    """Median overlap and sidelap of the planned keyframes, by ray casting on the floor; None without pairs."""
 
     along: float | None
     across: float | None

@@ -18,27 +18,27 @@ from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
 from twin.imaging.illumination import Illumination, illumination_of
 from twin.imaging.lamps import light_sources_in_camera
+from twin.imaging.lens_psf import NEAREST_FOCUS_M
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
-from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, Source
+from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source
 from twin.simulate.autopilot import top_speed_mps
 from twin.world.clearance import planned_clearance
 from twin.world.limits import check_map_size
-from twin.world.pace import Pace
+from twin.world.pace import SAME_TIME_S, Pace
 from twin.world.planning import plan_survey
 from twin.world.thrust_authority import check_thrust
 
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
 #: number of these points; on longer paths they are farther apart.
 LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
-_SAME_TIME_S = 1e-9  # times that differ by less are equal
 
 
 class Step(NamedTuple):
     """One planned frame.
 
     Args:
-        reference: planned pose and velocity of the left camera.
+        reference: planned position, velocity, yaw and acceleration of the left camera.
         keyframe: whether the frame is a keyframe.
         holding: whether the vehicle keeps station.
     """
@@ -49,15 +49,15 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Course:
+class FrameSequence:
     """Sequence of n consecutive planned frames; item k is the `Step` of frame k.
 
     Args:
-        reference: planned pose and velocity of the left camera at each frame.
+        reference: planned position, velocity, yaw and acceleration of the left camera at each frame.
         keyframe: (n,) bool, whether each frame is a keyframe.
         holding: whether the vehicle keeps station.
         path_times_s: (n,) time of each frame on the planned path, since the start of the track [s].
-        rate: path time per time; below 1 if the vehicle is slowed.
+        rate: derivative of the path time with respect to time; below 1 if the vehicle is slowed.
     """
 
     reference: segments.Reference
@@ -69,7 +69,7 @@ class Course:
     def __len__(self) -> int:
         return len(self.keyframe)
 
-    def first(self, n: int) -> Course:
+    def first(self, n: int) -> FrameSequence:
         """Returns the first n frames."""
         reference = segments.Reference(*(np.asarray(part)[:n] for part in self.reference))
         return replace(self, reference=reference, keyframe=self.keyframe[:n], path_times_s=self.path_times_s[:n])
@@ -111,21 +111,23 @@ class Mission:
         """Returns world_from_body (4, 4) at the start of the survey."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
-    def fly(self, track: int) -> Course:
+    def planned_frames(self, track: int) -> FrameSequence:
         """Returns the planned frames of a track (numbered from 1), without the station keeping after it."""
         times_s, keyframes = self.plan.frames_of_track(track)
-        return Course(self.plan.references(track, times_s), keyframes, False, times_s)
+        return FrameSequence(self.plan.references(track, times_s), keyframes, holding=False, path_times_s=times_s)
 
-    def hold(self, track: int) -> Course:
+    def station_keeping_frames(self, track: int) -> FrameSequence:
         """Returns the planned frames of the first or the second half of the station keeping after a track.
 
         Both halves are the same; the global alignment runs between them. Tracks are numbered from 1.
         """
         n = self._n_holding
         times_s = np.full(n, self.plan.track_duration_s(track))
-        return Course(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s)
+        return FrameSequence(
+            self.plan.references(track, times_s), np.zeros(n, np.bool_), holding=True, path_times_s=times_s
+        )
 
-    def fly_on(self, track: int, path_time_s: float, pace: Pace) -> Course:
+    def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
         """Returns the next frames of a track at a pace: one frame, or all that remain at full pace.
 
         Every planned keyframe is flown, at the first frame at or after its path time.
@@ -141,8 +143,8 @@ class Mission:
         planned_s, planned_keyframes = self.plan.frames_of_track(track)
         times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.frame_rate_hz)
         reference = pace.scaled(self.plan.references(track, times_s))
-        passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + _SAME_TIME_S, "right")
-        return Course(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, pace.rate)
+        passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + SAME_TIME_S, "right")
+        return FrameSequence(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, pace.rate)
 
     @property
     def _n_holding(self) -> int:
@@ -175,6 +177,9 @@ def prepare(scenario: Scenario) -> Mission:
         _attempt(lambda: _check_exposure(sensor), source, errors)
         for key, time_ms in (("exposure_max_ms", sensor.exposure_max_ms), ("readout_ms", sensor.readout_ms)):
             _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, errors)
+        _attempt(lambda: _check_white_balance(sensor), source, errors)
+    _attempt(lambda: _check_lens_blur(scenario), source, errors)
+    _attempt(lambda: _check_snow(scenario.snow), source, errors)
     true_cameras = _attempt(lambda: make_true_cameras(scenario), source, errors)
     illumination = _attempt(lambda: _illumination(scenario), source, errors)
     _attempt(lambda: check_require(scenario.require), source, errors)
@@ -196,7 +201,7 @@ def prepare(scenario: Scenario) -> Mission:
 
 
 def _attempt(build, source: Source, errors: list[str]):
-    """Returns the result of `build`; if it raises TwinError, appends the description to `errors` and returns None."""
+    """Returns the result of `build`; if it raises TwinError, appends its description to `errors` and returns None."""
     try:
         return build()
     except TwinError as error:
@@ -230,7 +235,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
 
 
 def _check_speed(scenario: Scenario) -> None:
-    """Raises TwinError if `plan.speed_mps` exceeds the top speed ahead or, for loops, the least over all directions."""
+    """Raises TwinError if `plan.speed_mps` exceeds the top speed forwards, or for loops in the slowest direction."""
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
@@ -305,6 +310,40 @@ def _check_exposure(sensor: SensorConfig) -> None:
         raise TwinError(
             "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
             f"up to sensor.exposure_max_ms = {sensor.exposure_max_ms:g}",
+        )  # fmt: skip
+
+
+def _check_white_balance(sensor: SensorConfig) -> None:
+    """Raises TwinError if gains or a colour temperature are set that the white balance does not use."""
+    unused = {"white_gains": "gains", "white_temperature_k": "temperature"}
+    for key, mode in unused.items():
+        if getattr(sensor, key) != SensorConfig.model_fields[key].default and sensor.white_balance != mode:
+            raise TwinError(
+                f"sensor.{key}", f'is unused: sensor.white_balance is "{sensor.white_balance}"',
+                f'with sensor.white_balance = "{mode}"',
+            )  # fmt: skip
+
+
+def _check_lens_blur(scenario: Scenario) -> None:
+    """Raises TwinError if the blur of the lens needs a sensor that is not given, or the focus is too near."""
+    lens = scenario.lens
+    for key, used in (("diffraction", lens.diffraction), ("focus_m", lens.focus_m > 0)):
+        if used and scenario.sensor is None:
+            raise TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
+    if 0 < lens.focus_m < NEAREST_FOCUS_M:
+        raise TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
+
+
+def _check_snow(snow: SnowConfig) -> None:
+    """Raises TwinError if the limits of the size distribution are reversed, or set without a distribution."""
+    if snow.junge_exponent is None:
+        for key in ("diameter_min_m", "diameter_max_m"):
+            if getattr(snow, key) != SnowConfig.model_fields[key].default:
+                raise TwinError(f"snow.{key}", "is unused: all particles have diameter_m", "with snow.junge_exponent")
+    elif snow.diameter_min_m >= snow.diameter_max_m:
+        raise TwinError(
+            "snow.diameter_min_m", f"{snow.diameter_min_m:g}: not smaller than the largest diameter",
+            f"below snow.diameter_max_m = {snow.diameter_max_m:g}",
         )  # fmt: skip
 
 

@@ -9,14 +9,14 @@ import numpy as np
 from controllers.segments import Reference
 from twin.core.geometry import Array
 
-_SAME_TIME_S = 1e-9  # times that differ by less are equal
+SAME_TIME_S = 1e-9  #: times that differ by less are equal
 
 
 class Pace(NamedTuple):
     """Pace along the path. The path time s, at which the plan is evaluated, advances by ds/dt = rate.
 
     Args:
-        rate: path time per time, 0 to 1; 1 is the planned speed.
+        rate: derivative ds/dt of the path time, 0 to 1; 1 is the planned speed.
         change_per_s: derivative of the rate [1/s].
         keyframe: whether the next frame is a keyframe in addition to the planned ones.
     """
@@ -33,15 +33,15 @@ class Pace(NamedTuple):
             end_s: path time of the last frame of the track, which is always flown.
             interval_s: time between frames.
         """
-        n_full = int(np.ceil((end_s - last_s - _SAME_TIME_S) / interval_s))
+        n_full = int(np.ceil((end_s - last_s - SAME_TIME_S) / interval_s))
         n = min(n_full, 1) if self != FULL else n_full
         return np.minimum(last_s + self.rate * interval_s * np.arange(1, n + 1), end_s)
 
     def scaled(self, reference: Reference) -> Reference:
-        """Returns the reference in time: dx/dt = r x', d2x/dt2 = r^2 x'' + (dr/dt) x', where x' = dx/ds and r = rate.
+        """Returns the reference with time derivatives: dx/dt = r x', d2x/dt2 = r^2 x'' + (dr/dt) x', where r = rate.
 
         Args:
-            reference: positions, velocities, yaws and accelerations along the path time.
+            reference: the reference with derivatives with respect to path time, x' = dx/ds and x'' = d2x/ds2.
         """
         return reference._replace(
             velocity=self.rate * reference.velocity,

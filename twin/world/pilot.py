@@ -28,11 +28,12 @@ def make_pilot(mission: Mission) -> PilotOfEstimates:
 
 
 def without_feedback(estimate: Estimate, reference: Reference, readings: Readings) -> Estimate:
-    """Returns the estimate with position and velocity of the reference where they were predicted, not measured.
+    """Returns the estimate; position and velocity are those of the reference if they were predicted, not measured.
 
-    A prediction contains no information on how the vehicle departs from its path. A pilot that corrects the predicted
-    departure moves the true vehicle by it, and does not see that it does: 4 cm of predicted drift became 0.7 m in 3 s.
-    The height is kept if it was measured by pressure, and the attitude always. With a DVL, all is measured.
+    A prediction contains no information on the deviation of the vehicle from its path. If the pilot corrects a
+    predicted deviation, the true vehicle moves by it, and no measurement reveals this motion. The attitude is always
+    kept, the height if it was measured by pressure. The estimate is returned unchanged if its motion was measured or a
+    DVL reading is available.
 
     Args:
         estimate: estimate of a frame.

@@ -26,8 +26,8 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
     """Returns the area of a survey in the scene.
 
     Raises:
-        TwinError: the keys of the plan contradict each other, the terrain lacks the coordinates that they need, or the
-            area lies outside the terrain.
+        TwinError: the keys of the plan contradict each other, the polygon cannot be read or is invalid, the terrain
+            lacks the coordinates that the plan needs, or the polygon or the centre lies outside the terrain.
     """
     heading = math.radians(plan.heading_deg)
     if plan.polygon is None:

@@ -19,13 +19,13 @@ from twin.world.placement import survey_area
 from twin.world.planned_images import floor_of, level_floor, overlaps, planned_keyframes, planned_pairs, thinned
 from twin.world.thrust_authority import climb_slope
 
-#: Percentage of the pairs of keyframes that may have less overlap over the floor than asked. If none were allowed, a
+#: Percentage of the pairs of keyframes that may have less overlap over the floor than required. If it were 0, a
 #: single step or boulder would determine the spacing of the whole survey.
 SHORT_PERCENT = 5.0
 #: Largest number of pairs of keyframes, along and across each, whose overlap is computed to choose the spacing.
 _PAIRS = 250
 _ITERATIONS = 25
-#: Relative tolerance of the shortfall 1 - overlap.
+#: Relative tolerance of 1 - overlap.
 _TOLERANCE = 0.005
 #: Least `along_scale` and `across_scale` of a request: footprint on the floor relative to that on the reference plane.
 _LEAST_SCALE = 0.05
@@ -35,7 +35,7 @@ _MOST_TRACKS = 1000
 _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 
 
-class Shortfall(NamedTuple):
+class NonOverlap(NamedTuple):
     """Percentile (100 - SHORT_PERCENT) of 1 - overlap over the pairs of keyframes, along and across the swaths."""
 
     along: float
@@ -128,11 +128,11 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     plane = make(whole._replace(surface=None))
     centre_m = request.area.centre_m if request.area else (0.0, 0.0)
     reach_m = 10 * (max(request.area_m) + max(request.footprint_m)) + 2 * float(np.hypot(*centre_m))
-    allowed = _shortfall(plane, pattern, level_floor(0.0, reach_m), rig)
-    allowed = Shortfall(max(allowed.along, 1 - request.overlap_along), max(allowed.across, 1 - request.overlap_across))
-    plan, unchanged = make(whole), Shortfall(0, 0)
+    allowed = _non_overlap(plane, pattern, level_floor(0.0, reach_m), rig)
+    allowed = NonOverlap(max(allowed.along, 1 - request.overlap_along), max(allowed.across, 1 - request.overlap_across))
+    plan, unchanged = make(whole), [0, 0]
     for _ in range(_ITERATIONS):
-        found = _shortfall(plan, pattern, field, rig)
+        found = _non_overlap(plan, pattern, field, rig)
         if all(f <= a * (1 + _TOLERANCE) for f, a in zip(found, allowed, strict=True)):
             return whole._replace(tracks=request.tracks)
         reduced = [_reduction(f, a, n) for f, a, n in zip(found, allowed, unchanged, strict=True)]
@@ -144,10 +144,10 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
             plan.n_frames_per_keyframe == previous.n_frames_per_keyframe,
             plan.swath_spacing_m == previous.swath_spacing_m,
         )
-        unchanged = Shortfall(*(n + 1 if kept else 0 for n, kept in zip(unchanged, same, strict=True)))
+        unchanged = [n + 1 if kept else 0 for n, kept in zip(unchanged, same, strict=True)]
     raise TwinError(
         "plan.altitude_m",
-        f"{request.altitude_m:g}: no spacing keeps the asked overlap over the floor, which comes too near",
+        f"{request.altitude_m:g}: no spacing keeps the required overlap over the floor, which comes too near",
         'a greater altitude, less overlap, plan.height = "floor", or plan.overlap_reference = "plane"',
     )
 
@@ -158,14 +158,14 @@ def _n_whole(request: SurveyRequest, pattern: str) -> float:
     return max(request.area_m) / swath_m
 
 
-def _reduction(found: float, allowed: float, unchanged: float) -> float:
+def _reduction(found: float, allowed: float, unchanged: int) -> float:
     """Returns the factor by which a scale is multiplied: 1 if the overlap suffices, otherwise 0.3 to 0.99.
 
-    The frames per keyframe and the tracks are integers, so a small step may leave them unchanged. The least step of 1 %
-    is therefore doubled after each of the last `unchanged` steps without effect.
+    The numbers of frames per keyframe and of tracks are integers, so a small step may leave them unchanged. The least
+    step of 1 % is therefore doubled after each of the last `unchanged` steps without effect.
 
     Args:
-        found, allowed: shortfall of the plan along or across, and its limit.
+        found, allowed: 1 - overlap of the plan along or across (`NonOverlap`), and its limit.
         unchanged: number of consecutive steps that did not change the spacing.
     """
     if found <= allowed * (1 + _TOLERANCE):
@@ -173,9 +173,9 @@ def _reduction(found: float, allowed: float, unchanged: float) -> float:
     return max(min(allowed / found, 1 - 0.01 * 2**unchanged), 0.3)
 
 
-def _shortfall(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> Shortfall:
-    """Returns the shortfall of a plan over a floor, from at most _PAIRS pairs each way; 0 if there are no pairs."""
+def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> NonOverlap:
+    """Returns `NonOverlap` of a plan over a floor, from at most _PAIRS pairs each way; 0 if there are no pairs."""
     pairs = planned_pairs(planned_keyframes(plan, pattern))
     missed = [1 - overlaps(field, thinned(p, _PAIRS), rig) for p in pairs]
     known = [m[np.isfinite(m)] for m in missed]
-    return Shortfall(*(float(np.percentile(m, 100 - SHORT_PERCENT)) if len(m) else 0.0 for m in known))
+    return NonOverlap(*(float(np.percentile(m, 100 - SHORT_PERCENT)) if len(m) else 0.0 for m in known))

@@ -13,7 +13,7 @@ from twin.errors import TwinError
 from twin.scenario.model import Scenario
 from twin.simulate.autopilot import thrust_loads
 
-#: A path over the floor may climb and sink at this share of the greatest vertical speed at cruise speed; the rest is
+#: A path over the floor may climb and descend at this share of the greatest vertical speed at cruise speed; the rest is
 #: reserved for the controller.
 _CLIMB_SHARE = 0.5
 #: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.

@@ -18,7 +18,7 @@ from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import true_heights
-from twin.world.mission import Course, Mission, Step
+from twin.world.mission import FrameSequence, Mission, Step
 from twin.world.pilot import PilotOfEstimates
 
 if TYPE_CHECKING:
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 #: random numbers of the others.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
 
-#: Simulates the frames of a course from index k, at most up to the next keyframe; returns the index of the first frame
-#: that it did not simulate.
-FastForward = Callable[[Course, int], int]
+#: Simulates the frames of a sequence from index k, at most up to the next keyframe; returns the index of the first
+#: frame that it did not simulate.
+FastForward = Callable[[FrameSequence, int], int]
 
 
 class CameraImages(NamedTuple):
@@ -52,7 +52,7 @@ class World(ABC):
     """Simulated world of a mission. Use as a context manager.
 
     Attributes:
-        warnings: limitations of this world that the user should know about.
+        warnings: sentences on the limitations of this simulated world, for the log and the report of the survey.
     """
 
     warnings: tuple[str, ...] = ()
@@ -66,7 +66,7 @@ class World(ABC):
     ):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         self._true_poses = GrowingArray(4, 4)
-        self._courses: list[tuple[Course, int]] = []  # each with the number of its track
+        self._sequences: list[tuple[FrameSequence, int]] = []  # each with the number of its track
 
     def __enter__(self) -> Self:
         return self
@@ -91,18 +91,18 @@ class World(ABC):
         """Returns the true pose (4, 4) of the left camera."""
         return left_camera(self.vehicle, self.mission.rig)
 
-    def start_course(self, course: Course, track: int) -> None:
-        """Starts the next course (sequence of planned frames) of a track.
+    def start_sequence(self, sequence: FrameSequence, track: int) -> None:
+        """Starts the next sequence of planned frames of a track.
 
-        The caller must simulate all frames of a course before it starts another one, unless it ends the course early
-        (`end_course`) or the survey is aborted.
+        The caller must simulate all frames of a sequence before it starts another one, unless it ends the sequence
+        early (`end_sequence`) or the survey is aborted.
         """
-        self._courses.append((course, track))
+        self._sequences.append((sequence, track))
 
-    def end_course(self, n: int) -> None:
-        """Ends the course after its first n frames."""
-        course, track = self._courses[-1]
-        self._courses[-1] = course.first(n), track
+    def end_sequence(self, n: int) -> None:
+        """Ends the sequence after its first n frames."""
+        sequence, track = self._sequences[-1]
+        self._sequences[-1] = sequence.first(n), track
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""
@@ -135,19 +135,19 @@ class World(ABC):
             navigator: the estimator in the loop.
             pilot: the controller in the loop.
         """
-        return lambda course, k: k
+        return lambda sequence, k: k
 
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far."""
-        n, courses = len(self), self._courses
-        lengths = np.array([len(course) for course, _ in courses], np.int64)
-        positions = [np.empty((0, 3)), *(course.reference.position for course, _ in courses)]
-        yaws = [np.empty(0), *(np.asarray(course.reference.yaw) for course, _ in courses)]
+        n, sequences = len(self), self._sequences
+        lengths = np.array([len(sequence) for sequence, _ in sequences], np.int64)
+        positions = [np.empty((0, 3)), *(sequence.reference.position for sequence, _ in sequences)]
+        yaws = [np.empty(0), *(np.asarray(sequence.reference.yaw) for sequence, _ in sequences)]
         return Truth(
             trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
             reference=np.concatenate(positions)[:n],
-            holding=np.repeat(np.array([course.holding for course, _ in courses], np.bool_), lengths)[:n],
-            track=np.repeat(np.array([track for _, track in courses], np.int64), lengths)[:n],
+            holding=np.repeat(np.array([sequence.holding for sequence, _ in sequences], np.bool_), lengths)[:n],
+            track=np.repeat(np.array([track for _, track in sequences], np.int64), lengths)[:n],
             height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
             seen=self.seen(),
             asked=self.mission.plan.inside_area(*np.meshgrid(*self.mission.grid.centres())),

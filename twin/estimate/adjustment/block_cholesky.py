@@ -2,8 +2,8 @@
 
 The columns are grouped into panels (see `elimination`). Factorisation is right-looking (Davis 2006, chapter 4): the
 outer product of a finished panel is subtracted from later panels, so no memory is needed in addition to the panels. A
-finished panel stores L1^-1 above L2, where L1 is the lower triangle in the panel's own rows, and L2 holds the nonzero
-rows below them.
+finished panel stores L1^-1 above L2, where L1 is the lower triangular block in the panel's own rows, and L2 holds the
+nonzero rows below them.
 
 Blocks of the inverse are computed from the last panel to the first (Takahashi et al. 1973). Let cov be the inverse,
 "own" the rows of the panel, "below" the rows of L2, and W = L2 L1^-1. Then cov(below, own) = -cov(below) W and
@@ -25,7 +25,7 @@ from twin.core.geometry import Array
 from twin.estimate.adjustment.elimination import BLOCK as _D
 from twin.estimate.adjustment.elimination import SymbolicFactor
 
-_MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smaller pivot counts as singular
+_MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smaller pivot counts as zero
 
 
 class CholeskyFactor(NamedTuple):
@@ -152,7 +152,7 @@ def _panel_matrix(s, panels, p):
 
 @njit(cache=True, nogil=True)
 def _factorise(s, original, panels):
-    """Replaces each panel by L1^-1 above L2. Returns False if the matrix is singular.
+    """Replaces each panel by L1^-1 above L2. Returns False if the matrix is not numerically positive definite.
 
     Args:
         original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.
@@ -177,7 +177,9 @@ def _factorise(s, original, panels):
 
 @njit(cache=True, nogil=True)
 def _invert_root(matrix, original, inverse):
-    """Inverts the lower Cholesky factor of a dense matrix, row by row. Returns False if the matrix is singular.
+    """Computes the inverse of the lower Cholesky factor of a dense matrix, row by row.
+
+    Returns False if the matrix is not numerically positive definite.
 
     Args:
         matrix: (n, n), only the lower triangle is read.
@@ -249,7 +251,7 @@ def _subtract(product, at, panel):
 
 @njit(cache=True, nogil=True)
 def _gather(panel, at, width):
-    """Returns a copy (6 m, 6 width) of the blocks in the block rows `at` (m,) and the block columns at[:width]."""
+    """Returns a copy (6 m, 6 width) of a panel's blocks in the block rows `at` (m,) and block columns at[:width]."""
     part = np.empty((_D * len(at), _D * width))
     for b in range(len(at)):
         for a in range(width):

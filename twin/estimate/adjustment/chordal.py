@@ -45,8 +45,8 @@ def solve_pose_graph(
 
     Args:
         links: measured motions; they have to connect all nodes.
-        start: initial pose (4, 4) of every node; None: chordal initialisation with the pose of the first node at the
-            identity.
+        start: initial pose (4, 4) of every node, by node number; None: chordal initialisation, with the pose of the
+            first node equal to the identity.
         huber: residual [standard deviations] above which the cost of a link grows linearly; None: least squares.
     """
     start = chordal_start(links) if start is None else start

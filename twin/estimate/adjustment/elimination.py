@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 Indices = NDArray[np.int64]
 
 BLOCK = 6  # rows and columns of a block: degrees of freedom of a pose
-_MAX_PANEL_NODES = 12  # the triangle of a panel is inverted by plain loops, which are slow for larger matrices
+_MAX_PANEL_NODES = 12  # the triangular block of a panel is inverted by loops, which are slow for larger matrices
 _MAX_EXTRA_BLOCKS = 8  # explicit zero blocks that merging a node into a panel may add
 
 

@@ -97,6 +97,7 @@ class _Evaluation(NamedTuple):
     """A factor graph evaluated at a state.
 
     Args:
+        state: state at which the graph is evaluated.
         cost: value of F.
         unary: residuals (m, d) of each kind of unary factors.
         binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
@@ -116,7 +117,8 @@ class _NormalEquations(NamedTuple):
     Args:
         diagonal: (n, 6, 6) diagonal blocks.
         gradient: (n, 6) gradient of F with respect to the poses.
-        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter.
+        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter (Gauss-Newton
+            approximation, as all second derivatives here).
         corner: second derivative of F with respect to the shared parameter; 0 if there is no such parameter.
         shared_gradient: derivative of F with respect to the shared parameter.
     """
@@ -129,7 +131,7 @@ class _NormalEquations(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Minimum of the cost of a factor graph.
+    """Minimum of the cost of a factor graph; if not converged, the last state of the iteration.
 
     Args:
         state: poses and shared parameter at the minimum.
@@ -168,9 +170,11 @@ class Solution(NamedTuple):
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
-    """Returns the local minimum of the cost reached by iteration from `start`.
+    """Returns the solution at the local minimum of the cost that the iteration reaches from `start`.
 
     Args:
+        graph: factors of the graph.
+        start: initial values of the unknowns.
         max_iterations: largest number of linear solves, at least one.
 
     Raises:
@@ -430,7 +434,7 @@ def matvec(matrices: Array, vectors: Array) -> Array:
 
 
 def _squared_norms(residuals: Array, information: Array) -> Array:
-    """Returns the squared Mahalanobis norms (m,) of residuals (m, d)."""
+    """Returns the squared Mahalanobis norms (m,) of residuals (m, d), given information matrices (m, d, d)."""
     return np.sum(residuals * matvec(information, residuals), axis=1)
 
 

@@ -82,11 +82,12 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth.
 
-    Each pixel of the new image is linearised at the point given by its new stereo depth. This point is projected into
-    the old image, where the old map is interpolated bilinearly, except across depth discontinuities (backward warping
-    leaves no holes and needs no rounding). The difference between the old depth and the depth of the point in the old
-    camera is converted, with the surface normal at the point, to a difference in depth along the ray of the new pixel.
-    A pixel without new stereo depth is linearised at the depth of the nearest old point that projects to it.
+    For each pixel of the new image, the propagation is linearised at the point given by its new stereo depth. This
+    point is projected into the old image, where the old map is interpolated bilinearly, except across depth
+    discontinuities (backward warping leaves no holes and needs no rounding). The difference between the old depth and
+    the depth of the point in the old camera is converted, with the surface normal at the point, to a difference in
+    depth along the ray of the new pixel. For a pixel without new stereo depth, the linearisation point has the depth of
+    the nearest old point that projects to it.
 
     Args:
         old: filtered depth of the old keyframe.
@@ -125,7 +126,7 @@ def motion_depth(
     about 0.1 px is common to the whole image and would remain in the map.
 
     Args:
-        gray, old_gray: (H, W) float32 left images.
+        gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
         current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
@@ -200,7 +201,7 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Returns depth and variance at pixel (x, y); NaN if its four neighbours are not on one surface.
+    """Returns depth and variance at pixel (x, y); NaN if its four neighbours are unknown or not on one surface.
 
     Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly, as for fully
     correlated errors, because the matching windows of neighbouring pixels overlap.
@@ -244,7 +245,7 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 @njit(cache=True, nogil=True)
 def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map, transferred to the new image by linearisation at `guess`."""
+    """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W)."""
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))

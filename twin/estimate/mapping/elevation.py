@@ -13,7 +13,7 @@ from twin.estimate.mapping.surface import HeightPatch
 
 Map = NDArray[np.float32]
 
-#: The higher of two hypotheses is chosen if the variance of the lower one is more than this many times larger.
+#: The higher of two hypotheses is chosen if the depth variance of the lower one is more than this many times larger.
 _VARIANCE_RATIO = 10.0
 #: Measured probability that the chosen hypothesis of a cell with two hypotheses is wrong.
 _WRONG_CHOICE = 0.16
@@ -27,16 +27,16 @@ class ElevationMapper:
     A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
     at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
     variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes the second hypothesis,
-    or replaces the hypothesis with the larger variance if the variance of z is smaller. The lower hypothesis is the
-    result unless the variance of the higher one is more than ten times smaller, because a matching window at an edge
-    often assigns the height of the nearer surface to the floor behind it. In the cells of the horseshoe reef with two
-    hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %, and the one chosen by this
-    rule in 84 %.
+    or replaces the hypothesis with the larger depth variance if that of z is smaller. The lower hypothesis is the
+    result unless the depth variance of the higher one is more than ten times smaller, because a matching window at an
+    edge often assigns the height of the nearer surface to the floor behind it. In the cells of the horseshoe reef with
+    two hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %, and the one chosen by
+    this rule in 84 %.
 
-    The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their part
-    decreases with each fusion. Errors due to the pose and to the smoothing of slopes are common to all cells of a leg
-    and mostly to all legs, so their part is the weighted mean of the variances of the patches, which does not decrease
-    with the number of patches.
+    The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their
+    part, the depth variance, decreases with each fusion. Errors due to the pose and to the smoothing of slopes are
+    common to all cells of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
+    patches, which does not decrease with the number of patches.
 
     The variance of the result has three further terms. With f the standard deviation of the lateral error divided by
     two cell sizes, these are f^2 times the squared range of heights around the cell, f times the squared height step

@@ -1,4 +1,4 @@
-"""Builds the map from the stereo pairs along the final trajectory: depth filter, elevation map and orthomosaic."""
+"""Construction of the map from the stereo pairs along the final trajectory: depth filter, heights and orthomosaic."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class KeyframePath(NamedTuple):
 
 
 class _StereoDepth(NamedTuple):
-    """Stereo pair with its stereo depth, before the depth is fused in the filter.
+    """Stereo pair with its stereo depth, before the depth is fused by the filter.
 
     Args:
         pair: colour images.

@@ -96,7 +96,7 @@ class _ViewGeometry(NamedTuple):
     """Pose of the camera relative to the grid, and constants of the rasterisation.
 
     Args:
-        position: (3,) position of the camera relative to the north-west corner of the grid [m].
+        position: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m].
         axis: (3,) optical axis in the world.
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
         cell_m: cell size [m].
@@ -166,7 +166,7 @@ def _contains_integer(a, b, c, e):
 
 @njit(cache=True, nogil=True)
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
-    """Rasterises all triangles of a depth map into `height`, `height_variance`, `systematic` and `pixel`."""
+    """Rasterises all triangles of a depth map into `height`, `height_variance`, `systematic` and `pixel`, in place."""
     out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):

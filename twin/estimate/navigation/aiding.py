@@ -2,8 +2,8 @@
 
 A reading of pressure, position (USBL) or attitude constrains the pose of one node. Beacons have surveyed positions, so
 their image coordinates also constrain the pose of one node. The DVL constrains the displacement between two nodes. The
-scale error of the DVL is estimated as one parameter shared by all displacements: modelled as independent noise of each
-displacement, it would average out along the path, but the real error accumulates.
+scale error of the DVL is estimated as one parameter shared by all displacements: if it were modelled as independent
+noise of each displacement, its effect would average out along the path, whereas the actual error accumulates.
 """
 
 from __future__ import annotations

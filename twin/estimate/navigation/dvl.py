@@ -56,7 +56,14 @@ class DvlIntegrator:
 
     Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
     correlated. Treating the displacements as independent, each with the variance (sigma dt)^2, gives the correct
-    variance of their sum; sigma is the noise of a reading, dt the interval between frames.
+    variance of their sum; sigma is the standard deviation of a reading, dt the interval between frames.
+
+    Args:
+        rig: believed calibration, for the pose of the camera in the body.
+        noise: believed noise of the navigation sensors.
+
+    Attributes:
+        state: integration since the last node.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
@@ -158,11 +165,11 @@ def _length(step):
 
 @njit(cache=True, nogil=True)
 def _step_cov(state, model, step):
-    """Returns the covariance (3, 3) of a frame's displacement, of length l [m^2].
+    """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
     The scale error, of standard deviation s, accumulates along the path. After a path of length L since the node, a
-    frame therefore contributes the variance s^2 ((L + l)^2 - L^2); these contributions sum to s^2 times the squared
-    length of the whole path.
+    displacement of length l therefore contributes the variance s^2 ((L + l)^2 - L^2) along its direction; these
+    contributions sum to s^2 times the squared length of the whole path.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))

@@ -21,6 +21,16 @@ class PoseFilter:
     """Extended Kalman filter of one pose.
 
     Errors are motions [rotation, translation] (rad, m) in camera axes: true pose = pose @ exp(error).
+
+    Args:
+        world_from_camera: (4, 4) initial pose, known with a standard deviation of 1e-4 rad and 1e-4 m.
+        rig: believed calibration.
+        noise: believed noise of the navigation sensors.
+
+    Attributes:
+        world_from_camera: (4, 4) estimated pose.
+        cov: (6, 6) covariance of its error.
+        pressure_ahrs: error model of the pressure sensor and the AHRS.
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
@@ -33,10 +43,10 @@ class PoseFilter:
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
         """Fuses a pose measured relative to an earlier pose, such as a registration with the mosaic.
 
-        The mosaic contains the error of the pose at which it was recorded, so the measurement constrains only the
+        The mosaic contains the error of the pose from which it was recorded, so the measurement constrains only the
         motion since that pose. With the covariances S of this motion and R of the measurement, the gain is
         S (S + R)^-1. The covariance of the pose decreases by the gain times S, which is less than for a measurement of
-        an absolute pose (Schmidt's consider filter, with the earlier pose as consider parameter).
+        an absolute pose (Schmidt-Kalman filter, with the earlier pose as consider parameter).
 
         Args:
             measured: (4, 4) measured world_from_camera.
@@ -74,11 +84,11 @@ class PoseFilter:
 
 
 def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Projects a beacon (3,) into the left image.
+    """Projects a beacon, at the position (3,) in the world [m], into the left image.
 
     Returns:
-        Pixel (2,), NaN if the beacon is behind the camera, and its Jacobian (2, 6) with respect to an increment
-        [rotation, translation] of the pose in camera axes.
+        Column and row (2,) [px], NaN if the beacon is behind the camera, and their Jacobian (2, 6) with respect to an
+        increment [rotation, translation] of the pose in camera axes.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -155,7 +165,7 @@ def transport_covariance(cov: Array, a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def kalman_update(world_from_camera, prior, residual, jacobian, cov):
-    """Updates a pose with an observation (Kalman update in Joseph's form).
+    """Updates a pose with an observation (Kalman update in Joseph form).
 
     Args:
         world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.

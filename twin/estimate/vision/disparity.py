@@ -57,11 +57,12 @@ class Disparity(NamedTuple):
 def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
     """Computes the disparity of every pixel of the left image that is visible in both images.
 
-    Semi-global matching (Hirschmueller 2008, three-way) of images with locally normalised contrast gives an initial
-    disparity; a left-right consistency check removes occlusions and mismatches. The sub-pixel interpolation of
-    semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation 0.17 px on a rendered reef),
-    so `epipolar.refine` refines the disparity (bias 0.002 px, standard deviation 0.06 px). The returned standard
-    deviation excludes the prior of the refinement, so it increases where texture is weak compared with noise.
+    Semi-global matching (Hirschmueller 2008; OpenCV's variant with three path directions) of images with locally
+    normalised contrast gives an initial disparity; a left-right consistency check removes occlusions and mismatches.
+    The sub-pixel interpolation of semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation
+    0.17 px on a rendered reef), so `epipolar.refine` refines the disparity (bias 0.002 px, standard deviation 0.06 px).
+    The returned standard deviation excludes the prior of the refinement, so it increases where texture is weak compared
+    with noise.
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
@@ -90,7 +91,7 @@ class SearchRange:
         self.max_disparity_px = self._widest_px
 
     def update(self, disparity_px: Map) -> None:
-        """Adapts the range to the disparities (H, W) of the last pair, or widens it fully if too few are known."""
+        """Adapts the range to the disparities (H, W) of the last pair; sets the widest range if too few are known."""
         known = disparity_px[np.isfinite(disparity_px)]
         if not self._fixed:
             wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px

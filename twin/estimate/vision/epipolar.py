@@ -28,9 +28,9 @@ SUPPORT_PX = 1.2
 #: Standard deviations of the priors of the disparity correction [px] and of the slopes of the disparity plane [px/px];
 #: the priors only matter where there is no texture.
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
-#: Taper of the Gaussian window (its standard deviation) at low noise, largest taper, and largest median standard
+#: Standard deviation of the Gaussian window at low noise, its largest value, and largest median standard
 #: deviation of disparity that counts as low noise [px].
-TAPER_PX, MAX_TAPER_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
+WINDOW_PX, WIDEST_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
 #: Side of the window in which brightness and contrast of the two images are equalised [px of images at half size].
 BALANCE_PX = 13
 #: Windows with a smaller correlation of the two images are treated as mismatches.
@@ -103,7 +103,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
     I is the reference image, and O the other image warped to it by the current disparities d. Each pixel measures the
     error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
-    weighted by (dO/dd)^2 and the taper of the window; its value at the centre is the refined disparity. This value is
+    weighted by (dO/dd)^2 and the weights of the window; its value at the centre is the refined disparity. This value is
     unbiased on inclined surfaces and not biased towards whole pixels; neighbours on another surface are excluded.
     Brightness and contrast of O are first matched locally to I, because backscatter and illumination change with the
     viewpoint.
@@ -121,18 +121,18 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         iterations: number of Gauss-Newton iterations.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
-    sigma, gain, mean_square, noise_variance, inflation, taper_px = fitted, fitted, fitted, 1.0, 1.0, TAPER_PX
+    sigma, gain, mean_square, noise_variance, inflation, window_px = fitted, fitted, fitted, 1.0, 1.0, WINDOW_PX
     for _ in range(iterations):
         residual, slope, visible = _balanced_warp(reference, other, fitted, view)
         fitted = np.where(visible, fitted, UNKNOWN_PX)
         noise_variance = _noise_variance(residual, visible)
         noise = _local_noise(residual, visible, noise_variance)
-        fit = _fit_planes(fitted, residual, slope, noise, _taper(taper_px), np.float32(SUPPORT_PX), _PRIORS)
+        fit = _fit_planes(fitted, residual, slope, noise, _gaussian_window(window_px), np.float32(SUPPORT_PX), _PRIORS)
         remaining = np.asarray(residual - slope * (fit[0] - fitted), np.float32)
         inflation = _variance_inflation(remaining, visible, noise_variance)
         fitted, unit_variance, gain, mean_square = fit
         sigma = np.sqrt(unit_variance * np.maximum(mean_square, noise))
-        taper_px = _choose_taper(_measurement_sigma(sigma, gain), fitted, taper_px)
+        window_px = _choose_window_sigma(_measurement_sigma(sigma, gain), fitted, window_px)
     known = (fitted > UNKNOWN_PX) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
     return Refinement(
         np.where(known, fitted, np.nan).astype(np.float32),
@@ -144,16 +144,16 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of the disparity without the prior, given `sigma`, with the prior."""
+    """Returns the standard deviation (H, W) of the disparity without the prior, which `sigma` includes."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
-def _choose_taper(sigma: Map, fitted: Map, taper_px: float) -> float:
-    """Returns the taper of the next window [px], larger if the median of `sigma` is above `LOW_NOISE_SIGMA_PX`."""
+def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
+    """Returns the standard deviation of the Gaussian window of the next iteration [px], larger if noise is high."""
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
-        return taper_px
-    return float(np.clip(TAPER_PX * np.sqrt(np.median(typical) / LOW_NOISE_SIGMA_PX), TAPER_PX, MAX_TAPER_PX))
+        return window_px
+    return float(np.clip(WINDOW_PX * np.sqrt(np.median(typical) / LOW_NOISE_SIGMA_PX), WINDOW_PX, WIDEST_PX))
 
 
 def _contrast(image: Map) -> Map:
@@ -193,14 +193,17 @@ def _mean(image: Map) -> Map:
     return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 
-def _taper(taper_px: float) -> Map:
-    """Returns the weights (n,) of a Gaussian window along one axis; `taper_px` is its standard deviation."""
-    half = int(np.ceil(2 * taper_px))
-    return np.exp(-0.5 * (np.arange(-half, half + 1) / taper_px) ** 2).astype(np.float32)
+def _gaussian_window(window_px: float) -> Map:
+    """Returns the weights (n,) of a Gaussian window along one axis; `window_px` is its standard deviation."""
+    half = int(np.ceil(2 * window_px))
+    return np.exp(-0.5 * (np.arange(-half, half + 1) / window_px) ** 2).astype(np.float32)
 
 
 def _noise_variance(residual: Map, visible: Mask) -> float:
-    """Returns a robust variance of the residuals, from their median absolute value; at least `MIN_NOISE_VARIANCE`."""
+    """Returns a robust variance of the residuals from their median absolute value, at least `MIN_NOISE_VARIANCE`.
+
+    Returns 1 if fewer than 100 of the sampled pixels are visible.
+    """
     sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
         return 1.0
@@ -221,7 +224,7 @@ def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float
 
 
 def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
-    """Returns the local mean square (H, W) of the residuals, from `MIN_NOISE_VARIANCE` to `max_variance`."""
+    """Returns the local mean square (H, W) of the residuals, limited to `MIN_NOISE_VARIANCE` to `max_variance`."""
     count = _mean(visible.astype(np.float32)) + 1e-3
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
@@ -261,7 +264,7 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support):
-    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the pixel's normal equations `sums` (12, n).
+    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (12, n) of the plane fit at each pixel.
 
     `sums` is modified in place. The loop is written so that the compiler can vectorise it.
     """
@@ -289,7 +292,7 @@ def _accumulate(sums, centre, disparity, residual, slope, i, j, weight, support)
 
 
 @njit(cache=True, nogil=True)
-def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
+def _fit_planes(disparity, residual, slope, noise, window, support, priors):
     """Fits a plane to the disparities around each pixel.
 
     Returns:
@@ -297,7 +300,7 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
         residual, each (H, W).
     """
     height, width = disparity.shape
-    half = taper.size // 2
+    half = window.size // 2
     fitted = np.full((height, width), UNKNOWN_PX, np.float32)
     unit_variance = np.full((height, width), np.float32(np.inf))
     gain = np.ones((height, width), np.float32)
@@ -317,7 +320,7 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
                     slope[v + j, neighbours],
                     np.float32(i),
                     np.float32(j),
-                    taper[j + half] * taper[i + half],
+                    window[j + half] * window[i + half],
                     support,
                 )
         for u in range(width):
@@ -331,7 +334,7 @@ def _fit_planes(disparity, residual, slope, noise, taper, support, priors):
             step = (c00 * sums[6, u] + c01 * sums[7, u] + c02 * sums[8, u]) / det
             if abs(step) < 1:
                 fitted[v, u] = disparity[v, u] + step
-                # the last factor accounts for the taper w in the variance: sum(w^2 g^2) / sum(w g^2)
+                # the last factor accounts for the weights w in the variance: sum(w^2 g^2) / sum(w g^2)
                 unit_variance[v, u] = c00 / det * (sums[11, u] + p0) / a00
                 # squared gradients up to mean + 3 sigma of those due to noise alone do not count as texture
                 noise_slopes = noise[v, u] * priors[2] * (sums[10, u] + 3 * np.sqrt(sums[10, u]))

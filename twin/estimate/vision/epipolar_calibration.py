@@ -1,10 +1,11 @@
 """Estimation of small errors of the rectification from the row differences of matched points.
 
-In a rectified pair every point lies in the same row of both images. A rotation of the right camera by the vector w
-[rad] (pitch, yaw, roll about its x, y and z axes) and an offset e of the row of its principal point change the row of a
-point at the normalised coordinates (x, y) of the right image by
+In a rectified pair every point lies in the same row of both images. Let w [rad] be the rotation vector (pitch, yaw,
+roll about the x, y and z axes of the camera) of the right camera from its ideal to its actual attitude, and e an offset
+of the row of the principal point. They change the row of a point at the normalised coordinates (x, y) of the right
+image by
 
-    dy = -w_x (1 + y^2) + w_y x y + w_z x + e
+    dy = w_x (1 + y^2) - w_y x y - w_z x + e
 
 (the linearised rotation of a pinhole camera; Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed
 from the right image. Yaw is estimated, but not removed: a lens distortion error causes nearly the same pattern, and a
@@ -23,6 +24,8 @@ from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import StereoPoints
 
+#: Which of pitch, yaw, roll and row offset are removed from the right images.
+CORRECTED = np.array([True, False, True, True])
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times a poor calibration's errors.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
 _SIGNIFICANT = 4.0  # the correction is updated if it changes a row at a corner by more than this many sigma ...
@@ -53,7 +56,7 @@ class EpipolarCalibration:
             patch_px: side of the matched patches, for the correlation between overlapping patches.
         """
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]
-        jacobian = np.column_stack([-(1 + y**2), x * y, x, np.ones_like(x)])
+        jacobian = row_jacobian(x, y)
         rows = points.row_difference_px / rig.focal_px + jacobian @ self.removed
         sigma, inflation = row_sigma(points), matching.variance_inflation(points.pixels, patch_px)
         estimate, weight = self.estimate, 1 / sigma**2
@@ -80,9 +83,9 @@ class EpipolarCalibration:
         Args:
             rig: calibration at full image size.
         """
-        change = (self.estimate - self.removed) * [1, 0, 1, 1]
+        change = (self.estimate - self.removed) * CORRECTED
         x, y = np.meshgrid(*((np.array([0, side - 1]) - c) / rig.focal_px for side, c in _sides(rig)))
-        shift = np.column_stack([-(1 + y.ravel() ** 2), 0 * x.ravel(), x.ravel(), np.ones(4)])
+        shift = row_jacobian(x.ravel(), y.ravel()) * CORRECTED
         cov = np.linalg.inv(self._information)
         shift_sigma = np.sqrt(np.einsum("ni,ij,nj->n", shift, cov, shift))
         size = np.abs(shift @ change)
@@ -103,7 +106,7 @@ class EpipolarCalibration:
         matrix = rig.matrix
         offset = np.eye(3)
         offset[1, 2] = self.removed[3] * rig.focal_px
-        source_from_result = offset @ matrix @ geometry.exp(np.append(self.removed[:3], np.zeros(3)))[:3, :3]
+        source_from_result = offset @ matrix @ geometry.exp(np.append(-self.removed[:3], np.zeros(3)))[:3, :3]
         source_from_result = source_from_result @ np.linalg.inv(matrix)
         flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LANCZOS4
         size = (rig.width_px, rig.height_px)
@@ -116,8 +119,15 @@ class EpipolarCalibration:
         return EpipolarError(self.estimate, sigma, self.removed.copy())
 
 
+def row_jacobian(x: Array, y: Array) -> Array:
+    """Returns the derivatives (n, 4) of the normalised rows of the right image at normalised (x, y).
+
+    They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset."""
+    return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
+
+
 def row_sigma(points: StereoPoints) -> Array:
-    """Returns the claimed standard deviation (n,) of the row differences, normalised.
+    """Returns the standard deviation (n,) of the row differences that follows from `points.cov`, normalised.
 
     `stereo.fuse` averages the rows of a point in the two images, which halves the variance. The variance of their
     difference is four times the variance of their average.
@@ -132,5 +142,5 @@ def spread(points: StereoPoints) -> float:
 
 
 def _sides(rig: StereoRig) -> tuple[tuple[int, float], tuple[int, float]]:
-    """Returns (size, principal point) along columns and rows [px]."""
+    """Returns (width, cx) and (height, cy) [px]."""
     return (rig.width_px, rig.cx_px), (rig.height_px, rig.cy_px)

@@ -16,7 +16,7 @@ from twin.estimate.vision.stereo import StereoPoints
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
-_MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; noise matches up to a tenth
+_MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; in pure noise, about a tenth are
 _MIN_INLIERS = 0.5  # smallest fraction of the tracked points that must agree with a motion
 _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
@@ -68,10 +68,10 @@ class FrameToFrame:
     of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is
     noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
 
-    A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because a vehicle
-    cannot jump from frame to frame, but a pose from few and noisy pixels can. A step fails if too few points are
-    tracked or agree, or if the measured pose contradicts the prediction. The predicted motion is then returned, with a
-    large covariance and the reason for the failure.
+    A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
+    acceleration of a vehicle is limited, whereas the error of a pose from few and noisy pixels is not. A step fails if
+    too few points are tracked, if too few of them are inliers, or if the measured pose contradicts the prediction. The
+    predicted motion is then returned, with a large covariance and the reason for the failure.
 
     Args:
         rig: calibration at the scale of the images.

@@ -39,7 +39,8 @@ class Registration(NamedTuple):
     """Result of a registration with the mosaic.
 
     Args:
-        correction: estimated pose of the frame in the camera at its predicted pose (predicted_from_estimated).
+        correction: estimated pose of the frame in the camera at its predicted pose (predicted_from_estimated); its
+            number of points is the number of cells, its residual is in normalised grey levels.
         reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells come from this
             keyframe or older ones.
     """
@@ -94,7 +95,7 @@ class Mosaic:
         image: matching.Image,
         depth_m: NDArray[np.float32],
         world_from_camera: Array,
-        footprint_m: float,
+        half_window_m: float,
         rig: StereoRig,
     ) -> Registration | None:
         """Registers a frame with the mosaic.
@@ -103,13 +104,13 @@ class Mosaic:
             image: (height, width) normalised frame.
             depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
-            footprint_m: half the side of the square of cells that is used, centred below the camera.
+            half_window_m: half the side of the square of cells that is used, centred below the camera.
             rig: calibration at the scale of the image.
 
         Returns:
             The pose correction with its covariance, or None if too few cells are textured or have small residuals.
         """
-        cells = self._textured_cells(world_from_camera[:3, 3], footprint_m)
+        cells = self._textured_cells(world_from_camera[:3, 3], half_window_m)
         if cells is None:
             return None
         points, brightness, keyframe = cells

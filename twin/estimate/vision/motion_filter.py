@@ -9,17 +9,15 @@ from twin.core.braking import braking_factor
 from twin.core.geometry import Array
 
 #: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
-_ACCELERATION = np.array([2.0] * 3 + [2.0] * 3)
-_FIRST_VELOCITY = np.array(
-    [1.0] * 3 + [1.0] * 3
-)  # standard deviation of the velocity before it is measured [rad/s, m/s]
+_ACCELERATION = np.full(6, 2.0)
+_FIRST_VELOCITY = np.ones(6)  # standard deviation of the velocity before it is measured [rad/s, m/s]
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it, the measurement is rejected
 
 
 class MotionFilter:
-    """Extended Kalman filter of the pose in a reference camera and of the velocity, with white acceleration.
+    """Extended Kalman filter of the pose in a reference camera and of the velocity, with white-noise acceleration.
 
-    A vehicle cannot jump from frame to frame. Where the image determines a pose well, the filter follows the measured
+    The acceleration of a vehicle is limited. Where the image determines a pose well, the filter follows the measured
     pose; where it does not (few pixels, noise), the pose follows from the velocity over many frames, and a measurement
     that contradicts the prediction is rejected. The model is that of constant velocity (Bar-Shalom, Li & Kirubarajan
     2001, Estimation with Applications to Tracking and Navigation, section 6.3.2). Errors of the pose are motions
@@ -47,7 +45,7 @@ class MotionFilter:
         self._cov[:6], self._cov[:, :6] = 0.0, 0.0
 
     def predict(self, interval_s: float) -> None:
-        """Moves to the predicted pose of the next frame, `interval_s` later.
+        """Predicts the pose of the next frame, `interval_s` later [s].
 
         The velocity is constant; after `braking.BLIND_S` without a measurement it decays.
         """

@@ -1,4 +1,4 @@
-"""Measurement of a link: matches points of a keyframe in an earlier keyframe and estimates their relative pose."""
+"""Measurement of a link: points of a keyframe are matched in an earlier one, and the relative pose is estimated."""
 
 from __future__ import annotations
 
@@ -104,10 +104,10 @@ class PairMatcher:
         )
 
     def _locking_in_node(self, points: stereo.StereoPoints) -> Array:
-        """Returns the derivative (n, 3) of the normalised (x, y, disparity) by the amplitude of pixel locking [1/px].
+        """Returns the derivative (n, 3) of (x, y, disparity), normalised, with respect to the pixel-locking amplitude.
 
-        The patches are centred at whole pixels of the left image, so only their positions in the right image are
-        biased.
+        The unit is 1/px. The patches are centred at whole pixels of the left image, so only their positions in the
+        right image are biased.
         """
         left_px, shift_px = self._project(points.measured)
         warp = np.tile(np.eye(2), (len(left_px), 1, 1))

@@ -8,10 +8,11 @@ Systematic errors of patch matching, measured against the simulated truth, and t
   in all images.
 - The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
   the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
-  change (0.01 px on a lamp-lit reef, always backwards). Linear gradients of brightness and of contrast over the patch
-  are therefore estimated as nuisance parameters.
-- Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. Cubic B-splines
-  leave 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images (`matching.gray`).
+  change (0.01 px on a lamp-lit reef, with the same sign at every step). Linear gradients of brightness and of contrast
+  over the patch are therefore estimated as nuisance parameters.
+- Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. With cubic
+  B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
+  (`matching.gray`).
 - Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
   cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
   Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
@@ -43,7 +44,7 @@ _MAX_SHIFT_PX = 3.0
 _MIN_CORRELATION = 0.7  # patches of different floor rarely correlate by more than 0.5
 _NOISE_LOSS = 1.2  # 2 / (1 + 2/3): interpolation removes a third of the target's noise variance from the residual
 _REASSOCIATE = {"reassoc", "contract", "nsz"}  # fastmath flags that let sums be vectorised
-_NUISANCES = 6  # brightness, contrast, and the linear gradients of both along columns and rows
+_NUISANCES = 6  # brightness, contrast, and the linear gradients of both in column and row
 
 
 class PatchTemplates(NamedTuple):
@@ -56,7 +57,7 @@ class PatchTemplates(NamedTuple):
             too uniform or extends beyond the image.
         gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
         nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
-            of both along columns and rows.
+            of both with respect to column and row.
     """
 
     half: int
@@ -98,7 +99,7 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
         patch_px: side of the patch (odd), the same at every level.
 
     Returns:
-        The templates per level.
+        The templates of each level.
     """
     levels = []
     for level, image in enumerate(images):

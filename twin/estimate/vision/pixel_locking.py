@@ -1,7 +1,7 @@
 """Pixel locking: a bias of matched positions that depends on their sub-pixel position.
 
-A template is cut out at whole pixels. Aliasing and interpolation of detail near the resolution limit shift its match by
--A sin(2 pi u) along columns and by -A sin(2 pi v) along rows, with (u, v) the matched position [px] and A the
+A template is extracted at whole pixels. Aliasing and interpolation of detail near the resolution limit shift its match
+by -A sin(2 pi u) in column and by -A sin(2 pi v) in row, with u and v the column and row of the match [px] and A the
 amplitude. Digital image correlation has the same systematic error, of period one pixel (Schreier, Braasch & Sutton
 2000, "Systematic errors in digital image correlation caused by intensity interpolation", Opt. Eng. 39). Neighbouring
 points on a smooth floor have nearly the same sub-pixel position, so their biases do not average out. The amplitude
@@ -43,7 +43,7 @@ class PixelLocking(NamedTuple):
 
 
 def shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
-    """Returns the shifts (n, 2) of matched positions by pixel locking of amplitude 1 px [px].
+    """Returns the shifts (n, 2) [px] of matched positions due to pixel locking with an amplitude of 1 px.
 
     Args:
         pixels: (n, 2) matched positions in the target image [px].

@@ -1,4 +1,4 @@
-"""Ambiguity of matches: how well an image matches itself at another position."""
+"""Ambiguity of matches in repetitive texture, measured by the autocorrelation of the image."""
 
 from __future__ import annotations
 
@@ -42,7 +42,11 @@ def _taper(height: int, width: int) -> tuple[Array, Array]:
 
 
 def _autocorrelation(values: Array) -> Array:
-    """Returns the autocorrelation at row shifts from 0 to half the height and at all column shifts, cyclic."""
+    """Returns the autocorrelation (rows, columns) of zero-padded values; the indices are the shifts.
+
+    Row shifts are from 0 to half the height; negative column shifts follow the positive ones, as in a discrete Fourier
+    transform.
+    """
     shape = [cv2.getOptimalDFTSize(2 * side) for side in values.shape]
     spectrum = np.abs(np.fft.rfft2(values, shape)) ** 2
     return np.asarray(np.fft.irfft2(spectrum, shape)[: values.shape[0] // 2], np.float64)

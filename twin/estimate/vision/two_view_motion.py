@@ -39,8 +39,8 @@ class Motion(NamedTuple):
         a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
         cov: (6, 6) covariance of the motion [rotation, translation], in the axes of b (rad, m).
         n_points: number of inliers.
-        residual: robust standard deviation of the residuals, in normalised coordinates (`frame_motion`) or divided by
-            its expected value (`pair_motion`).
+        residual: robust standard deviation of the residuals, in normalised coordinates (`frame_motion`), divided by its
+            expected value (`pair_motion`) or in grey levels (`mosaic`); infinite for a predicted motion.
         closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
             None if it started from another motion.
     """
@@ -63,7 +63,7 @@ class PairMotionSettings(NamedTuple):
             a large variance in `cov_a`.
         iterations: number of Gauss-Newton iterations.
         locking: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated
-            with the motion; None if there is no such bias.
+            with the motion; None: the amplitude is not estimated.
         measured_scatter: whether the covariance of the motion is computed from the residuals of the individual points
             (`_scatter_cov`), instead of from the covariances of the measurements and a common scale.
     """
@@ -157,10 +157,10 @@ def pair_motion(
 ) -> Motion | None:
     """Estimates the motion between two stereo pairs jointly with the structure, which avoids errors-in-variables bias.
 
-    Both pairs measure each point as z = (x, y, disparity); the true point in b is unknown. With e = z_a - g(z_b),
-    G = dg/dz_b and A = dg/dmotion, the structure is eliminated: the cost is e' (C_a + G C_b G')^-1 e, linearised at the
-    adjusted structure (mixed adjustment model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003).
-    Residuals have Huber weights.
+    Both pairs measure each point as z = (x, y, disparity) with covariance C; the true point in b is unknown. Let g be
+    the transfer of a point from b to a by the motion. With e = z_a - g(z_b) and G = dg/dz_b, the structure is
+    eliminated: the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed adjustment
+    model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). Residuals have Huber weights.
 
     If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
     estimated without it: over a level floor all points have nearly the same phase, and an amplitude of 1 / (2 pi) px
@@ -206,7 +206,7 @@ class _WeightedNormals(NamedTuple):
         normal: (p, p) normal matrix, `prior` included.
         prior: (p, p) prior information.
         right: (p,) right-hand side.
-        bias_jacobian: (p, 3) derivative of `right` with respect to a bias of all points.
+        bias_jacobian: (p, 3) derivative of `right` with respect to a bias in x, y and disparity that all points share.
     """
 
     observations: LinearisedObservations
@@ -236,7 +236,7 @@ def _with_locking(
 def _weighted_normals(
     observations: LinearisedObservations, amplitude_px: float, settings: PairMotionSettings
 ) -> _WeightedNormals:
-    """Returns the normal equations with Huber weights, and with the prior of the pixel-locking amplitude."""
+    """Returns the normal equations with Huber weights, and with the prior on the pixel-locking amplitude."""
     size = observations.normalised_residual
     scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
     weight = _huber_weights(size, scale, CUTOFF)
@@ -264,11 +264,12 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
 
     It is the sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, Robust Statistics, section
     7.6; White 1980). S is the sum of the outer products of the points' scores w J' C^-1 e, with w the weight of a
-    point, J its Jacobian, C the covariance of its residual e. S therefore includes errors that C does not account for,
-    such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function: a
-    point in its linear part contributes its weight times (k - 1) / k, the mean over the k measured coordinates of its
-    residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points determine S poorly, it is
-    averaged with its expectation for covariances C times a common factor; the expectation counts as 50 points.
+    point, J its Jacobian and C the covariance of its residual e. S therefore includes errors that C does not account
+    for, such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function:
+    a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
+    coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
+    determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
+    counts as 50 points.
 
     Args:
         normals: normal equations at the last iteration.

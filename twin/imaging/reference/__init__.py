@@ -1,1 +1,1 @@
-"""Reference for the light model: a Monte Carlo of the radiance of a pixel, with any order of scattering."""
+"""Reference for the light model: Monte Carlo simulation of the radiance of a pixel, with any order of scattering."""

@@ -1,4 +1,4 @@
-"""Compiled geometry of the floor of the reference: the plane z = 0, or a height field, with rays in any direction."""
+"""Compiled ray casting on the floor, in any direction: the floor is the plane z = 0 or a height field."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from numba import njit
 
 from twin.core.floor_rays import cast_ray
 
-LIFT_M = 1e-6  # distance of a path's vertex above the floor that it met
-TOLERANCE_M = 1e-4  # a ray that meets the floor this close to its end reaches its end
+LIFT_M = 1e-6  # height by which a path vertex on the floor is raised above the floor
+TOLERANCE_M = 1e-4  # an intersection with the floor this close to the end of a ray does not block the ray
 
 
 @njit(cache=True, nogil=True)
 def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
-    """Returns the distance [m] at which the ray from (ox, oy, oz) meets the floor; inf if it does not.
+    """Returns the distance [m] at which the ray from (ox, oy, oz) intersects the floor; inf if it does not.
 
     Args:
         is_plane: whether the floor is the plane z = 0; if not, it is `field`.
+        field: height field (`floor_rays.HeightField`).
         dx, dy, dz: unit direction, z up.
     """
     if is_plane:
@@ -28,7 +29,10 @@ def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
-    """Returns `floor_distance` for a ray that rises: the reversed ray tells whether it is blocked, steps find where."""
+    """Same as `floor_distance`, for a rising ray.
+
+    A cast of the reversed ray decides whether the floor blocks the ray; steps and bisection then locate the point.
+    """
     top = min((field.highest_m - oz) / dz, field.spacing_m * (field.height_m.shape[0] + field.height_m.shape[1]))
     if top <= 0:
         return np.inf
@@ -75,7 +79,7 @@ def _height_and_slopes(field, x, y):
 
 @njit(cache=True, nogil=True)
 def floor_normal(is_plane, field, x, y):
-    """Returns the unit normal of the floor's facet at (x, y); it points up."""
+    """Returns the unit normal x, y, z of the triangle of the floor at (x, y); it points up."""
     if is_plane:
         return 0.0, 0.0, 1.0
     _, east, north = _height_and_slopes(field, x, y)
@@ -85,7 +89,7 @@ def floor_normal(is_plane, field, x, y):
 
 @njit(cache=True, nogil=True)
 def sees(is_plane, field, ax, ay, az, bx, by, bz):
-    """Returns whether the straight line between two points above the floor is free."""
+    """Returns whether the floor does not block the straight line between two points above it."""
     if is_plane:
         return az > 0 and bz > 0
     dx, dy, dz = bx - ax, by - ay, bz - az

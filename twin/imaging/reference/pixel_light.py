@@ -1,4 +1,4 @@
-"""Radiance of one pixel in one colour band by Monte Carlo, in components, with standard errors."""
+"""Monte Carlo estimate of the radiance of one pixel in one colour band, by component, with standard errors."""
 
 from __future__ import annotations
 
@@ -12,14 +12,22 @@ from numpy.typing import NDArray
 from twin.core.floor_rays import HeightField, height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
+from twin.imaging.lamp_light import LAMP_RADIUS_M
 from twin.imaging.lamps import LightSources, beam_share
 from twin.imaging.phase_function import PhaseFunction, petzold, tabulate
-from twin.imaging.reference.walk import DIRECT, FIRST_BIN, LAMP_SCATTERED, VEIL_MORE, VEIL_ONCE, trace_pixel
+from twin.imaging.reference.walk import (
+    DIRECT,
+    FIRST_BIN,
+    LAMP_SCATTERED,
+    VEIL_MORE,
+    VEIL_ONCE,
+    trace_pixel,
+    trace_plane,
+)
 
 Array = NDArray[np.float64]
 
 BEAM_STEPS = 3600  # steps of 0.025 deg
-LAMP_RADIUS_M = 0.03  # radius of the housing of a lamp, within which there is no water
 BIN_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0, 80.0, 160.0)
 NO_FLOOR = height_field(np.zeros((2, 2)), 1.0, 0.0, 0.0)
 
@@ -41,17 +49,22 @@ class BandWater:
 
 @dataclass(frozen=True)
 class Sunlight:
-    """Parallel light from above a water surface that neither refracts nor reflects.
+    """Light of sun and sky that enters the water, given by its radiance just below the surface.
 
     Args:
         to_sun: (3,) unit direction to the sun under water, in world axes.
-        normal_lx: illuminance just below the surface on a plane that faces the sun [lx].
+        normal_lx: illuminance just below the surface by the sun, on a plane that faces it [lx].
         surface_m: height of the surface, z in world axes; light that rises above it is lost.
+        radius_rad: radius of the sun's disc, which matters for phase functions with a sharp peak; 0: parallel light.
+        sky_cd_m2: (n,) radiance of the sky just below the surface, at even steps of the cosine of the zenith angle from
+            0 to 1; empty: none.
     """
 
     to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
     normal_lx: float = 0.0
     surface_m: float = np.inf
+    radius_rad: float = 0.0
+    sky_cd_m2: tuple[float, ...] | Array = ()
 
 
 @dataclass(frozen=True)
@@ -62,9 +75,9 @@ class ReferenceScene:
         water: optical properties of the water.
         lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity on the axis [cd].
         beams: for each lamp, (m, 2) angle from the axis [deg] and intensity relative to that on the axis.
-        albedo: Lambert albedo of the floor.
+        albedo: albedo of the Lambertian floor.
         relief: the floor; None = the plane z = 0.
-        sun: parallel light; by default none, and no surface.
+        sun: sunlight and light of the sky; by default none, and no surface.
         lamp_radius_m: distance from a lamp within which there is no water.
     """
 
@@ -90,11 +103,13 @@ class Effort:
     """Size of a Monte Carlo computation.
 
     Args:
-        walks: number of pairs of walks; each pair starts at the floor and in the water.
-        batches: number of batches, from whose spread the standard errors follow.
+        walks: number of pairs of random walks, rounded down to a multiple of `batches`; one walk of each pair starts on
+            the floor, the other in the water.
+        batches: number of batches; the standard errors are computed from the scatter of their means.
         seed: seed of the random numbers; equal seeds give equal results.
-        plain: use the textbook estimator, which connects every vertex straight to the lamps and samples directions from
-            the phase function alone. It has the same mean and a much larger variance: a check of the other.
+        plain: use the textbook estimator, which connects every vertex directly to the lamps and samples directions
+            only from the phase function (in the water) or Lambert's cosine (on the floor). It has the same mean and a
+            much larger variance; it serves to check the default estimator.
     """
 
     walks: int = 100_000
@@ -112,11 +127,12 @@ class BatchMean(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelLight:
-    """Light that reaches a pixel: means of the batches [cd/m2].
+    """Light that reaches a pixel, by component [cd/m2].
 
     Args:
-        sums: (batches, FIRST_BIN + 2 n) light of each batch, as in `walk.walk`.
-        bin_edges_px: (n,) lower edges of the bins of blurred light.
+        sums: (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `walk.walk`.
+        bin_edges_px: (n,) lower edges of the bins of blurred light: distance from the pixel to the image that its point
+            of the floor would have without scattering.
     """
 
     sums: Array
@@ -124,7 +140,7 @@ class PixelLight:
 
     @property
     def total(self) -> BatchMean:
-        """All light."""
+        """Total radiance."""
         return _estimate(self.sums.sum(1))
 
     @property
@@ -134,7 +150,7 @@ class PixelLight:
 
     @property
     def lamp_scattered(self) -> BatchMean:
-        """Light of the floor that arrived unscattered, but reached the floor by scattering or from the floor."""
+        """Light of the floor, not scattered between floor and camera, that was scattered or reflected before."""
         return _estimate(self.sums[:, LAMP_SCATTERED])
 
     @property
@@ -149,17 +165,17 @@ class PixelLight:
 
     @property
     def blurred_straight_lamp(self) -> BatchMean:
-        """Light of the floor that was scattered between floor and camera only."""
+        """Light of the floor that was scattered between floor and camera, but not between lamp and floor."""
         return _estimate(self.blurred_by_bin[:, 0].sum(1))
 
     @property
     def veil(self) -> BatchMean:
-        """Light that never touched the floor."""
+        """Light that was scattered into the camera without reflection by the floor."""
         return _estimate(self.sums[:, VEIL_ONCE] + self.sums[:, VEIL_MORE])
 
     @property
     def veil_once(self) -> BatchMean:
-        """Light that never touched the floor and was scattered once."""
+        """Light that was scattered once and not reflected by the floor."""
         return _estimate(self.sums[:, VEIL_ONCE])
 
     @property
@@ -169,13 +185,14 @@ class PixelLight:
 
     @property
     def blurred_by_bin(self) -> Array:
-        """(batches, 2, n) blurred light by the way from the lamps (straight, not straight) and by bin."""
+        """Blurred light (batches, 2, n) [cd/m2]: index 0 = direct illumination of the floor, 1 = all other; n bins."""
         return self.sums[:, FIRST_BIN:].reshape(len(self.sums), 2, -1)
 
     def blurred_share(self, from_px: float, to_px: float = np.inf) -> BatchMean:
-        """Returns the share of the blurred light that arrives between two distances from its straight image [px].
+        """Returns the share of the blurred light in the bins between two edges of `bin_edges_px`.
 
-        Both must be edges of bins.
+        Raises:
+            ValueError: `from_px` or a finite `to_px` is not an edge.
         """
         edges = self.bin_edges_px
         if from_px not in edges or (to_px not in edges and np.isfinite(to_px)):
@@ -188,8 +205,36 @@ class PixelLight:
         return self.sums[:, DIRECT] + self.sums[:, LAMP_SCATTERED]
 
 
+@dataclass(frozen=True)
+class PlaneLight:
+    """Illuminance of a plane by daylight and by scattered light of lamps: means of the batches [lx].
+
+    Light that arrives from a lamp without scattering is not included.
+
+    Args:
+        sums: (batches, 3) unscattered light of the sun, unscattered light of the sky, scattered light.
+    """
+
+    sums: Array
+
+    @property
+    def total(self) -> BatchMean:
+        """All light."""
+        return _estimate(self.sums.sum(1))
+
+    @property
+    def sun(self) -> BatchMean:
+        """Unscattered light of the sun."""
+        return _estimate(self.sums[:, 0])
+
+    @property
+    def sky(self) -> BatchMean:
+        """Unscattered light of the sky."""
+        return _estimate(self.sums[:, 1])
+
+
 class KernelScene(NamedTuple):
-    """A `ReferenceScene` as the compiled kernels take it; lamps without light are left out."""
+    """A `ReferenceScene` in the form of the compiled kernels, without the lamps of zero intensity."""
 
     absorption: float
     scattering: float
@@ -205,6 +250,8 @@ class KernelScene(NamedTuple):
     to_sun: Array
     sun_lx: float
     surface_m: float
+    sun_cosine: float
+    sky: Array
     is_plane: bool
     field: HeightField
     plain: bool
@@ -219,16 +266,37 @@ def pixel_light(
         scene: water, light and floor.
         ray: the pixel.
         effort: number of walks, and seed.
-        bin_edges_px: lower edges of the bins of blurred light, from 0; the last bin is open.
+        bin_edges_px: lower edges of the bins of blurred light, from 0, see `PixelLight`; the last bin is open.
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
     """
+    n_walks, rngs = _batches(effort)
+    kernel, view, edges = _kernel_scene(scene, effort.plain), _view(ray), np.array(bin_edges_px, np.float64)
+    return PixelLight(np.array([trace_pixel(kernel, view, edges, n_walks, rng) for rng in rngs]), edges)
+
+
+def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Effort) -> PlaneLight:
+    """Returns the illuminance of a plane that does not disturb the light, in components.
+
+    Args:
+        scene: water, light and floor.
+        point_m: (3,) a point of the plane above the floor, in world axes.
+        normal: (3,) unit normal of the plane; light that arrives from the side of the normal counts.
+        effort: number of walks, and seed.
+    Raises:
+        TwinError: there are fewer than two batches or fewer walks than batches.
+    """
+    n_walks, rngs = _batches(effort)
+    kernel, point, facing = _kernel_scene(scene, effort.plain), tuple(map(float, point_m)), tuple(map(float, normal))
+    return PlaneLight(np.array([trace_plane(kernel, point, facing, n_walks, rng) for rng in rngs]))
+
+
+def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
+    """Returns the number of walks of a batch and the random stream of each batch."""
     if effort.batches < 2 or effort.walks < effort.batches:
         raise TwinError("effort.batches", f"{effort.batches} for {effort.walks} walks", "2 or more, one walk in each")
-    kernel, view, edges = _kernel_scene(scene, effort.plain), _view(ray), np.array(bin_edges_px, np.float64)
     rngs = [np.random.default_rng(s) for s in np.random.SeedSequence(effort.seed).spawn(effort.batches)]
-    n_walks = effort.walks // effort.batches
-    return PixelLight(np.array([trace_pixel(kernel, view, edges, n_walks, rng) for rng in rngs]), edges)
+    return effort.walks // effort.batches, rngs
 
 
 def lamps_in_world(sources: LightSources, world_from_camera: Array, band: int) -> Array:
@@ -268,12 +336,13 @@ def _kernel_scene(scene: ReferenceScene, plain: bool) -> KernelScene:
         table.density_per_sr, table.cumulative, table.cumulative_angle, table.angle_integral, table.beyond,
         np.ascontiguousarray(lamps[lit]), np.ascontiguousarray(beams.reshape(-1, BEAM_STEPS + 1)[lit]),
         float(scene.lamp_radius_m), np.array(sun.to_sun, np.float64), float(sun.normal_lx), float(sun.surface_m),
+        float(np.cos(sun.radius_rad)), np.array(sun.sky_cd_m2, np.float64),
         floor is None, NO_FLOOR if floor is None else floor, plain,
     )  # fmt: skip
 
 
 def _view(ray: PixelRay) -> Array:
-    """Returns the camera and the pixel as `walk.bin_of` takes them: (5, 3)."""
+    """Returns the camera and the pixel as the argument `view` (5, 3) of `walk.bin_of`."""
     pose, rig = ray.world_from_camera, ray.rig
     pixel = ray.pixel[0] - rig.cx_px, ray.pixel[1] - rig.cy_px, rig.focal_px
     return np.vstack([pose[:3, :3].T, pose[:3, 3], pixel])

@@ -1,4 +1,4 @@
-"""Compiled sampling of directions: phase function table, hemisphere above a floor, lobe around a lamp."""
+"""Compiled random sampling of directions: from the table of a phase function, and in lobes around a lamp."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cell_of(cumulative, u):
 
 @njit(cache=True, nogil=True)
 def sample_cosine(cumulative, rng):
-    """Returns a cosine of the scattering angle, distributed as the light that the phase function scatters."""
+    """Returns a random cosine of the scattering angle, sampled from the phase function."""
     cells = cumulative.shape[0] - 1
     k = cell_of(cumulative, rng.random())
     low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4
@@ -40,7 +40,7 @@ def sample_cosine(cumulative, rng):
 
 @njit(cache=True, nogil=True)
 def sample_angle(cumulative_angle, rng):
-    """Returns a scattering angle [rad], distributed as the phase function times the angle."""
+    """Returns a random angle in [0, pi] with a density proportional to the phase function times the angle."""
     cells = cumulative_angle.shape[0] - 1
     k = cell_of(cumulative_angle, rng.random())
     low, high = 2 * np.arcsin((k / cells) ** 2), 2 * np.arcsin(((k + 1) / cells) ** 2)
@@ -73,11 +73,11 @@ def turn_by_cosine(x, y, z, cosine, rng):
 
 @njit(cache=True, nogil=True)
 def sample_guide(cumulative_angle, rng):
-    """Returns the cosine of the angle from a lamp, for directions that are sampled around the lamp.
+    """Returns a random cosine of the angle from the direction to a lamp, for directions sampled around the lamp.
 
-    One half follows the angle at a point under which light arrives that was scattered once on its way from the lamp:
-    evenly between 0 and the scattering angle, which has the density p(angle) angle. The other half is wider, for light
-    that was scattered more often: a Henyey-Greenstein lobe of mean cosine `GUIDE_G`, by inversion.
+    The distribution is a mixture of two, each with probability 1/2. The first is for light that is scattered once
+    between lamp and point: uniform between 0 and a scattering angle that is sampled by `sample_angle`. The second is
+    wider, for light that is scattered more often: Henyey-Greenstein with the mean cosine `GUIDE_G`, by inversion.
     """
     if rng.random() < 0.5:
         return np.cos(sample_angle(cumulative_angle, rng) * rng.random())

@@ -1,20 +1,23 @@
 """Compiled random walks of light, traced backwards from a pixel: the kernel of the reference.
 
-The radiance of a pixel is the integral over all paths from lamps and sun that end in its ray (Veach 1997, the path
-integral; Mobley 1994 for the quantities). A walk starts in two ways: at the floor point that the pixel shows, with the
-share exp(-c r) that arrives unscattered, and at a first scattering between camera and floor, sampled from the truncated
-exponential distribution. At each vertex the lamps are connected:
+The radiance of a pixel is the integral over all paths from lamps and sun that end on the ray of the pixel (Veach 1997,
+the path integral; Mobley 1994 for the quantities). A walk starts in one of two ways: at the floor point that the pixel
+shows, with the share exp(-c r) that arrives unscattered, or at a first scattering between camera and floor, sampled
+from the truncated exponential distribution. Each vertex of the walk is connected to each lamp in two ways:
 
-* each vertex straight: rho/pi cos I/d^2 exp(-c d) at the floor, or p I/d^2 exp(-c d) in the water;
-* each vertex also by one more scattering between vertex and lamp. With the scattering angle t = alpha + beta, where
-  alpha and beta are the angles of the triangle at vertex and lamp, and D their distance, the volume element divided by
-  both squared distances is (1/D) d(alpha) d(t) d(azimuth). If t is sampled in proportion to p(t) t, and alpha evenly
-  between 0 and t, the weight has neither the peak of p nor the poles 1/d^2 (compare Georgiev et al. 2013).
+* directly: rho/pi cos I/d^2 exp(-c d) at the floor, or p I/d^2 exp(-c d) in the water;
+* by one more scattering between vertex and lamp. With the scattering angle t = alpha + beta, where alpha and beta are
+  the angles of the triangle at vertex and lamp, and D the distance between vertex and lamp, the volume element divided
+  by both squared distances is (1/D) d(alpha) d(t) d(azimuth). If t is sampled in proportion to p(t) t, and alpha
+  uniformly between 0 and t, the weight has neither the peak of p nor the poles 1/d^2 (compare Georgiev et al. 2013).
 
-Light that is scattered last at a point of the water is found both ways, which `share_of_walk` weights.
+Light that is scattered last at a point of the water is sampled both by these connections and by the walk;
+`share_of_walk` weights the two. Vertices are connected directly to the sun, and the sky is sampled by walks that leave
+the water; a sun with a disc is sampled in both ways.
 
 The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), and
-lobes around the lamps. Absorption is a weight. Russian roulette ends weak walks; nothing is clamped.
+lobes around the lamps and the sun. Absorption reduces the weight of a walk. Russian roulette ends walks of small
+weight; no contribution is clipped.
 """
 
 from __future__ import annotations
@@ -35,13 +38,17 @@ from twin.imaging.reference.sampling import (
 
 #: Sums that a walk adds to, before the bins of the blurred light.
 DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
-GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around the lamps
+GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around lamps and sun
+UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
 WEAK, STEPS = 0.002, 10000  # relative weight at which the roulette starts; largest number of vertices
 
 
 @njit(cache=True, nogil=True)
 def beam_at(beam, cosine):
-    """Returns the relative intensity of a lamp, from its values at even steps of the angle from 0 to 90 deg."""
+    """Returns the relative intensity of a lamp at the cosine of the angle from its beam axis.
+
+    `beam` has the values at equal steps of the angle from 0 to 90 deg.
+    """
     if cosine <= 0:
         return 0.0
     at = np.arccos(min(cosine, 1.0)) / (np.pi / 2) * (beam.shape[0] - 1)
@@ -51,7 +58,7 @@ def beam_at(beam, cosine):
 
 @njit(cache=True, nogil=True)
 def response(scene, kind, normal, direction, ox, oy, oz):
-    """Returns the light that a vertex sends back along its path per unit of light from a direction [1/sr].
+    """Returns the scattering function of a vertex for light from a direction, back along the path [1/sr].
 
     Args:
         kind: 0 floor (albedo / pi times the cosine), 1 water (phase function).
@@ -64,23 +71,30 @@ def response(scene, kind, normal, direction, ox, oy, oz):
     return density_at(scene.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def towards(lamp, point):
+    """Returns the unit direction x, y, z from a point to a lamp, and their distance [m]."""
+    x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
+    d = np.sqrt(x * x + y * y + z * z)
+    return x / d, y / d, z / d, d
+
+
 @njit(cache=True, nogil=True)
 def straight(scene, kind, point, normal, direction, before, density, step_m):
     """Returns the light of all lamps that reaches a vertex without scattering, times its response.
 
     Args:
-        before: the vertex before it.
-        density: density of the direction between both [1/sr]; 0 for the full light, else it is `share_of_walk`.
-        step_m: distance between both.
+        before: the previous vertex of the walk.
+        density: density with which the direction from `before` to this vertex was sampled [1/sr]; if it is above 0, the
+            light of each lamp is weighted by `share_of_walk`.
+        step_m: distance between the two vertices.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
         lamp = scene.lamps[k]
-        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
-        d = np.sqrt(x * x + y * y + z * z)
+        x, y, z, d = towards(lamp, point)
         if d <= scene.lamp_radius_m:
             continue
-        x, y, z = x / d, y / d, z / d
         light = lamp[6] * beam_at(scene.beams[k], -(x * lamp[3] + y * lamp[4] + z * lamp[5]))
         light *= response(scene, kind, normal, direction, x, y, z)
         if light > 0 and sees(scene.is_plane, scene.field, point[0], point[1], point[2], lamp[0], lamp[1], lamp[2]):
@@ -95,15 +109,14 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
 
 @njit(cache=True, nogil=True)
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
-    """Returns an estimate of the light of all lamps that reaches a vertex scattered once, times its response.
+    """Returns an estimate of the light of all lamps that reaches a vertex after one scattering, times its response.
 
-    It is weighted by the complement of `share_of_walk`; `guided` is the share of guided directions at the vertex.
+    It is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around the lamps.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
         lamp = scene.lamps[k]
-        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
-        d = np.sqrt(x * x + y * y + z * z)
+        x, y, z, d = towards(lamp, point)
         if d <= scene.lamp_radius_m:
             continue
         angle = sample_angle(scene.cumulative_angle, rng)
@@ -114,7 +127,7 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
         from_point, from_lamp = d * np.sin(angle - alpha) / sine, d * np.sin(alpha) / sine
         if from_lamp <= scene.lamp_radius_m:
             continue
-        ox, oy, oz = turn(x / d, y / d, z / d, np.cos(alpha), np.sin(alpha), 2 * np.pi * rng.random())
+        ox, oy, oz = turn(x, y, z, np.cos(alpha), np.sin(alpha), 2 * np.pi * rng.random())
         own = response(scene, kind, normal, direction, ox, oy, oz)
         if own <= 0:
             continue
@@ -128,36 +141,100 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
         if sees(scene.is_plane, scene.field, px, py, pz, lamp[0], lamp[1], lamp[2]):
             scale = 2 * np.pi * scene.angle_integral * scene.scattering / d
             scale *= np.exp(-attenuation * (from_point + from_lamp))
-            density = direction_density(scene, kind, point, guided, own, ox, oy, oz)
+            density = direction_density(scene, kind, point, direction, guided, own, ox, oy, oz)
             phase = density_at(scene.density_per_sr, np.cos(angle))
             total += scale * light * (1 - share_of_walk(scene, d, phase, from_lamp, density, from_point))
     return total
 
 
 @njit(cache=True, nogil=True)
-def sunlight(scene, kind, point, normal, direction):
-    """Returns the sunlight that reaches a vertex without scattering, times its response."""
+def sunlight(scene, kind, point, normal, direction, guided, rng):
+    """Returns the sunlight that reaches a vertex without scattering, times its response.
+
+    In water, a sun with a disc is sampled at a point of the disc, weighted by the complement of `share_of_escape`.
+    """
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
         return 0.0
+    has_disc = kind == 1 and scene.sun_cosine < 1
+    if has_disc:
+        sx, sy, sz = turn_by_cosine(sx, sy, sz, 1 - rng.random() * (1 - scene.sun_cosine), rng)
+        if sz <= 0:
+            return 0.0
     if floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], sx, sy, sz) < np.inf:
         return 0.0
     path = (scene.surface_m - point[2]) / sz
-    light = scene.sun_lx * np.exp(-(scene.absorption + scene.scattering) * path)
-    return light * response(scene, kind, normal, direction, sx, sy, sz)
+    own = response(scene, kind, normal, direction, sx, sy, sz)
+    light = scene.sun_lx * np.exp(-(scene.absorption + scene.scattering) * path) * own
+    if has_disc:
+        density = direction_density(scene, kind, point, direction, guided, own, sx, sy, sz)
+        light *= 1 - share_of_escape(scene, density, path)
+    return light
+
+
+@njit(cache=True, nogil=True)
+def share_of_escape(scene, density, path_m):
+    """Returns the share of the walk's estimate of the sun's disc (the balance heuristic, as in `share_of_walk`).
+
+    Args:
+        density: density of the walk's direction [1/sr].
+        path_m: distance to the surface along it.
+    """
+    by_walk = density * np.exp(-scene.scattering * path_m)
+    by_connection = 1 / (2 * np.pi * (1 - scene.sun_cosine))
+    return by_walk / (by_walk + by_connection)
+
+
+@njit(cache=True, nogil=True)
+def light_above(scene, from_water, density, path_m, x, y, z):
+    """Returns the radiance just below the surface from a direction: sky, and the sun's disc for walks in water.
+
+    Args:
+        from_water: whether the last vertex is a scattering.
+        density: density of the direction there [1/sr].
+        path_m: distance to the surface.
+        x, y, z: unit direction.
+    """
+    last = scene.sky.shape[0] - 1
+    light = 0.0
+    if last > 0:
+        at = min(max(z, 0.0), 1.0) * last
+        k = min(int(at), last - 1)
+        light = scene.sky[k] + (at - k) * (scene.sky[k + 1] - scene.sky[k])
+    if from_water and scene.sun_lx > 0 and scene.sun_cosine < 1:
+        if x * scene.to_sun[0] + y * scene.to_sun[1] + z * scene.to_sun[2] >= scene.sun_cosine:
+            disc = scene.sun_lx / (2 * np.pi * (1 - scene.sun_cosine))
+            light += disc * share_of_escape(scene, density, path_m)
+    return light
+
+
+@njit(cache=True, nogil=True)
+def axis_of(scene, k, point):
+    """Returns the unit direction from a point to lamp k; to the sun if k is the number of lamps."""
+    if k == scene.lamps.shape[0]:
+        return scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
+    x, y, z, _ = towards(scene.lamps[k], point)
+    return x, y, z
+
+
+@njit(cache=True, nogil=True, inline="always")
+def upward_share(scene, kind, direction, guided):
+    """Returns the share of the directions that are sampled upwards among those that are not sampled around a light."""
+    sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
+    return UPWARDS if sunny and kind == 1 and guided > 0 and direction[2] < 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
 def next_direction(scene, kind, point, normal, direction, guided, rng):
     """Returns the next direction of a walk, sampled from the mixture whose density `direction_density` returns."""
-    n = scene.lamps.shape[0]
+    n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
     if n > 0 and rng.random() < guided:
-        lamp = scene.lamps[min(int(n * rng.random()), n - 1)]
-        x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
-        d = np.sqrt(x * x + y * y + z * z)
-        x, y, z = turn_by_cosine(x / d, y / d, z / d, sample_guide(scene.cumulative_angle, rng), rng)
+        x, y, z = axis_of(scene, min(int(n * rng.random()), n - 1), point)
+        x, y, z = turn_by_cosine(x, y, z, sample_guide(scene.cumulative_angle, rng), rng)
     elif kind == 0:
         x, y, z = turn_by_cosine(normal[0], normal[1], normal[2], np.sqrt(rng.random()), rng)
+    elif rng.random() < upward_share(scene, kind, direction, guided):
+        x, y, z = turn_by_cosine(0.0, 0.0, 1.0, np.sqrt(rng.random()), rng)
     else:
         cosine = sample_cosine(scene.cumulative, rng)
         x, y, z = turn_by_cosine(direction[0], direction[1], direction[2], cosine, rng)
@@ -166,39 +243,43 @@ def next_direction(scene, kind, point, normal, direction, guided, rng):
 
 
 @njit(cache=True, nogil=True)
-def direction_density(scene, kind, point, guided, own, x, y, z):
+def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
 
     Args:
         kind: 0 floor, 1 water.
-        guided: share of the directions that are sampled around the lamps.
+        direction: unit direction in which the backward path arrived there.
+        guided: share of the directions that are sampled around lamps and sun.
         own: response of the vertex to that direction; per unit of albedo it is the density of the other directions.
     """
     own = own / scene.albedo if kind == 0 else own
-    n = scene.lamps.shape[0]
+    upwards = upward_share(scene, kind, direction, guided)
+    if upwards > 0:
+        own = (1 - upwards) * own + upwards * max(z, 0.0) / np.pi
+    n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
     if n == 0 or guided == 0:
         return own
     lobes = 0.0
     for k in range(n):
-        a, b, c = scene.lamps[k, 0] - point[0], scene.lamps[k, 1] - point[1], scene.lamps[k, 2] - point[2]
-        cosine = (a * x + b * y + c * z) / np.sqrt(a * a + b * b + c * c)
+        a, b, c = axis_of(scene, k, point)
+        cosine = a * x + b * y + c * z
         lobes += guide_density(scene.density_per_sr, scene.beyond, scene.angle_integral, cosine) / n
     return (1 - guided) * own + guided * lobes
 
 
 @njit(cache=True, nogil=True)
 def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
-    """Returns the share of the walk's estimate of the light of a lamp that is scattered last at a point.
+    """Returns the weight of the walk's estimate of the light that leaves a lamp and is first scattered at a point.
 
     The walk and `by_one_scattering` sample the same point with the densities per volume w and s; their estimates
     are weighted by w / (w + s) and s / (w + s) (the balance heuristic of Veach 1997, section 9.2.2).
 
     Args:
-        lamp_m: distance of the lamp from the vertex before the point.
+        lamp_m: distance of the lamp from the previous vertex, which the light reaches after the point.
         phase: value of the phase function for the scattering at the point [1/sr].
         to_lamp_m: distance of the lamp from the point.
-        density: density of the direction from that vertex to the point [1/sr].
-        step_m: distance of the point from that vertex.
+        density: density with which the walk samples the direction from the previous vertex to the point [1/sr].
+        step_m: distance of the point from the previous vertex.
     """
     by_walk = density * scene.scattering * np.exp(-scene.scattering * step_m)
     by_connection = phase * lamp_m / (2 * np.pi * scene.angle_integral * to_lamp_m * to_lamp_m)
@@ -207,7 +288,7 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
 
 @njit(cache=True, nogil=True)
 def bin_of(view, bin_edges_px, x, y, z):
-    """Returns the bin of the distance between a pixel and the straight image of a point; the last bin is open.
+    """Returns the bin of the distance between a pixel and the unscattered image of a point; the last bin is open.
 
     Args:
         view: (5, 3) axes of the camera as rows, its position, and (column, row) of the pixel from the principal point
@@ -229,7 +310,7 @@ def bin_of(view, bin_edges_px, x, y, z):
 
 @njit(cache=True, nogil=True)
 def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
-    """Adds the light of one walk to `sums`.
+    """Adds the light of one random walk to `sums`.
 
     Args:
         scene: `pixel_light.KernelScene`.
@@ -237,8 +318,9 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         point: (3,) first vertex.
         direction: (3,) unit direction in which the backward path arrives there.
         weight: weight of the first vertex.
-        sums: (FIRST_BIN + 2 n,) sums of light [cd/m2]: after FIRST_BIN, n bins of blurred light of the floor whose way
-            from the lamps was straight, and n bins of that whose way was not.
+        sums: (FIRST_BIN + 2 n,) sums of light [cd/m2], modified in place: DIRECT, LAMP_SCATTERED, VEIL_ONCE and
+            VEIL_MORE; then the light from the floor that was scattered on its way to the camera, in n bins for light
+            that had illuminated the floor without scattering, and in n bins for all other light.
     """
     unscattered, before_floor, at_first_floor = kind == 0, kind == 1, False
     n_bins, at_bin, start = bin_edges_px.shape[0], 0, weight
@@ -247,30 +329,29 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
     for order in range(STEPS):
         first = order == 0
         shared = 0.0 if scene.plain or kind == 0 else density  # density is 0 at the first vertex
-        once = weight * sunlight(scene, kind, point, normal, direction)
-        once += weight * straight(scene, kind, point, normal, direction, before, shared, step_m)
         guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == 0 else GUIDED_IN_WATER)
+        once = weight * sunlight(scene, kind, point, normal, direction, guided, rng)
+        once += weight * straight(scene, kind, point, normal, direction, before, shared, step_m)
         more = 0.0
         if not scene.plain and scene.scattering > 0:
             more = weight * by_one_scattering(scene, kind, point, normal, direction, guided, rng)
         if before_floor:
-            sums[VEIL_ONCE if first else VEIL_MORE] += once
-            sums[VEIL_MORE] += more
+            to, to_more = VEIL_ONCE if first else VEIL_MORE, VEIL_MORE
         elif unscattered:
-            if not first:  # the light that is scattered nowhere is computed once, without sampling
-                sums[LAMP_SCATTERED] += once
-            sums[LAMP_SCATTERED] += more
+            to, to_more = DIRECT if first else LAMP_SCATTERED, LAMP_SCATTERED
         else:
-            sums[FIRST_BIN + at_bin + (0 if at_first_floor else n_bins)] += once
-            sums[FIRST_BIN + at_bin + n_bins] += more
+            to, to_more = FIRST_BIN + at_bin + (0 if at_first_floor else n_bins), FIRST_BIN + at_bin + n_bins
             at_first_floor = False
-        if scene.scattering <= 0:
+        if to != DIRECT:  # `trace_pixel` computes the unscattered light of lamps and sun once, without sampling
+            sums[to] += once
+        sums[to_more] += more
+        if scene.scattering <= 0 and scene.sky.shape[0] < 2:
             return
         x, y, z = next_direction(scene, kind, point, normal, direction, guided, rng)
         own = response(scene, kind, normal, direction, x, y, z)
         if own <= 0:
             return
-        density = direction_density(scene, kind, point, guided, own, x, y, z)
+        density = direction_density(scene, kind, point, direction, guided, own, x, y, z)
         weight *= own / density
         if weight < WEAK * start:
             survival = weight / (WEAK * start)
@@ -280,8 +361,12 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         direction = (x, y, z)
         floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
         surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
-        step_m = -np.log(1 - rng.random()) / scene.scattering
+        step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
         if step_m >= surface_m and surface_m <= floor_m:
+            above = light_above(scene, kind == 1, density, surface_m, x, y, z)
+            sums[to] += weight * np.exp(-scene.absorption * surface_m) * above
+            return
+        if step_m == np.inf and floor_m == np.inf:
             return
         kind = 1 if step_m < floor_m else 0
         step_m = min(step_m, floor_m)
@@ -300,33 +385,85 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 
 @njit(cache=True, nogil=True)
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the mean sums (FIRST_BIN + 2 n,) of `walk` over `n_walks` pairs of walks of a pixel, with n bins."""
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2]: the mean of `walk` over `n_walks` pairs of walks."""
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
-    eye = (view[3, 0], view[3, 1], view[3, 2])
+    centre = (view[3, 0], view[3, 1], view[3, 2])
     a, b, f = view[4, 0], view[4, 1], view[4, 2]
     length = np.sqrt(a * a + b * b + f * f)
     x = (a * view[0, 0] + b * view[1, 0] + f * view[2, 0]) / length
     y = (a * view[0, 1] + b * view[1, 1] + f * view[2, 1]) / length
     z = (a * view[0, 2] + b * view[1, 2] + f * view[2, 2]) / length
     ray = (x, y, z)
-    floor_m = floor_distance(scene.is_plane, scene.field, eye[0], eye[1], eye[2], x, y, z)
-    end_m = min(floor_m, (scene.surface_m - eye[2]) / z if z > 0 else np.inf)
+    floor_m = floor_distance(scene.is_plane, scene.field, centre[0], centre[1], centre[2], x, y, z)
+    end_m = min(floor_m, (scene.surface_m - centre[2]) / z if z > 0 else np.inf)
     seen = floor_m < np.inf and floor_m <= end_m and scene.albedo > 0
     share = 1 - np.exp(-scene.scattering * end_m) if scene.scattering > 0 else 0.0
-    arrives, shown, up = 0.0, eye, (0.0, 0.0, 1.0)
+    arrives, shown, up = 0.0, centre, (0.0, 0.0, 1.0)
     if seen:
         arrives = np.exp(-(scene.absorption + scene.scattering) * floor_m)
-        shown = (eye[0] + floor_m * x, eye[1] + floor_m * y, eye[2] + floor_m * z)
+        shown = (centre[0] + floor_m * x, centre[1] + floor_m * y, centre[2] + floor_m * z)
         up = floor_normal(scene.is_plane, scene.field, shown[0], shown[1])
         shown = (shown[0] + LIFT_M * up[0], shown[1] + LIFT_M * up[1], shown[2] + LIFT_M * up[2])
-        direct = straight(scene, 0, shown, up, ray, shown, 0.0, 0.0) + sunlight(scene, 0, shown, up, ray)
+        direct = straight(scene, 0, shown, up, ray, shown, 0.0, 0.0) + sunlight(scene, 0, shown, up, ray, 0.0, rng)
         sums[DIRECT] = n_walks * arrives * direct
     for k in range(n_walks):
-        if seen and scene.scattering > 0:
+        if seen and (scene.scattering > 0 or scene.sky.shape[0] > 1):
             walk(scene, view, bin_edges_px, 0, shown, ray, arrives, rng, sums)
         if share > 0:
             at_m = -np.log(1 - share * (k + rng.random()) / n_walks) / scene.scattering
             weight = share * np.exp(-scene.absorption * at_m)
-            point = (eye[0] + at_m * x, eye[1] + at_m * y, eye[2] + at_m * z)
+            point = (centre[0] + at_m * x, centre[1] + at_m * y, centre[2] + at_m * z)
             walk(scene, view, bin_edges_px, 1, point, ray, weight, rng, sums)
     return sums / n_walks
+
+
+@njit(cache=True, nogil=True)
+def trace_plane(scene, point, normal, n_walks, rng):
+    """Returns the illuminance (3,) of a plane that does not disturb the light: sun, sky, and all scattered light [lx].
+
+    Args:
+        scene: `pixel_light.KernelScene`.
+        point: a point of the plane.
+        normal: unit normal of the plane.
+        n_walks: number of walks.
+    """
+    out, sums, no_view, edges = np.zeros(3), np.zeros(FIRST_BIN + 2), np.zeros((5, 3)), np.zeros(1)
+    sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
+    guided = 0.0 if scene.plain else GUIDED_AT_FLOOR
+    facing = normal[0] * sx + normal[1] * sy + normal[2] * sz
+    blocked = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], sx, sy, sz) < np.inf
+    if scene.sun_lx > 0 and facing > 0 and not blocked:
+        attenuation = scene.absorption + scene.scattering
+        out[0] = n_walks * facing * scene.sun_lx * np.exp(-attenuation * (scene.surface_m - point[2]) / sz)
+    for _ in range(n_walks):
+        x, y, z = next_direction(scene, 0, point, normal, normal, guided, rng)
+        cosine = normal[0] * x + normal[1] * y + normal[2] * z
+        if cosine <= 0:
+            continue
+        weight = cosine / direction_density(scene, 1, point, (0.0, 0.0, 1.0), guided, cosine / np.pi, x, y, z)
+        floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
+        surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
+        step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
+        if step_m >= surface_m and surface_m <= floor_m:
+            light = light_above(scene, False, 0.0, surface_m, x, y, z)
+            out[1] += weight * np.exp(-scene.absorption * surface_m) * light
+            continue
+        if step_m == np.inf and floor_m == np.inf:
+            continue
+        kind = 1 if step_m < floor_m else 0
+        if kind == 0 and scene.albedo <= 0:
+            continue
+        step_m = min(step_m, floor_m)
+        weight *= np.exp(-scene.absorption * step_m)
+        next_point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
+        if kind == 0:
+            up = floor_normal(scene.is_plane, scene.field, next_point[0], next_point[1])
+            next_point = (
+                next_point[0] + LIFT_M * up[0], next_point[1] + LIFT_M * up[1], next_point[2] + LIFT_M * up[2]
+            )  # fmt: skip
+            first = straight(scene, 0, next_point, up, (x, y, z), next_point, 0.0, 0.0)
+            first += sunlight(scene, 0, next_point, up, (x, y, z), 0.0, rng)
+            sums[LAMP_SCATTERED] += weight * first
+        walk(scene, no_view, edges, kind, next_point, (x, y, z), weight, rng, sums)
+    out[2] = sums.sum()
+    return out / n_walks

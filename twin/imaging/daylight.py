@@ -1,0 +1,191 @@
+"""Daylight on floors of any slope, and its backscatter in the lines of sight of a camera, from the light field.
+
+The tables are computed once per scenario, at the depth of the cameras; `optics` uses them for every image. Light that
+the floor reflects and the water scatters back to the floor is neglected: 8 % of the light on a floor of albedo 0.5 in
+water of Jerlov type III.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.imaging.illumination import Daylight
+from twin.imaging.light_field import SLOPE_MODES, BandOptics, LightField
+from twin.imaging.phase_function import Scatterer, table_of
+from twin.imaging.spread import Absorbed
+from twin.imaging.sun_sky import SunSky
+from twin.imaging.water import Medium
+
+Array = NDArray[np.float64]
+
+MODES = 8  # terms of the azimuth series of the upwelling light; its mean error is below 1 %
+VIEW_STEPS, LARGEST_VIEW_DEG = 24, 86.0  # angles of the lines of sight from straight down, and their limit
+FLOOR_STEPS, FLOOR_SCALE_M = 96, 2.0  # table of vertical distances h of the floor, even in h / (h + scale)
+FIT_DEPTHS = 9  # number of depths, from the cameras to below the reference plane, at which light is computed
+LEAST_LX = 1e-12  # lower limit of the diffuse illuminance, per lux at the surface
+
+
+class FloorDaylight(NamedTuple):
+    """Daylight on the floor in the bands R, G, B.
+
+    The light on a floor at depth z with the unit normal n is
+
+        E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0)
+                  + (n, 1) rest_lx (n, 1)' exp(d rest_per_m[0] + min(max(d, low), high)^2 rest_per_m[1]),
+
+    with d = z - reference_depth_m and (low, high) the range of the fit.
+
+    Args:
+        to_sun: (3,) unit direction to the refracted sun, east, north, up.
+        beam_lx: (3,) illuminance by the beam just below the surface on a plane that faces the sun.
+        beam_per_m: (3,) attenuation of the beam with depth.
+        rest_lx: (3, 4, 4) illuminance by all other light at the reference depth, a form in (east, north, up, 1).
+        rest_per_m: (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the change of its logarithm.
+        reference_depth_m: depth below the surface at which `rest_lx` applies.
+        fitted_m: lowest and highest d of the fit.
+    """
+
+    to_sun: Array
+    beam_lx: Array
+    beam_per_m: Array
+    rest_lx: Array
+    rest_per_m: Array
+    reference_depth_m: float
+    fitted_m: tuple[float, float]
+
+
+def floor_daylight(daylight: Daylight, water: Medium) -> FloorDaylight:
+    """Returns the daylight on the floor.
+
+    With single scattering, beam and diffuse light keep their shares, and both decrease with the diffuse attenuation;
+    with multiple scattering the beam turns into diffuse light on its way.
+
+    Args:
+        daylight: sun, sky and depth of the water.
+        water: optical properties of the water.
+    """
+    source, east_north = daylight.source, _turn(daylight.source)
+    beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
+    if not (deep and water.multiple and daylight.surface_lx.any()):
+        form = east_north @ _in_clear_water(source).slope_form(0.0, 1e-6) @ east_north.T
+        fade = -daylight.attenuation_per_m
+        rest_lx = (daylight.surface_lx * np.exp(fade * deep))[:, None, None] * form
+        rest_per_m = np.stack([fade, np.zeros(3)], 1)
+        return FloorDaylight(np.array(source.to_sun), beam, -fade, rest_lx, rest_per_m, deep, (0.0, 0.0))
+    fields = [_field(band, source, SLOPE_MODES) for band in water.bands]
+    depths = np.linspace(daylight.camera_depth_m, deep + max(1.0, (deep - daylight.camera_depth_m) / 4), FIT_DEPTHS)
+    forms, changes = zip(*(_rest_of(field, deep, depths) for field in fields), strict=True)
+    turned = daylight.surface_lx[:, None, None] * (east_north @ np.array(forms) @ east_north.T)
+    per_m = np.array([field.beam_per_m for field in fields])
+    fitted = float(depths[0] - deep), float(depths[-1] - deep)
+    return FloorDaylight(np.array(source.to_sun), beam, per_m, turned, np.array(changes), deep, fitted)
+
+
+def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, Array]:
+    """Returns the illuminance of the floor by all light except the beam of the sun, in one band.
+
+    It is the quadratic form (4, 4) in the floor normal at the depth `deep_m`, and the coefficients (2,) of its change
+    with depth, fitted at `depths_m`; see `FloorDaylight.rest_lx` and `rest_per_m`.
+    """
+    light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
+    square, slope, level = np.polyfit(depths_m - deep_m, light, 2)
+    form = field.slope_form(deep_m, deep_m)
+    return form * np.exp(level) / max(field.illuminance(deep_m, deep_m)[1], LEAST_LX), np.array([slope, square])
+
+
+class DaylightVeil:
+    """Daylight that the water scatters into the lines of sight of a camera, with any order of scattering.
+
+    Args:
+        daylight: sun, sky and depth of the cameras.
+        water: optical properties of the water.
+        range_m: (n,) ranges at which it is tabulated [m], increasing from 0; the last one may be infinite.
+    """
+
+    def __init__(self, daylight: Daylight, water: Medium, range_m: Array):
+        self._depth_m, self._source = daylight.camera_depth_m, daylight.source
+        terms = _veil_terms(self._depth_m, water, self._source, range_m)
+        self._terms = np.ascontiguousarray(terms * daylight.surface_lx)
+        fields = [_field(band, self._source, 1) for band in water.bands]
+        loss = np.array([_local_attenuation(field, self._depth_m) for field in fields])
+        self._loss = loss if daylight.reference_depth_m else np.zeros(3)
+
+    def radiance(self, ray: Array, depth_m: float) -> Array:
+        """Returns the radiance (..., ranges, 3) [cd/m2] along lines of sight, in front of a black floor at each range.
+
+        Args:
+            ray: (..., 3) unit directions of sight, east, north, up; those more than `LARGEST_VIEW_DEG` from straight
+                down get the radiance at that angle.
+            depth_m: depth of the camera below the surface.
+        """
+        flat = ray.reshape(-1, 3)
+        modes, views = self._terms.shape[:2]
+        at = np.rad2deg(np.arccos(np.clip(-flat[:, 2], -1.0, 1.0))) * ((views - 1) / LARGEST_VIEW_DEG)
+        at = np.clip(at, 0.0, views - 1 - 1e-9)
+        sun = np.arctan2(self._source.to_sun[1], self._source.to_sun[0])
+        turn = np.cos(np.arange(modes) * (np.arctan2(flat[:, 1], flat[:, 0]) - sun)[:, None])
+        light = np.zeros((len(flat), self._terms[0, 0].size))
+        _interpolate_terms(self._terms.reshape(modes, views, -1), at, turn, light)
+        light = light.reshape(*ray.shape[:-1], -1, 3)
+        return np.maximum(light, 0.0) * np.exp(-self._loss * (depth_m - self._depth_m))
+
+
+@njit(cache=True, nogil=True)
+def _interpolate_terms(terms, at, turn, out):
+    """Adds to `out` (n, k) the terms (modes, views, k), interpolated at views `at` (n,), times `turn` (n, modes)."""
+    for i in range(at.size):
+        view = int(at[i])
+        part = at[i] - view
+        for m in range(terms.shape[0]):
+            near, far = turn[i, m] * (1 - part), turn[i, m] * part
+            for k in range(out.shape[1]):
+                out[i, k] += near * terms[m, view, k] + far * terms[m, view + 1, k]
+
+
+def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -> Array:
+    """Returns the terms (modes, views, ranges, 3) of the azimuth series of the veil, per lux at the surface."""
+    cosine = np.cos(np.deg2rad(np.linspace(0.0, LARGEST_VIEW_DEG, VIEW_STEPS)))
+    share = np.linspace(0.0, 1.0, FLOOR_STEPS + 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height_m = np.append(FLOOR_SCALE_M * share[:-1] / (1 - share[:-1]), np.inf)
+        vertical_m = cosine[:, None] * range_m
+        wanted = np.where(np.isinf(vertical_m), 1.0, vertical_m / (vertical_m + FLOOR_SCALE_M))
+    bands = []
+    for band in water.bands:
+        light = _field(band, source, MODES).veil(depth_m, cosine, depth_m + height_m)
+        rows = [[np.interp(wanted[k], share, light[m, k]) for k in range(VIEW_STEPS)] for m in range(len(light))]
+        bands.append(rows)
+    return np.moveaxis(np.array(bands), 0, -1)
+
+
+def _local_attenuation(field: LightField, depth_m: float) -> float:
+    """Returns the attenuation of the illuminance with depth at a depth in deep water [1/m]."""
+    above, below = (sum(field.illuminance(z, np.inf)) for z in (max(depth_m - 0.25, 0.0), depth_m + 0.25))
+    return float(np.log(above / below) / (depth_m + 0.25 - max(depth_m - 0.25, 0.0)))
+
+
+def _turn(source: SunSky) -> Array:
+    """Returns the matrix (4, 4) from the axes towards the sun, left of it, up to east, north, up; the 1 is kept."""
+    east, north, _ = source.to_sun
+    length = np.hypot(east, north)
+    c, s = (east / length, north / length) if length > 0 else (1.0, 0.0)
+    out = np.eye(4)
+    out[:2, :2] = [[c, -s], [s, c]]
+    return out
+
+
+def _in_clear_water(source: SunSky) -> LightField:
+    """Returns the light field in water without absorption and scattering."""
+    return _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
+
+
+@lru_cache(maxsize=64)
+def _field(band: Absorbed, source: SunSky, modes: int) -> LightField:
+    """Returns the light field of a band, cached, with `modes` terms of the series in azimuth."""
+    optics = BandOptics(band.absorption_per_m, band.scattering_per_m, table_of(band.scatterer))
+    return LightField(optics, source, modes)

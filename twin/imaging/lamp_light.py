@@ -1,0 +1,178 @@
+"""Light of the lamps in the water, unscattered and scattered: by any number of small angles, and once by any angle.
+
+A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular to its light, the illuminance
+
+    (I(theta) exp(-c d) + S(theta, d)) / d^2,
+
+where S is the beam convolved with the kernel of `spread.lamp_mixture`: the scattered light is not lost, but makes the
+beam wider and its edge softer. In water without scattering, or with single scattering, S is 0. Light that the
+floor reflects and the water scatters back to it is neglected, and so are the shadows of the floor in scattered light.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TypeAlias
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.imaging.lamps import LightSources, beam_share
+from twin.imaging.phase_function import phase_at
+from twin.imaging.shading import RANGE_SCALE_M
+from twin.imaging.spread import LAMP_SIGMA_RAD, NODES_M, Absorbed, Receiver, lamp_mixture, over_path, ring_shares
+from twin.imaging.water import Medium
+
+Array = NDArray[np.float64]
+Beam: TypeAlias = tuple[tuple[float, ...], ...]
+
+LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
+ANGLE_STEPS, SOFT_STEPS = 256, 64  # steps of sqrt(1 - cos(angle)) from 0 to 1, for all light and for scattered light
+PATH_STEPS = 96  # number of steps of d / (d + RANGE_SCALE_M) from 0 to 1
+RINGS, AZIMUTHS = 120, 24  # rings and directions on each ring around the straight path
+
+
+class LampLight:
+    """Light of all lamps at points in the axes of one camera.
+
+    Args:
+        sources: lamps in the axes of the camera.
+        water: optical properties of the water.
+    """
+
+    def __init__(self, sources: LightSources, water: Medium):
+        self.sources, self._water = sources, water
+        self._tables = [_all_light(beam, water, "particle") for beam in sources.beam] if _scatters(water) else None
+
+    def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
+        """Returns the illuminance of a plane that faces a lamp, (..., 3) [lx], and the unit directions from the lamp.
+
+        Args:
+            lamp: number of the lamp.
+            points: (..., 3) points in the axes of the camera [m].
+        """
+        sources, position, axis = self.sources, self.sources.position_m[lamp], self.sources.axis[lamp]
+        strength = sources.intensity_cd[lamp] * sources.colour[lamp]
+        if self._tables is not None:
+            points = np.ascontiguousarray(points, np.float64)
+            lux, from_lamp = np.empty_like(points), np.empty_like(points)
+            flat = points.reshape(-1, 3), position, axis, strength, self._tables[lamp]
+            _from_table(*flat, lux.reshape(-1, 3), from_lamp.reshape(-1, 3))
+            return lux, from_lamp
+        from_lamp = points - position
+        distance = np.maximum(np.linalg.norm(from_lamp, axis=-1), LAMP_RADIUS_M)[..., None]
+        from_lamp /= distance
+        share = beam_share(from_lamp @ axis, sources.beam[lamp])[..., None]
+        return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
+
+    def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
+        """Returns the light (..., n, 3) that the water scatters into a ray to the camera, per metre of the ray [cd/m3].
+
+        Args:
+            points: (..., n, 3) points of the ray in the axes of the camera [m].
+            ray: (..., 3) unit direction from the camera.
+        """
+        total = np.zeros(points.shape)
+        for lamp in range(len(self.sources.intensity_cd)):
+            lux, from_lamp = self.lux(lamp, points)
+            lux *= phase_at(self._water.scatterers, -(from_lamp @ ray[..., None])[..., 0])
+            total += lux
+        return total * self._water.scattering_per_m
+
+
+def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray[np.float32] | None:
+    """Returns the light of each lamp on a floor (lamps, n, m, 4), relative to the intensity on its axis.
+
+    Axes: lamp, even steps of sqrt(1 - cos(angle)), even steps of d / (d + RANGE_SCALE_M), and R, G, B, 0, so that a
+    cell lies in one cache line. None in water without multiple scattering.
+
+    Args:
+        sources: lamps in the axes of a camera.
+        water: optical properties of the water.
+        shadows: return only the scattered light S, which the floor is assumed not to block; else all light.
+    """
+    if not (_scatters(water) and len(sources.beam)):
+        return None
+    of_beam = _softened if shadows else _all_light
+    return np.pad([of_beam(beam, water, "floor") for beam in sources.beam], ((0, 0), (0, 0), (0, 0), (0, 1))).astype(
+        np.float32
+    )
+
+
+def _scatters(water: Medium) -> bool:
+    return water.multiple and bool(water.scattering_per_m.any())
+
+
+def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
+    """Returns I exp(-c d) + S of a beam (ANGLE_STEPS + 1, PATH_STEPS + 1, 3), see `floor_tables`."""
+    at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
+    low = np.minimum(at.astype(int), SOFT_STEPS - 1)
+    coarse = _softened(beam, water, receiver)
+    soft = coarse[low] + (at - low)[:, None, None] * (coarse[low + 1] - coarse[low])
+    share = beam_share(1 - np.linspace(0.0, 1.0, ANGLE_STEPS + 1) ** 2, beam)
+    soft[:, :-1] += share[:, None, None] * np.exp(-water.attenuation_per_m * _path_m()[:, None])
+    return soft
+
+
+def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
+    """Returns the scattered light S of a beam (SOFT_STEPS + 1, PATH_STEPS + 1, 3), see `floor_tables`."""
+    return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
+
+
+@cache
+def _softened_of(beam: Beam, bands: tuple[Absorbed, ...], receiver: Receiver) -> Array:
+    """Same as `_softened`, with hashable arguments for the cache."""
+    rings, path_m = _on_rings(beam), _path_m()
+    out = np.zeros((SOFT_STEPS + 1, PATH_STEPS + 1, 3))
+    for k, band in enumerate(bands):
+        if band.scattering_per_m:
+            share = rings @ lamp_mixture(band, NODES_M, receiver).T
+            out[:, :-1, k] = over_path(share, band.scattering_per_m, path_m)
+            out[:, :-1, k] *= np.exp(-band.absorption_per_m * path_m)
+    return out
+
+
+def _path_m() -> Array:
+    """Returns the distances (PATH_STEPS,) of the tables [m], without the last, which is infinite."""
+    x = np.linspace(0.0, 1.0, PATH_STEPS + 1)[:-1]
+    return RANGE_SCALE_M * x / (1 - x)
+
+
+@cache
+def _on_rings(beam: Beam) -> Array:
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each direction, weighted with m Gaussians."""
+    edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
+    cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
+    azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi
+    ring = ((edges[1:] + edges[:-1]) / 2)[:, None]
+    along = cosine * np.cos(ring) + np.sqrt(1 - cosine**2) * np.sin(ring) * np.cos(azimuth)
+    mean = np.where(along > 0, beam_share(along, np.array(beam)), 0.0).mean(-1)
+    return mean @ ring_shares(edges, LAMP_SIGMA_RAD)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _from_table(points, position, axis, strength, table, lux, from_lamp):
+    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
+
+    Args:
+        position, axis: those of the lamp.
+        strength: (3,) intensity on the axis for R, G, B.
+        table: (n, m, 3) light of the lamp, see `_all_light`.
+    """
+    rows, cols = table.shape[0] - 1, table.shape[1] - 1
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] - position[0], points[k, 1] - position[1], points[k, 2] - position[2]
+        d = max(np.sqrt(x * x + y * y + z * z), LAMP_RADIUS_M)
+        from_lamp[k, 0], from_lamp[k, 1], from_lamp[k, 2] = x / d, y / d, z / d
+        cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / d
+        if cosine <= 0:
+            lux[k, 0], lux[k, 1], lux[k, 2] = 0.0, 0.0, 0.0
+            continue
+        row, col = np.sqrt(max(1 - cosine, 0.0)) * rows, d / (d + RANGE_SCALE_M) * cols
+        i, j = min(int(row), rows - 1), min(int(col), cols - 1)
+        u, v = row - i, col - j
+        for c in range(3):
+            near = table[i, j, c] + u * (table[i + 1, j, c] - table[i, j, c])
+            far = table[i, j + 1, c] + u * (table[i + 1, j + 1, c] - table[i, j + 1, c])
+            lux[k, c] = strength[c] * (near + v * (far - near)) / (d * d)

@@ -1,0 +1,199 @@
+"""Multiple scattering of light near its straight path, as mixtures of Gaussians: the spread of a beam, and of an image.
+
+A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), what arrives
+is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular frequency k is
+
+    exp(-a d - b d (1 - K(k))),
+
+with K the transform of the kernel of light scattered once. The kernel of an image is that of a beam with the path
+reversed. Here K is not approximated by small angles, but exact for light scattered once, also at wide angles: with t
+the scattering angle, and alpha and beta the angles at the point and at the lamp of the triangle lamp, scattering, point
+(alpha + beta = t), the volume element divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
+
+    k1(beta) = integral over t > beta of p(t) g(t - beta) exp(-a d (path / d - 1)),  per d(beta) d(azimuth),
+
+with path / d = (sin(alpha) + sin(beta)) / sin(t). g is the response of the point to light that arrives at the angle
+alpha from the straight path: the cosine for a floor, 1 for a particle in the water. The integral of the kernel is below
+1 for a floor, as light scattered by wide angles misses it or is absorbed on its longer path.
+
+For a camera that views a floor at the range r, a ray of the camera is scattered by the angle t at the distance u r and
+meets the floor at tan(beta) = (1 - u) tan(t); its weight is p(t) sin(t), reduced by absorption on the excess path.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.special import j1
+
+from twin.imaging.phase_function import Scatterer, phase_at
+
+Array = NDArray[np.float64]
+#: Receiver of lamp light: a floor, whose response is the cosine, or a particle, whose response is 1 in all directions.
+Receiver = Literal["floor", "particle"]
+
+ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
+LEAST_RAD, MOST_TAN = 1e-5, 20.0  # inner and outer edge of the rings
+STEPS = 24  # number of positions of a scattering along a ray of the camera
+MAX_GROWTH = 1.0  # upper limit of t (K - 1), the logarithm of the transform relative to exp(-a d)
+WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture
+#: Lengths of the path at which kernels are computed [m]; between them, values per scattered light are interpolated.
+NODES_M = tuple(np.geomspace(0.05, 30.0, 22).tolist())
+#: Standard deviations of the Gaussians of the kernel of a lamp [rad].
+LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
+
+
+class Absorbed(NamedTuple):
+    """One band of the water: absorption a and scattering b [1/m], and its molecules and particles."""
+
+    absorption_per_m: float
+    scattering_per_m: float
+    scatterer: Scatterer
+
+
+@cache
+def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
+    """Returns the kernel of scattered light of a lamp, relative to exp(-a d): weights (n, m) of Gaussians.
+
+    Args:
+        water: one band of the water.
+        distances_m: (n,) distances from the lamp.
+        receiver: what the light arrives at.
+
+    Returns:
+        Weights of normalised Gaussians in the angle at the lamp, of the widths `LAMP_SIGMA_RAD`.
+    """
+    rings = _rings(np.pi)
+    once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
+    return _mixtures(once, rings, water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
+
+
+@cache
+def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
+    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r): weights (n, m).
+
+    Args:
+        water: one band of the water.
+        ranges_m: (n,) ranges of the floor.
+        sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
+    """
+    once = np.array([_camera_rings(water, r) for r in ranges_m])
+    return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
+
+
+def ring_shares(edges: Array, sigmas: Array) -> Array:
+    """Returns the share (n, m) of each normalised Gaussian of width `sigmas` (m,) in the rings between n + 1 edges."""
+    beyond = np.exp(-(edges[:, None] ** 2) / (2 * sigmas**2))
+    return beyond[:-1] - beyond[1:]
+
+
+def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
+    """Returns values (..., m) at path lengths (m,), interpolated from `share` (..., nodes) at `NODES_M`.
+
+    The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d).
+    """
+    of_scattered = share / -np.expm1(-scattering_per_m * np.array(NODES_M))
+    at = np.interp(np.log(np.maximum(path_m, 1e-9)), np.log(NODES_M), np.arange(len(NODES_M)))
+    low = np.minimum(at.astype(int), len(NODES_M) - 2)
+    part = at - low
+    found = of_scattered[..., low] * (1 - part) + of_scattered[..., low + 1] * part
+    return found * -np.expm1(-scattering_per_m * path_m)
+
+
+@cache
+def _rings(most: float) -> Array:
+    """Returns the edges (ANGLES + 1,) of the rings from 0 to `most`, even in their logarithm."""
+    return np.concatenate([[0.0], np.geomspace(LEAST_RAD, most, ANGLES)])
+
+
+def _middle(edges: Array) -> Array:
+    """Returns the geometric mean of each pair of neighbouring edges; half of the first edge that is not 0."""
+    return np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
+
+
+@cache
+def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
+    """Returns response times width of the cell of beta, and relative excess path, each (ANGLES, ANGLES) for t, beta."""
+    edges = _rings(np.pi)
+    t = _middle(edges)[:, None]
+    inside = np.clip(t - edges[:-1], 0.0, np.diff(edges))  # the part of each cell of beta that is below t
+    beta = np.minimum(edges[:-1] + inside / 2, t)
+    alpha = t - beta
+    excess = (np.sin(beta) + np.sin(alpha)) / np.maximum(np.sin(t), 1e-12) - 1
+    response = np.maximum(np.cos(alpha), 0.0) if receiver == "floor" else np.ones_like(alpha)
+    return response * inside, np.maximum(excess, 0.0)
+
+
+def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array:
+    """Returns the light scattered once in each ring of the angle at the lamp, divided by b d exp(-a d)."""
+    width, excess = _lamp_geometry(receiver)
+    edges = _rings(np.pi)
+    density = phase_at((water.scatterer,), np.cos(_middle(edges)))[:, 0] * np.diff(edges)
+    return 2 * np.pi * density @ (width * np.exp(-water.absorption_per_m * distance_m * excess))
+
+
+@cache
+def _camera_geometry() -> tuple[Array, Array, Array]:
+    """Returns ring of tan(beta) and relative excess path, each (STEPS, ANGLES) for u and t, and solid angles of t."""
+    edges = _rings(np.pi / 2 * 0.999)
+    t = _middle(edges)
+    u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
+    tangent = (1 - u) * np.tan(t)
+    excess = u + (1 - u) / np.cos(t) - np.sqrt(1 + tangent**2)
+    ring = np.minimum(np.searchsorted(_rings(MOST_TAN), tangent, side="right") - 1, ANGLES - 1)
+    solid = 4 * np.pi * np.diff(np.sin(edges / 2) ** 2)
+    return ring, excess, solid
+
+
+def _camera_rings(water: Absorbed, range_m: float) -> Array:
+    """Returns the light scattered once in each ring of tan(beta), divided by b r exp(-a r)."""
+    ring, excess, solid = _camera_geometry()
+    density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
+    light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)
+    return np.asarray(np.bincount(ring.ravel(), light.ravel(), ANGLES), np.float64)
+
+
+def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Array:
+    """Returns the weights (n, m) of the Gaussians for light that is scattered at least once.
+
+    The transform of that light, exp(-t) (exp(t K) - 1), is fitted by Gaussians with weights of 0 or more.
+
+    Args:
+        once: (n, rings) light scattered once in each ring, per optical thickness of scattering.
+        edges: (rings + 1,) edges of the rings.
+        thickness: (n,) optical thickness of scattering t.
+        sigmas: (m,) standard deviations of the Gaussians.
+    """
+    k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
+    transform = once @ _ring_transforms(k, edges).T
+    t = thickness[:, None]
+    # exp(-t) (exp(t K) - 1); without the limit, light near a lamp would grow without bound in very turbid water,
+    wanted = np.exp(np.minimum(t * (transform - 1), MAX_GROWTH)) * -np.expm1(-t * transform)
+    basis = np.exp(-(k[:, None] ** 2) * sigmas**2 / 2)
+    basis[0] *= WEIGHT_OF_TOTAL
+    return np.array([_fit(basis, row) for row in wanted])
+
+
+def _fit(basis: Array, wanted: Array) -> Array:
+    """Returns the weights of 0 or more that fit one transform; the first row of `basis` is weighted."""
+    total = wanted[0]
+    if total <= 0:
+        return np.zeros(basis.shape[1])
+    rows = wanted / total
+    rows[0] *= WEIGHT_OF_TOTAL
+    return nnls(basis, rows, maxiter=100 * basis.shape[1])[0] * total
+
+
+def _frequencies(least: float, most: float) -> Array:
+    """Returns the frequencies of the fit: 0, where a transform is the integral, and those of the range of widths."""
+    return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
+
+
+def _ring_transforms(k: Array, edges: Array) -> Array:
+    """Returns the Hankel transforms (n, rings) of uniform rings, each with the integral 1."""
+    at = np.where(k[:, None] > 0, edges * j1(k[:, None] * edges) / np.maximum(k[:, None], 1e-12), edges**2 / 2)
+    return 2 * np.diff(at, axis=1) / np.diff(edges**2)

@@ -1,0 +1,92 @@
+"""Sun and sky above a level water surface: refracted direction of the sun, and radiance of the sky under water.
+
+A ray from the zenith angle t in air continues under water at the angle w with sin t = n sin w (Snell). The whole sky
+therefore appears within a cone around the zenith whose half angle is the critical angle of 48 deg (Snell's window). A
+sky of uniform radiance L appears in it with the radiance n^2 T(t) L, T being the Fresnel transmittance for unpolarised
+light (Mobley 1994, section 4.2; the n^2 law of radiance).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+WATER_INDEX = 1.34  # refractive index of sea water in visible light
+CRITICAL_COSINE = float(np.sqrt(1 - 1 / WATER_INDEX**2))  # cosine of the edge of the cone in which the sky appears
+
+
+class SunSky(NamedTuple):
+    """Daylight just below the surface, for an illuminance of 1 lx on the horizontal plane.
+
+    Args:
+        to_sun: (3,) unit direction to the refracted sun, east, north, up.
+        sky_share: share of the illuminance that is light of the sky; the rest is the beam of the sun.
+    """
+
+    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    sky_share: float = 0.0
+
+    @property
+    def sun_cosine(self) -> float:
+        """Cosine of the refracted sun's zenith angle, mu0."""
+        return self.to_sun[2]
+
+    @property
+    def beam_lx(self) -> float:
+        """Illuminance by the beam on a plane that faces the refracted sun [lx]."""
+        return (1 - self.sky_share) / self.sun_cosine
+
+    @property
+    def mean_cosine(self) -> float:
+        """Mean cosine of the zenith angle of all light just below the surface: illuminance / scalar illuminance."""
+        return 1 / (self.beam_lx + self.sky_share * _SKY_SCALAR)
+
+
+def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
+    """Returns the unit direction (east, north, up) to the sun as it appears under water.
+
+    Args:
+        elevation_deg: elevation of the sun above the horizon, in air.
+        azimuth_deg: direction to the sun, counter-clockwise from x (east).
+    """
+    sine = np.cos(np.deg2rad(elevation_deg)) / WATER_INDEX if elevation_deg < 90 else 0.0
+    east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))
+    return float(east), float(north), float(np.sqrt(1 - sine**2))
+
+
+def sky_radiance(cosine: Array) -> Array:
+    """Returns the radiance [cd/m2] under water of a uniform sky that causes 1 lx just below the surface.
+
+    Args:
+        cosine: cosine of the zenith angle under water, of any shape; the sky is dark beyond the critical angle.
+    """
+    return _transmitted(cosine) / _SKY_LX
+
+
+def _transmitted(cosine: Array) -> Array:
+    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water; 0 beyond the cone."""
+    under = np.asarray(cosine, np.float64)
+    above = np.sqrt(np.maximum(1 - WATER_INDEX**2 * (1 - under**2), 0.0))
+    inside = (under > 0) & (above > 0)
+    under = np.where(inside, under, 1.0)
+    across = (above - WATER_INDEX * under) / (above + WATER_INDEX * under)
+    along = (WATER_INDEX * above - under) / (WATER_INDEX * above + under)
+    return np.where(inside, 1 - (across**2 + along**2) / 2, 0.0)
+
+
+def _sky_moments() -> tuple[float, float]:
+    """Returns the illuminance [lx] by a sky of transmitted radiance T, and the scalar illuminance per lx."""
+    # nodes are even in the cosine in air squared, which removes the root at the edge of the cone
+    x, w = np.polynomial.legendre.leggauss(64)
+    above = (x + 1) / 2
+    under = np.sqrt(1 - (1 - above**2) / WATER_INDEX**2)
+    # 2 pi under d(under) = 2 pi above d(above) / n^2
+    light = _transmitted(under) * np.pi * w * above / WATER_INDEX**2
+    return float(light.sum()), float((light / under).sum() / light.sum())
+
+
+_SKY_LX, _SKY_SCALAR = _sky_moments()

@@ -1,0 +1,94 @@
+"""Wind waves: the unified spectrum of Elfouhaily et al. (1997), from the longest gravity waves to capillary waves.
+
+Elfouhaily, Chapron, Katsaros & Vandemark (1997, J. Geophys. Res. 102, 15781). The elevation of the surface has the
+spectrum S(k) = B(k) / k^3, with B the curvature spectrum; the slopes have the variance (mean square slope, mss)
+int k^2 S dk = int B / k dk. Waves with the wave number k are spread over directions phi from the wind with the density
+(1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed (inverse wave age 0.84).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+GRAVITY_MPS2 = 9.81
+#: Wave number [rad/m] and phase speed [m/s] of the slowest waves; shorter waves are capillary waves.
+SLOWEST_RAD_PER_M, SLOWEST_MPS = 370.0, 0.23
+INVERSE_WAVE_AGE = 0.84  # of a fully developed sea
+_PEAK_ENHANCEMENT, _PEAK_WIDTH = 1.7, 0.08 * (1 + 4 / INVERSE_WAVE_AGE**3)  # JONSWAP
+_SHORTEST_RAD_PER_M = 2e4  # the spectrum of shorter waves is negligible
+
+
+def angular_frequency(k: Array) -> Array:
+    """Returns the angular frequency of gravity-capillary waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2).
+
+    Args:
+        k: wave numbers, of any shape [rad/m].
+    """
+    return np.sqrt(GRAVITY_MPS2 * k * (1 + (k / SLOWEST_RAD_PER_M) ** 2))
+
+
+def curvature_spectrum(k: Array, wind_mps: float) -> Array:
+    """Returns the omnidirectional curvature spectrum B(k), without unit (Elfouhaily et al. 1997, eq. 30 to 41).
+
+    Args:
+        k: wave numbers, of any shape, above 0 [rad/m].
+        wind_mps: wind speed 10 m above the sea.
+    """
+    peak = GRAVITY_MPS2 * (INVERSE_WAVE_AGE / wind_mps) ** 2
+    speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
+    ratio = np.sqrt(k / peak)
+    around_peak = np.exp(-1.25 / ratio**4) * _PEAK_ENHANCEMENT ** np.exp(-((ratio - 1) ** 2) / (2 * _PEAK_WIDTH**2))
+    long = 0.006 * np.sqrt(INVERSE_WAVE_AGE) * peak_mps / speed
+    long *= np.exp(-INVERSE_WAVE_AGE / np.sqrt(10) * (ratio - 1))
+    friction = np.log(_friction_mps(wind_mps) / SLOWEST_MPS)
+    short = max(0.01 * (1 + (friction if friction <= 0 else 3 * friction)), 0.0) * SLOWEST_MPS / speed
+    short *= np.exp(-0.25 * (k / SLOWEST_RAD_PER_M - 1) ** 2)
+    return 0.5 * around_peak * (long + short)
+
+
+def directionality(k: Array, wind_mps: float) -> Array:
+    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57).
+
+    Args:
+        k: wave numbers, of any shape, above 0 [rad/m].
+        wind_mps: wind speed 10 m above the sea.
+    """
+    speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
+    short = 0.13 * _friction_mps(wind_mps) / SLOWEST_MPS
+    return np.tanh(np.log(2) / 4 + 4 * (speed / peak_mps) ** 2.5 + short * (SLOWEST_MPS / speed) ** 2.5)
+
+
+def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
+    """Returns the variance of the slope per area of the wave number plane [m^2/rad^2]; 0 at k = 0.
+
+    The integral over the whole plane is the mean square slope. The density is the same for opposite directions.
+
+    Args:
+        kx, ky: components of the wave number along and across the wind, broadcast against each other [rad/m].
+        wind_mps: wind speed 10 m above the sea.
+    """
+    k = np.hypot(kx, ky)
+    k_or_1 = np.where(k > 0, k, 1.0)
+    spread = 1 + directionality(k_or_1, wind_mps) * (kx**2 - ky**2) / k_or_1**2
+    return np.where(k > 0, curvature_spectrum(k_or_1, wind_mps) * spread / (2 * np.pi * k_or_1**2), 0.0)
+
+
+def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[float, float]:
+    """Returns the variance of the slopes along and across the wind due to the waves shorter than a wave length.
+
+    Args:
+        wind_mps: wind speed 10 m above the sea.
+        above_rad_per_m: wave number of the longest wave that counts.
+    """
+    k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
+    per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4
+    along, across = (float(np.trapezoid(per_k * share, k)) for share in (0.5 + quarter, 0.5 - quarter))
+    return along, across
+
+
+def _friction_mps(wind_mps: float) -> float:
+    """Returns the friction velocity of the wind [m/s], with the drag coefficient (0.8 + 0.065 U) 1e-3 (Wu 1982)."""
+    return wind_mps * np.sqrt(1e-3 * (0.8 + 0.065 * wind_mps))

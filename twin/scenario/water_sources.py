@@ -1,0 +1,27 @@
+"""Published tables of absorption and scattering from which a scenario can take its water type."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+WaterSourceName = Literal["solonenko2015", "williamson2022"]
+
+
+class WaterSource(NamedTuple):
+    """A published table of water types.
+
+    Args:
+        citation: authors and year.
+        types: the Jerlov types of the table.
+    """
+
+    citation: str
+    types: tuple[str, ...]
+
+
+WATER_SOURCES: dict[WaterSourceName, WaterSource] = {
+    "solonenko2015": WaterSource(
+        "Solonenko & Mobley 2015", ("I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C")
+    ),
+    "williamson2022": WaterSource("Williamson & Hollins 2022", ("IB", "II", "III", "1C", "3C", "5C")),
+}
