@@ -10,7 +10,7 @@ it. The fine levels are mirrored at the borders of the image.
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import cv2
@@ -151,7 +151,7 @@ def level_sigma_px(level: int) -> float:
     return float(np.sqrt(2 * (4.0**level - 1) / 3))
 
 
-@cache
+@lru_cache(maxsize=64)
 def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
     """Returns the weights (levels + 1, 3, nodes) of the levels at the ranges `NODES_M`."""
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))

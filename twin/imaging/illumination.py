@@ -48,8 +48,9 @@ def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
     The absorption of a band is the effective one over twice the planned altitude, the path to the floor and back, for
-    the spectrum of the lamps, or of daylight if there are no lamps. Daylight itself is attenuated with the effective
-    absorption over the path from the surface to the reference plane.
+    the spectrum of the lamps, or of daylight if there are no lamps; the light field of daylight (`daylight`) uses it,
+    too. The diffuse attenuation Kd, which serves snow and single scattering, has the effective absorption of daylight
+    over the path from the surface to the reference plane.
 
     Raises:
         TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or

@@ -82,11 +82,11 @@ class ImageFormation:
         self._reference_depth_m, self._daylight_on = daylight.reference_depth_m, bool(daylight.surface_lx.any())
         waves = bool(daylight.focused_share)
         self._caustics = Caustics(illumination, scenario.sun.wind_mps, scenario.seed) if waves else None
-        slanted = bool(daylight.surface_lx.any()) and daylight.source.sun_cosine < 1
+        slanted = self._daylight_on and daylight.source.sun_cosine < 1
         to_sun = np.array(daylight.source.to_sun) if slanted else None
         positions_m = [source.position_m for source in sources]
-        shaded = imaging.shadows and floor is not None
-        self._shadows = Shadows(floor, rig, positions_m, to_sun) if shaded and floor is not None else None
+        shaded = floor if imaging.shadows else None
+        self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
         snows = snow.density_per_m3 > 0
         particles = snow, current_mps, rig, water, self._optics.lamp_light, snow_rng
         self._snow = MarineSnow(*particles, defocus_of(scenario, rig)) if snows else None
@@ -107,8 +107,7 @@ class ImageFormation:
     def radiance_without_snow(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
         """Returns the light (H, W, 3) of floor and water [cd/m2]; the arguments are those of `radiance`."""
         floor, surface = self._floor_view(depth, camera, pose), self._water_surface(camera, pose)
-        light = self._optics.radiance(albedo, depth, camera, floor, surface)
-        return light
+        return self._optics.radiance(albedo, depth, camera, floor, surface)
 
     def add_snow(
         self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None

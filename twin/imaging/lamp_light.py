@@ -11,7 +11,7 @@ floor reflects and the water scatters back to it is neglected, and so are the sh
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -43,7 +43,9 @@ class LampLight:
 
     def __init__(self, sources: LightSources, water: Medium):
         self.sources, self._water = sources, water
-        self._tables = [_all_light(beam, water, "particle") for beam in sources.beam] if _scatters(water) else None
+        self._tables = (
+            [_all_light(beam, water, "particle") for beam in sources.beam] if water.scatters_repeatedly else None
+        )
 
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
         """Returns the illuminance of a plane that faces a lamp, (..., 3) [lx], and the unit directions from the lamp.
@@ -92,16 +94,12 @@ def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray
         water: optical properties of the water.
         shadows: return only the scattered light S, which the floor is assumed not to block; else all light.
     """
-    if not (_scatters(water) and len(sources.beam)):
+    if not (water.scatters_repeatedly and len(sources.beam)):
         return None
     of_beam = _softened if shadows else _all_light
     return np.pad([of_beam(beam, water, "floor") for beam in sources.beam], ((0, 0), (0, 0), (0, 0), (0, 1))).astype(
         np.float32
     )
-
-
-def _scatters(water: Medium) -> bool:
-    return water.multiple and bool(water.scattering_per_m.any())
 
 
 def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
@@ -120,7 +118,7 @@ def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
     return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _softened_of(beam: Beam, bands: tuple[Absorbed, ...], receiver: Receiver) -> Array:
     """Same as `_softened`, with hashable arguments for the cache."""
     rings, path_m = _on_rings(beam), _path_m()
@@ -139,7 +137,7 @@ def _path_m() -> Array:
     return RANGE_SCALE_M * x / (1 - x)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _on_rings(beam: Beam) -> Array:
     """Returns the means (SOFT_STEPS + 1, m) of a beam around each direction, weighted with m Gaussians."""
     edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])

@@ -45,6 +45,7 @@ Lit = NDArray[np.uint8]
 
 LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the light of the floor
 ALBEDO_STEP_PX = 16  # spacing of the pixels from whose mean the albedo of the floor around the image is computed
+_NO_BACKSCATTER = np.zeros((0, 0, 0, 4), np.float32)
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
 
@@ -137,7 +138,7 @@ class Optics:
         daylight = illumination.daylight
         self.light_sources = [light_sources_in_camera(rig, lamps, daylight, camera) for camera in (0, 1)]
         self.lamp_light = [LampLight(sources, self._medium) for sources in self.light_sources]
-        scatters = self._medium.multiple and bool(self._medium.scattering_per_m.any())
+        scatters = self._medium.scatters_repeatedly
         sunny = scatters and bool(daylight.surface_lx.any())
         self._veil = DaylightVeil(daylight, self._medium, table_range_m()) if sunny else None
         # computed on demand, as some callers need one camera only
@@ -215,8 +216,8 @@ class Optics:
         grid, plane = self._forward.surroundings, self._forward.plane(depth)
         light = np.empty((*grid.shape, 3), np.float32)
         mean = albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX].mean((0, 1)).round().astype(np.uint8)
-        white = np.broadcast_to(mean, light.shape)
-        self._run(white, plane, camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
+        uniform = np.broadcast_to(mean, light.shape)
+        self._run(uniform, plane, camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
         return light, place_of(plane * self._forward.range_per_depth)
 
     def _floor_and_backscatter(
@@ -237,21 +238,29 @@ class Optics:
         out: _Output,
         focal_px: float | None = None,
     ) -> None:
-        """Fills `out` by `shading.shade`; `focal_px` is the focal length of the image, None = that of the rig."""
+        """Fills `out` by `shading.shade`.
+
+        With a `focal_px`, the image is that of the surroundings, which has this focal length and no backscatter.
+        """
         sources, focal = self.light_sources[camera], np.float32(focal_px or self._rig.focal_px)
         above = self._calm_surface if surface is None else surface
         sky = _sky(self._floor_daylight, self._medium, above)
         lamps = np.column_stack([sources.position_m, sources.axis, sources.intensity_cd, sources.colour])
-        lamps, (beams, all_light, scattered, transmission, backscatter) = (
-            lamps.astype(np.float32), self._tables_of(camera)
-        )  # fmt: skip
-        if self._veil is not None:
-            rays = grid_rays(self._rig, grid_of(sources.beam)) @ _world_axes(above)
-            backscatter = backscatter + _with_a_zero(self._veil.radiance(rays, float(above.from_camera[2, 3])))
+        lamps, tables = lamps.astype(np.float32), self._tables_of(camera)
+        backscatter = _NO_BACKSCATTER if focal_px else self._backscatter(camera, above)
         seen = FloorView() if floor is None else floor
-        soft = all_light if seen.lit is None and seen.material is None else scattered
-        scene = np.ascontiguousarray(albedo), depth, focal, lamps, beams, soft, transmission, backscatter, sky
+        soft = tables.all_light if seen.lit is None and seen.material is None else tables.scattered
+        light = lamps, tables.beams, soft, tables.transmission, backscatter, sky
+        scene = np.ascontiguousarray(albedo), depth, focal, *light
         in_row_bands(lambda first, end: shade(*scene, *seen, *out, first, end), len(depth))
+
+    def _backscatter(self, camera: int, surface: WaterSurface) -> NDArray[np.float32]:
+        """Returns the backscatter of lamps and daylight, see `_Tables.backscatter`."""
+        of_lamps = self._tables_of(camera).backscatter
+        if self._veil is None:
+            return of_lamps
+        rays = grid_rays(self._rig, grid_of(self.light_sources[camera].beam)) @ _world_axes(surface)
+        return of_lamps + _with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:

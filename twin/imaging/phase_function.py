@@ -7,7 +7,7 @@ the sphere. `tabulate` returns a table of it, for fast evaluation and random sam
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -196,7 +196,7 @@ def phase_of(scatterer: Scatterer) -> PhaseFunction:
     return mixture(particles, scatterer.molecular_share)
 
 
-@cache
+@lru_cache(maxsize=64)
 def table_of(scatterer: Scatterer) -> PhaseTable:
     """Returns the table of the phase function of the molecules and particles of one band."""
     return tabulate(phase_of(scatterer))
@@ -215,7 +215,7 @@ def phase_at(scatterers: tuple[Scatterer, ...], cosine: Array) -> Array:
     return low + (at - cell)[..., None] * (table[cell + 1] - low)
 
 
-@cache
+@lru_cache(maxsize=64)
 def _densities(scatterers: tuple[Scatterer, ...]) -> Array:
     """Returns the densities (cells, n) of the tables of n scatterers."""
     return np.stack([table_of(scatterer).density_per_sr for scatterer in scatterers], axis=-1)

@@ -22,7 +22,7 @@ meets the floor at tan(beta) = (1 - u) tan(t); its weight is p(t) sin(t), reduce
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -55,7 +55,7 @@ class Absorbed(NamedTuple):
     scatterer: Scatterer
 
 
-@cache
+@lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
 def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
     """Returns the kernel of scattered light of a lamp, relative to exp(-a d): weights (n, m) of Gaussians.
 
@@ -72,7 +72,7 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
     return _mixtures(once, rings, water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
 
 
-@cache
+@lru_cache(maxsize=64)
 def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
     """Returns the kernel of light scattered between floor and camera, relative to exp(-a r): weights (n, m).
 
@@ -171,7 +171,7 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
     k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
     transform = once @ _ring_transforms(k, edges).T
     t = thickness[:, None]
-    # exp(-t) (exp(t K) - 1); without the limit, light near a lamp would grow without bound in very turbid water,
+    # exp(-t) (exp(t K) - 1); without the limit, light near a lamp would grow without bound in very turbid water
     wanted = np.exp(np.minimum(t * (transform - 1), MAX_GROWTH)) * -np.expm1(-t * transform)
     basis = np.exp(-(k[:, None] ** 2) * sigmas**2 / 2)
     basis[0] *= WEIGHT_OF_TOTAL

@@ -50,6 +50,11 @@ class Medium(NamedTuple):
         return self.absorption_per_m if self.multiple else self.attenuation_per_m
 
     @property
+    def scatters_repeatedly(self) -> bool:
+        """Whether the water scatters, and multiple scattering is modelled."""
+        return self.multiple and bool(self.scattering_per_m.any())
+
+    @property
     def bands(self) -> tuple[Absorbed, ...]:
         """Properties of each band, as hashable records."""
         rows = zip(self.absorption_per_m.tolist(), self.scattering_per_m.tolist(), self.scatterers, strict=True)
