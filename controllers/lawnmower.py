@@ -72,7 +72,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
 
 
 def _leg_extents(area: SurveyArea, spacing_m: float, n_legs: int) -> list[tuple[float, float]]:
-    """Returns for each leg the least and the greatest u [m] of the area within the leg's strip."""
+    """Returns the extent of the area within the strip of each leg: least and greatest coordinate along the leg [m]."""
     south_m = -area.size_m[1] / 2
     return [area.extent_between(south_m + k * spacing_m, south_m + (k + 1) * spacing_m) for k in range(n_legs)]
 

@@ -76,7 +76,10 @@ class SurveyArea:
         return np.column_stack(self.to_scene(u, v))
 
     def extent_between(self, low_m: float, high_m: float) -> tuple[float, float]:
-        """Returns the least and the greatest u [m] of a rectangle or polygon where `low_m` <= v <= `high_m`."""
+        """Returns the least and the greatest u [m] of the part of a rectangle or polygon with `low_m` <= v <= `high_m`.
+
+        u is the coordinate along the legs, v the one to the left of them.
+        """
         corners = self._corners()
         found = [u for a, b in pairwise([*corners, corners[0]]) for u in _clipped(a, b, low_m, high_m)]
         return min(found), max(found)
@@ -127,7 +130,10 @@ def _cos_sin(angle: float) -> tuple[float, float]:
 
 
 def _clipped(a: Corner, b: Corner, low_m: float, high_m: float) -> list[float]:
-    """Clips the edge from a to b to `low_m` <= v <= `high_m`; returns u of both ends, or [] if it lies outside."""
+    """Clips the edge from a to b to `low_m` <= v <= `high_m`; returns u [m] of both ends of the clipped edge.
+
+    Corners are pairs (u, v); for u and v see `extent_between`. Returns [] if the edge lies outside.
+    """
     (ua, va), (ub, vb) = a, b
     if max(va, vb) < low_m or min(va, vb) > high_m:
         return []

@@ -3,5 +3,6 @@
 from terrains.generate import generate
 from terrains.load import load
 from terrains.terrain import Terrain
+from terrains.textures import TextureSource
 
-__all__ = ["Terrain", "generate", "load"]
+__all__ = ["Terrain", "TextureSource", "generate", "load"]

@@ -11,6 +11,7 @@ from twin.errors import TwinError
 HEIGHT_FIELD = "terrain.height_file"
 HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"
 TEXTURE_FIELD = "terrain.texture_file"
+ORTHOPHOTO_FIELD = "terrain.orthophoto_file"
 
 
 def check_height_count(cols: int, rows: int, file: Path) -> None:
@@ -19,10 +20,10 @@ def check_height_count(cols: int, rows: int, file: Path) -> None:
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} has {cols} x {rows} heights", f"at most {MAX_NODES} heights")
 
 
-def check_texel_count(cols: int, rows: int, file: Path) -> None:
-    """Raises TwinError if a texture image has more than MAX_TEXELS pixels."""
+def check_texel_count(cols: int, rows: int, file: Path, field: str = TEXTURE_FIELD) -> None:
+    """Raises TwinError, naming the key `field`, if a texture image has more than MAX_TEXELS pixels."""
     if cols * rows > MAX_TEXELS:
-        raise TwinError(TEXTURE_FIELD, f"{file.name!r} has {cols} x {rows} pixels", f"at most {MAX_TEXELS} pixels")
+        raise TwinError(field, f"{file.name!r} has {cols} x {rows} pixels", f"at most {MAX_TEXELS} pixels")
 
 
 def image_size(file: Path) -> tuple[int, int] | None:

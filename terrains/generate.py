@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.ground_cover import DEFAULT_COVERS
 from terrains.noise import fractal_field
 from terrains.terrain import Terrain, texture_shape
-from terrains.textures import generate_texture
+from terrains.textures import TextureSource, generate_texture
 from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
@@ -23,7 +24,7 @@ def generate(
     relief_m: float,
     base_m: float,
     grid_m: float,
-    texture_px_m: float,
+    texture: TextureSource,
     seed: int | np.random.SeedSequence,
 ) -> Terrain:
     """Generates a terrain centred at the origin, with heights from base_m to base_m + relief_m.
@@ -36,7 +37,7 @@ def generate(
         relief_m: difference between the greatest and the least height.
         base_m: least height.
         grid_m: distance between grid nodes.
-        texture_px_m: side of a texel.
+        texture: side of a texel and cover of the floor; its files are not used.
         seed: seed of the heights and the texture.
     Raises:
         TwinError: the kind is unknown, or the terrain is too large for memory.
@@ -44,13 +45,13 @@ def generate(
     if kind not in KINDS:
         raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
-    shape = texture_shape((ny, nx), grid_m, texture_px_m)
+    shape = texture_shape((ny, nx), grid_m, texture.texel_m(((nx - 1) * grid_m, (ny - 1) * grid_m)))
     shape_rng, texture_rng = np.random.default_rng(seed).spawn(2)
     heights = KINDS[kind] if relief_m > 0 else _flat
     height_m = scale_to_relief(heights((ny, nx), grid_m, relief_m, shape_rng), relief_m, base_m)
     texel_m = (nx - 1) * grid_m / shape[1]
-    texture = generate_texture(kind, height_m, shape, texel_m, texture_rng)
-    return Terrain(height_m, grid_m, -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2, texture, texel_m)
+    texels = generate_texture(texture.cover or DEFAULT_COVERS[kind], height_m, shape, texel_m, texture_rng)
+    return Terrain(height_m, grid_m, -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2, texels, texel_m)
 
 
 def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:

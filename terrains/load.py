@@ -1,4 +1,4 @@
-"""Terrains from files: heights from GeoTIFF, 16-bit PNG or .npy, texture from any image."""
+"""Terrains from files: heights from GeoTIFF, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
+from terrains.ground_cover import DEFAULT_COVERS
 from terrains.terrain import Terrain, texture_shape
-from terrains.textures import generate_texture, read_image, tile_image
+from terrains.textures import TextureSource, generate_texture, texture_from_photo
 from terrains.vertical import Direction, VerticalAxis, upward_sign
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
@@ -37,8 +38,7 @@ class HeightGrid(NamedTuple):
 
 def load(
     height_file: str | Path,
-    texture_file: str | Path | None,
-    texture_px_m: float,
+    texture: TextureSource,
     height_spacing_m: float,
     height_range_m: float,
     seed: int | np.random.SeedSequence,
@@ -49,8 +49,7 @@ def load(
     Args:
         height_file: heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain is one
             cell smaller than the raster in both directions.
-        texture_file: image that is repeated as tiles; None: the texture is generated.
-        texture_px_m: side of a texel on the floor, and of a pixel of the texture image.
+        texture: source of the texture.
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.
         seed: seed of the texture if it is generated.
@@ -66,14 +65,22 @@ def load(
     georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
     ny, nx = height_m.shape
     extent_m = ((nx - 1) * spacing_m, (ny - 1) * spacing_m)
-    shape = texture_shape((ny, nx), spacing_m, texture_px_m)
+    shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m))
     texel_m = extent_m[0] / shape[1]
-    if texture_file is not None:
-        texture = tile_image(read_image(Path(texture_file)), texture_px_m, shape, extent_m)
+    if texture.photo_file is not None:
+        texels = texture_from_photo(texture, shape, extent_m)
     else:
-        texture = generate_texture("file", height_m, shape, texel_m, np.random.default_rng(seed))
+        texels = generate_texture(
+            texture.cover or DEFAULT_COVERS["file"], height_m, shape, texel_m, np.random.default_rng(seed)
+        )
+    share = None
+    if texture.orthophoto_file is not None:
+        # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
+        from terrains.orthophoto import lay_orthophoto
+
+        share = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
-    return Terrain(height_m, spacing_m, west_m, south_m, texture, texel_m, n_filled, georeference)
+    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share)
 
 
 def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightGrid:

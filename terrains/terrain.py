@@ -28,6 +28,7 @@ class Terrain:
         texture_px_m: side of a texel.
         n_filled: number of nodes without a height in the source, filled with the nearest height.
         georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
+        orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.
     """
 
     height_m: NDArray[np.float32]
@@ -38,6 +39,7 @@ class Terrain:
     texture_px_m: float
     n_filled: int = 0
     georeference: Georeference | None = None
+    orthophoto_share: float | None = None
 
     @property
     def size_m(self) -> tuple[float, float]:

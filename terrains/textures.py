@@ -1,46 +1,62 @@
-"""Seafloor textures: generated sand, rock and coral, or an image repeated as tiles."""
+"""Seafloor textures: generated sand, rock and coral, or made from a photo."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from terrains.file_header import TEXTURE_FIELD, check_texel_count, image_size
+from terrains.ground_cover import paint
 from terrains.noise import fractal_field, pink_noise
+from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.errors import TwinError
 
-#: Albedo of each material as 8-bit RGB: dark, medium and bright tone.
-SAND = ((104, 92, 70), (176, 161, 130), (236, 226, 204))
-DETRITUS = ((62, 52, 38), (122, 107, 82), (190, 176, 148))
-ROCK = ((32, 34, 32), (98, 98, 90), (178, 174, 160))
-ALGAE = ((30, 40, 24), (92, 98, 66), (166, 164, 118))
-CORAL = ((78, 42, 44), (160, 98, 84), (238, 196, 172))
+COARSEN_TEXELS = 40_000_000
+_QUILT_SEED = 1  #: a floor from files is the same for every seed of a survey
 
-#: Four materials of each kind of floor, ordered from low and flat to high and steep ground.
-MATERIALS = {
-    "flat": (SAND, SAND, SAND, DETRITUS),
-    "ripples": (DETRITUS, SAND, SAND, SAND),
-    "fractal": (SAND, DETRITUS, ROCK, ALGAE),
-    "reef": (SAND, ALGAE, ROCK, CORAL),
-    "cliffs": (SAND, ALGAE, ROCK, CORAL),
-    "file": (SAND, ALGAE, ROCK, CORAL),
-}
-LEVELS = 256 // 4  #: tones per material in the palette
+
+@dataclass(frozen=True)
+class TextureSource:
+    """Source of the texture of a floor.
+
+    Args:
+        px_m: side of a texel on the floor, and of a pixel of the photo.
+        photo_file: photo of a piece of floor; None: the texture is generated.
+        tiling: "stochastic": the texture is made of pieces of the photo without visible repetition, after slow
+            variations of its brightness are removed; "repeat": the photo is repeated unchanged.
+        orthophoto_file: GeoTIFF that replaces the texture wherever it has valid pixels; None: no orthophoto.
+        cover: materials of a generated texture, a key of `ground_cover.COVERS`; None: those of the kind of floor.
+        coarsen: whether texels of a large floor are larger than px_m, so that there are not more than COARSEN_TEXELS.
+    """
+
+    px_m: float
+    photo_file: str | Path | None = None
+    tiling: Literal["stochastic", "repeat"] = "stochastic"
+    orthophoto_file: str | Path | None = None
+    cover: str | None = None
+    coarsen: bool = False
+
+    def texel_m(self, size_m: tuple[float, float]) -> float:
+        """Returns the side of the texels of a floor of the given extent along x and y [m]."""
+        least_m = float(np.sqrt(size_m[0] * size_m[1] / COARSEN_TEXELS))
+        return max(self.px_m, least_m) if self.coarsen else self.px_m
 
 
 def generate_texture(
-    kind: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
+    cover: str, height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """Generates the texture of a height grid.
 
-    The palette has four materials with 64 tones each. Height, slope and noise determine the material of a texel; pink
-    noise down to single texels determines its tone.
+    Height, slope and noise determine the material of a texel; the structure of the material and pink noise down to
+    single texels determine its tone.
 
     Args:
-        kind: kind of floor, a key of MATERIALS.
+        cover: a key of `ground_cover.COVERS`.
         height_m: (ny, nx) heights, row 0 = south.
         shape: (rows, cols) of the texture.
         texel_m: side of a texel.
@@ -51,10 +67,7 @@ def generate_texture(
     octaves = int(np.clip(np.log2(max(shape)), 3, 11))
     tone = pink_noise(shape, octaves, 20.0, rng)
     material = _material_level(height_m, shape, texel_m, rng)
-    index = cv2.addWeighted(material, 1.0, tone, 0.34, -0.34 * 128)
-    index = cv2.LUT(index, (np.arange(256) // LEVELS * LEVELS).astype(np.uint8))
-    tone = cv2.LUT(tone, (np.arange(256) * LEVELS // 256).astype(np.uint8))
-    return _colour(cv2.add(index, tone, dst=index), _palette(MATERIALS[kind]))
+    return paint(material, tone, texel_m, cover, rng)
 
 
 def _material_level(
@@ -76,18 +89,6 @@ def _material_level(
     return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def _palette(materials: tuple[tuple[tuple[int, int, int], ...], ...]) -> NDArray[np.uint8]:
-    """Returns the palette (256, 3) uint8 RGB: 64 tones of each material, from dark to bright."""
-    knots, tones = [0, LEVELS / 2, LEVELS], np.arange(LEVELS) + 0.5
-    ramps = [np.stack([np.interp(tones, knots, c) for c in zip(*m, strict=True)], axis=1) for m in materials]
-    return np.rint(np.concatenate(ramps)).astype(np.uint8)
-
-
-def _colour(index: cv2.typing.MatLike, palette: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Returns the palette colours (rows, cols, 3) of an index image."""
-    return np.asarray(cv2.merge([cv2.LUT(index, np.ascontiguousarray(palette[:, k])) for k in range(3)]), np.uint8)
-
-
 def read_image(file: Path) -> NDArray[np.uint8]:
     """Reads an image file as (rows, cols, 3) uint8 RGB.
 
@@ -105,6 +106,25 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     if image is None:
         raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
     return np.asarray(image, dtype=np.uint8)
+
+
+def texture_from_photo(
+    source: TextureSource, shape: tuple[int, int], extent_m: tuple[float, float]
+) -> NDArray[np.uint8]:
+    """Returns the texture (rows, cols, 3) of a floor, made from a photo of a part of it; small photos are repeated.
+
+    Args:
+        source: source of the texture, with a photo.
+        shape: (rows, cols) of the texture.
+        extent_m: extent of the texture along x and y.
+    Raises:
+        TwinError: the photo is missing, not an image or too large.
+    """
+    assert source.photo_file is not None
+    photo = read_image(Path(source.photo_file))
+    if source.tiling == "repeat" or min(photo.shape[:2]) < BLOCK_FRACTION * MIN_BLOCK_PX:
+        return tile_image(photo, source.px_m, shape, extent_m)
+    return quilt(even_lighting(photo), shape, np.random.default_rng(_QUILT_SEED))
 
 
 def tile_image(

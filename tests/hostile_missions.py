@@ -49,7 +49,12 @@ HOSTILE = {
     "lamps of 1 cd, physical sensor": (lamps(1), "sensor.read_noise_e=2.4"),
     "no light": ("lamps=[]", "sun.illuminance_lx=0.001", "sensor.read_noise_e=2.4"),
     **{
-        f"{name} floor": (*FLOOR_FILE, f"terrain.texture_file={{folder}}/{name}.png", "terrain.texture_px_m=0.002")
+        f"{name} floor": (
+            *FLOOR_FILE,
+            f"terrain.texture_file={{folder}}/{name}.png",
+            "terrain.texture_px_m=0.002",
+            "terrain.texture_tiling=repeat",
+        )
         for name in ("constant", "black", "white", "stripes", "dots", "chequerboard", "faint")
     },
     "strong caustics": (*SUN, "sun.caustics=1.0"),

@@ -11,6 +11,7 @@ from twin.app import plan_summary
 from twin.app.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
+from twin.surrogate.error_model import ScatterLaw
 from twin.world.mission import prepare
 
 SMALL = ["terrain.texture_px_m=0.02", "plan.tracks=1", "plan.area_m=[2.0, 1.6]"]
@@ -53,9 +54,10 @@ def test_requirements_that_cannot_be_predicted_are_left_out():
 
 
 def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2_over_f_b(tmp_path):
-    """With an error model in which further keyframes add nothing: those depend on their distance in baselines."""
+    """The error model has no scatter over cells, and further keyframes, which depend on the baseline, add nothing."""
     fitted = error_model_file.load()
-    model = fitted.model._replace(depth_error=fitted.model.depth_error._replace(gain=0.0))
+    gainless = fitted.model.depth_error._replace(gain=0.0)
+    model = fitted.model._replace(depth_error=gainless, depth_cell_scatter=ScatterLaw(0.0, 1.0))
     error_model_file.save(replace(fitted, model=model), tmp_path / "one.toml")
     flat = (
         "terrain.kind=flat",

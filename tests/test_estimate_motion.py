@@ -175,3 +175,31 @@ def test_eq_2_is_biased_by_noise_of_depth_and_joint_estimation_is_not():
         exact_depth.append(first.a_from_b[0, 3] - 0.4)
         joint.append(second.a_from_b[0, 3] - 0.4)
     assert abs(np.mean(joint)) < 0.5 * abs(np.mean(exact_depth))
+
+
+def test_an_offset_of_all_disparities_is_estimated_from_the_motions_of_near_and_far_points():
+    """Its error agrees with its standard deviation: the mean of 60 squared ratios has a standard error of 0.18."""
+    rng, offset, ratios, estimates = np.random.default_rng(8), 2e-3, [], []
+    sigma = np.array([2e-4, 2e-4, 3e-4])
+    true = geometry.exp(np.array([0.01, -0.02, 0.05, 0.25, -0.1, 0.03]))
+    for _ in range(60):
+        a, b = measure(floor_points(rng, 300), true)
+        shift = np.array([0, 0, offset])
+        noisy = [z + shift + sigma * rng.normal(size=z.shape) for z in (a, b)]
+        found = pair_motion(*noisy, sigma, true).disparity_offset
+        estimates.append(found.estimate)
+        ratios.append((found.estimate - offset) / found.sigma)
+    assert np.mean(estimates) == pytest.approx(offset, rel=0.1)
+    assert np.mean(np.square(ratios)) == pytest.approx(1.0, abs=0.6)
+
+
+def test_over_a_level_floor_the_offset_of_all_disparities_is_unknown():
+    rng, sigma = np.random.default_rng(9), np.full(3, 2e-4)
+    level = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.full(300, 2.0)])
+    true = geometry.exp(np.array([0, 0, 0.05, 0.25, -0.1, 0]))
+    relief = level + np.column_stack([np.zeros((300, 2)), rng.uniform(-0.3, 0.3, 300)])
+    sigmas = []
+    for points in (level, relief):
+        noisy = [z + sigma * rng.normal(size=z.shape) for z in measure(points, true)]
+        sigmas.append(pair_motion(*noisy, sigma, true).disparity_offset.sigma)
+    assert sigmas[0] > 5 * sigmas[1]

@@ -1,10 +1,13 @@
-"""Kalman filter of the pose and velocity of the camera between keyframes."""
+"""Kalman filter of the pose and velocity of the camera between keyframes, and the covariance of its poses."""
 
 import numpy as np
 import pytest
 
 from twin.core import geometry
+from twin.core.records import StereoRig
+from twin.estimate.vision import f2f
 from twin.estimate.vision.motion_filter import MotionFilter
+from twin.estimate.vision.two_view_motion import Motion
 
 INTERVAL_S = 1 / 30
 VELOCITY = np.array([0.0, 0.0, 0.1, 0.3, -0.1, 0.0])
@@ -74,3 +77,69 @@ def test_a_new_reference_keeps_the_velocity_and_has_no_pose_error():
     np.testing.assert_array_equal(motion_filter.pose, np.eye(4))
     np.testing.assert_array_equal(motion_filter.velocity, velocity)
     assert not motion_filter.cov.any()
+
+
+IMAGE = np.zeros((48, 64), np.uint8)
+NO_POINTS = f2f._Reference(IMAGE, np.zeros((0, 2), np.float32), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+
+class MeasuredPoses(f2f.FrameToFrame):
+    """Tracks without images: each pose relative to the reference is measured with an error common to all poses and
+    one of its own, both of standard deviation `sigma`; the first `n_measured` frames are measured."""
+
+    def __init__(self, sigma, seed, n_measured=1000, tracked_share=1.0):
+        super().__init__(StereoRig(64, 48, 55.0, 0.15), 11)
+        self.rng, self.sigma = np.random.default_rng(seed), sigma
+        self.n_measured, self.tracked_share = n_measured, tracked_share
+        self.true = self.true_reference = np.eye(4)
+        self.started = True
+        self._set_reference(NO_POINTS)
+
+    def _set_reference(self, reference):
+        super()._set_reference(reference)
+        self.common, self.true_reference = self.sigma * self.rng.normal(size=6), self.true
+
+    def _locate(self, image, reference, predicted):
+        self.n_measured -= 1
+        if self.n_measured < 0:
+            return None
+        error = self.common + self.sigma * self.rng.normal(size=6)
+        measured = geometry.inverse(self.true_reference) @ self.true @ geometry.exp(error)
+        motion = Motion(measured, np.eye(6) * 2 * self.sigma**2, 100, 1.0)
+        return f2f._Located(motion, 1.0, self.tracked_share, NO_POINTS)
+
+    def fly(self, n):
+        """Tracks n frames and returns the error (6,) of the pose since the start."""
+        pose = np.eye(4)
+        for _ in range(n):
+            self.true = self.true @ geometry.exp(VELOCITY * INTERVAL_S)
+            pose = pose @ self.step(IMAGE, INTERVAL_S)[0].a_from_b
+        return geometry.log(geometry.inverse(pose) @ self.true)
+
+
+def test_the_covariance_since_the_keyframe_includes_the_error_common_to_all_frames():
+    """A filter averages only errors that change from frame to frame: its own covariance is too small."""
+    nees, claimed = [], []
+    for seed in range(60):
+        tracker = MeasuredPoses(0.02, seed)
+        error = tracker.fly(20)
+        nees.append(error @ np.linalg.solve(tracker.cov_since_keyframe, error))
+        claimed.append(error @ np.linalg.solve(tracker.filter.cov, error))
+    assert 2.5 < np.mean(nees) < 7.5
+    assert np.mean(claimed) > 9
+
+
+def test_the_covariance_since_the_keyframe_is_that_of_one_pose_not_the_sum_over_frames():
+    tracker = MeasuredPoses(0.002, seed=1)
+    tracker.fly(20)
+    np.testing.assert_allclose(tracker.cov_since_keyframe, np.eye(6) * 2 * 0.002**2, atol=1e-9)
+
+
+def test_the_covariance_since_the_keyframe_grows_with_each_reference_and_each_lost_frame():
+    tracker = MeasuredPoses(0.002, seed=1, n_measured=3, tracked_share=0.5)  # every measured frame becomes a reference
+    variances = []
+    for _ in range(6):
+        tracker.fly(1)
+        variances.append(np.trace(tracker.cov_since_keyframe[3:, 3:]))
+    assert variances[2] > 2.9 * variances[0]
+    assert np.all(np.diff(variances) > 0)

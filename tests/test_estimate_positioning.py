@@ -504,6 +504,9 @@ class Script:
     def observe_stereo(self, frame, row):
         return over_flat_floor(row, 0.0, 0.0).points
 
+    def tracking_cov(self):
+        return None if self.row == 0 else np.eye(6) * (0.001 * self.row) ** 2
+
     def restart_tracking(self):
         pass
 
@@ -573,6 +576,12 @@ def test_frame_to_frame_motion_bridges_a_failed_link():
     missing = [node.dvl_displacement is None for node in navigator.network.nodes]
     assert missing == [True, False, False, True, False, False]
     assert result.quality.nodes_bridged == 1
+
+
+def test_the_quality_reports_the_uncertainty_of_frames_relative_to_their_keyframe():
+    """Nodes are every other keyframe; the tracker claims k mm per axis just before keyframe k, 1 to 5."""
+    result = navigated(Script(line(0.3 * np.arange(6))), [1] * 6, node_stride=2).finish()
+    assert result.quality.frame_sigma_m == pytest.approx(np.percentile(np.sqrt(3) * 1e-3 * np.arange(1, 6), 90))
 
 
 def test_only_the_newest_keyframe_keeps_its_points():

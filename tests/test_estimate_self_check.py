@@ -8,8 +8,9 @@ from judge_synthetic import survey
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from twin.core import geometry
-from twin.core.quality import EstimationQuality
+from twin.core.quality import DisparityOffset, EpipolarError, EstimationQuality
 from twin.core.records import StereoObservation, StereoRig
+from twin.estimate.disparity_offset import combine
 from twin.estimate.self_check import check_survey
 from twin.estimate.vision import matching
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
@@ -20,7 +21,7 @@ RIG = StereoRig(320, 240, 277.0, 0.15)
 NOISE_PX = 0.05
 
 
-def matched(rotation, offset_px, seed=0, n=400):
+def matched(rotation, offset_px, seed=0, n=400, noise=1.0, k1=0.0):
     """Returns stereo points of a right camera that is turned by a rotation vector and whose principal point is off."""
     rng = np.random.default_rng(seed)
     pixels = np.column_stack([rng.uniform(30, 310, n), rng.uniform(10, 230, n)]).round().astype(np.float32)
@@ -28,7 +29,9 @@ def matched(rotation, offset_px, seed=0, n=400):
     left = RIG.normalised(pixels)
     right = np.column_stack([left[:, 0] - disparity, left[:, 1], np.ones(n)])
     turned = right @ geometry.so3_exp(np.asarray(rotation, float))  # directions in the axes of the camera
-    rows = (turned[:, 1] / turned[:, 2] - left[:, 1]) * RIG.focal_px + offset_px + NOISE_PX * rng.standard_normal(n)
+    rows = (turned[:, 1] / turned[:, 2] - left[:, 1]) * RIG.focal_px + offset_px
+    rows += noise * NOISE_PX * rng.standard_normal(n)
+    rows += k1 * left[:, 1] * (np.sum(right[:, :2] ** 2, axis=1) - np.sum(left**2, axis=1)) * RIG.focal_px
     measured = np.column_stack([left, disparity])
     cov = np.tile(np.diag([1.0, 0.5, 2.0]) * (NOISE_PX / RIG.focal_px) ** 2 / 2, (n, 1, 1))
     xyz = np.column_stack([left, np.ones(n)]) * (RIG.baseline_m / disparity)[:, None]
@@ -60,6 +63,22 @@ def test_nothing_is_removed_from_a_rectified_pair():
     image = np.random.default_rng(1).integers(0, 255, (240, 320, 3)).astype(np.uint8)
     assert not calibration.update(RIG)
     assert calibration.rectify(image, RIG) is image
+
+
+def pattern_px(noise, k1, n_pairs=25):
+    """Returns the systematic row difference [px] of pairs with matching noise and an error k1 of the distortion."""
+    calibration = EpipolarCalibration()
+    for seed in range(n_pairs):
+        calibration.add(matched(np.array([3e-4, -2e-4, 1e-3]), 0.0, seed, noise=noise, k1=k1), RIG, 11)
+    return calibration.report().pattern * RIG.focal_px
+
+
+def test_matching_noise_has_no_pattern_however_large_and_a_distortion_error_has_one():
+    """Noise of eight times the claimed one, 0.4 px, is averaged over 33 points of a region and 25 pairs: 0.014 px."""
+    assert pattern_px(noise=1.0, k1=0.0) < 0.005
+    assert pattern_px(noise=8.0, k1=0.0) < 0.01  # after subtraction of its expectation
+    assert pattern_px(noise=1.0, k1=1.0) > 0.2
+    assert pattern_px(noise=8.0, k1=1.0) > 0.2
 
 
 def test_the_rectified_image_is_the_image_of_a_camera_without_the_error():
@@ -103,6 +122,9 @@ def survey_result():
     return replace(result, node_cov=np.tile(np.eye(6) * 1e-6, (n, 1, 1)), keyframe_depth_m=np.full(n, 2.0))
 
 
+PATTERN = EpipolarError(np.zeros(4), np.full(4, 1e-5), np.zeros(4), 0.2 / 277.0)
+
+
 def quality(**changes):
     return EstimationQuality(links_tried=100, link_residual=1.0, link_chi2=1.0, frame_sigma_m=0.003)._replace(**changes)
 
@@ -117,7 +139,8 @@ def quality(**changes):
         ({"link_residual": 3.0}, {}, "link_residual"),
         ({"frame_sigma_m": 0.05}, {}, "frame_sigma"),
         ({}, {"n_points": 20}, "points"),
-        ({}, {"row_spread_px": 0.2}, "row_spread"),
+        ({"epipolar": PATTERN}, {}, "row_pattern"),
+        ({"disparity_offset": DisparityOffset(-1e-3, 1e-4)}, {}, "disparity_offset"),
         ({}, {"row_offset_px": -0.3}, "row_offset"),
         ({}, {"repetition": 0.9}, "repetition"),
     ],
@@ -134,3 +157,24 @@ def test_an_uncertain_position_is_a_finding():
     result = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION])
     result.node_cov[-1, 3:, 3:] = np.eye(3) * 0.1**2
     assert [finding.check for finding in check_survey(result, RIG)] == ["sigma"]
+
+
+def test_offsets_of_links_that_share_a_node_count_as_one():
+    """Oracle: 40 links from 10 nodes with equal errors per node have the error of 10 independent links."""
+    rng, errors, sigma = np.random.default_rng(3), [], 0.0
+    for _ in range(300):
+        shared = np.repeat(rng.normal(size=10), 4) * 1e-3
+        combined = combine([DisparityOffset(value, 1e-3) for value in shared], 10, 277.0)
+        errors.append(combined.estimate)
+        sigma = combined.sigma
+    assert np.std(errors) == pytest.approx(1e-3 / np.sqrt(10), rel=0.1)
+    assert sigma == pytest.approx(1e-3 / np.sqrt(10), rel=0.4)
+    assert combine([], 10, 277.0) is None
+    assert combine([DisparityOffset(0.02, 0.002)] * 40, 10, 277.0) is None  # 0.55 px: a level floor
+
+
+def test_offsets_that_contradict_each_other_are_uncertain():
+    agreeing = combine([DisparityOffset(2e-3, 1e-3)] * 20, 20, 277.0)
+    contrary = combine([DisparityOffset(2e-3 + 0.02 * (-1) ** k, 1e-3) for k in range(20)], 20, 277.0)
+    assert agreeing.estimate == pytest.approx(contrary.estimate)
+    assert contrary.sigma == pytest.approx(20 * agreeing.sigma)

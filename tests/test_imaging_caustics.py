@@ -13,6 +13,7 @@ from twin.imaging.caustics import CELLS, TILE_DEPTHS, WATER_INDEX, Caustics, sca
 from twin.imaging.illumination import Daylight, Illumination, daylight_at, illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.phase_function import petzold, tabulate
+from twin.imaging.sun_sky import SunSky
 from twin.imaging.water import Medium, medium
 from twin.imaging.waves import GRAVITY_MPS2, slope_variance
 from twin.scenario.model import Scenario, SunConfig, WaterConfig
@@ -39,8 +40,9 @@ def contrast_in_channel(depth_m, wind_mps, direct_share):
     """Coefficient of variation of the irradiance in the Santa Barbara Channel, over the tile and two instants."""
     absorption, scattering = (np.full(3, value) for value in CHANNEL_PER_M)
     dark = np.zeros(3)
-    daylight = Daylight(dark, dark, dark, depth_m, depth_m, direct_share)
-    here = Caustics(Illumination(Medium(absorption, scattering), daylight), wind_mps, 1)
+    water = Medium(absorption, scattering)
+    daylight = Daylight(dark, dark, dark, depth_m, depth_m, direct_share, SunSky(), water, absorption)
+    here = Caustics(Illumination(water, daylight), wind_mps, 1)
     return np.mean([here.pattern(time_s).std() for time_s in (0.0, 5.0)])
 
 

@@ -18,11 +18,20 @@ EFFECTS = (
     "imaging.shadows=true", "water.jerlov=II", "sun.illuminance_lx=50.0",
     "sun.depth_m=8.0", "sun.caustics=0.7",
 )  # fmt: skip
+EVERYTHING = (
+    *LARGE, *EFFECTS, "sensor.bits=12", "snow.density_per_m3=500", 'port.kind="flat"', "lens.k1=-0.1",
+    "sensor.readout_ms=10", "calibration_error.right_yaw_deg=0.05", "lens.diffraction=true",
+    "lens.blur_px=[0.5,0.4,0.6]", "lens.lateral_colour=[0.001,-0.001]", "lens.focus_m=1.5", "snow.junge_exponent=4",
+    'sensor.tone_curve="srgb"', 'sensor.white_balance="grey_world"',
+)  # fmt: skip
+#: Overrides, and the largest processor time relative to rendering: about 1.3 times that measured, 320x240 excepted.
 CASES = {
-    "320x240, default set": ((), 1.0),
+    "320x240, default set": ((), 2.5),
     "640x480, default set": (LARGE, 1.5),
-    "640x480, all but snow and refraction, plain sensor": ((*LARGE, *EFFECTS), 1.5),
-    "640x480, all but snow and refraction, [sensor]": ((*LARGE, *EFFECTS, "sensor.bits=12"), 1.5),
+    "640x480, marine snow": ((*LARGE, "snow.density_per_m3=500"), 1.7),
+    "640x480, all but snow and refraction, plain sensor": ((*LARGE, *EFFECTS), 2.8),
+    "640x480, all but snow and refraction, [sensor]": ((*LARGE, *EFFECTS, "sensor.bits=12"), 2.9),
+    "640x480, everything": (EVERYTHING, 5.5),
 }
 N_PAIRS, WARM_UP = 60, 10
 
@@ -61,13 +70,13 @@ def measure(overrides: tuple[str, ...]) -> dict[str, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_optics_and_sensor_take_about_as_long_as_rendering(case: str) -> None:
-    """The limit holds for wall time on two idle processors; processor time is tested, as other processes may run."""
+    """Processor time is tested, not wall time, as other processes may run."""
     overrides, limit = CASES[case]
     taken = measure(overrides)
     wall_ratio, processor_ratio = np.median(taken["optics"], axis=0) / np.median(taken["render"], axis=0)
     (render_ms, _), (optics_ms, _) = (np.median(taken[stage], axis=0) for stage in ("render", "optics"))
     print(
-        f"\n{case}: optics / rendering: {wall_ratio:.2f} in wall time (limit {limit:g}; {optics_ms:.1f} ms /"
-        f" {render_ms:.1f} ms), {processor_ratio:.2f} in processor time"
+        f"\n{case}: optics / rendering: {wall_ratio:.2f} in wall time ({optics_ms:.1f} ms / {render_ms:.1f} ms),"
+        f" {processor_ratio:.2f} in processor time (limit {limit:g})"
     )
-    assert processor_ratio < 2.5 * limit
+    assert processor_ratio < limit

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from twin.core.records import StereoRig
+from twin.imaging.bands import band_weights
 from twin.imaging.daylight import DaylightVeil, floor_daylight
-from twin.imaging.illumination import Illumination, daylight_at
+from twin.imaging.illumination import Illumination, daylight_at, illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.light_field import BandOptics, LightField
+from twin.imaging.light_spectra import spectrum_of
 from twin.imaging.optics import Optics, WaterSurface
-from twin.imaging.phase_function import henyey_greenstein, petzold, phase_of, table_of, tabulate
+from twin.imaging.phase_function import henyey_greenstein, petzold, table_of, tabulate
 from twin.imaging.reference.pixel_light import (
     BandWater,
     Effort,
@@ -24,11 +26,13 @@ from twin.imaging.reference.pixel_light import (
 from twin.imaging.shadows import Shadows
 from twin.imaging.sun_sky import CRITICAL_COSINE, WATER_INDEX, SunSky, direction_to_sun, sky_radiance
 from twin.imaging.water import downwelling_per_m, medium
+from twin.imaging.water_tables import water_spectrum
+from twin.reproduce.light_cell import green_of, looking_down
+from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario, SunConfig, WaterConfig
 
 RIG = StereoRig(96, 64, 80.0, 0.1)
 CENTRE = (RIG.height_px // 2, RIG.width_px // 2)
-DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 UP = np.array([0.0, 0.0, 1.0])
 HG = henyey_greenstein(0.924)
 #: Water, elevation of the sun [deg], depth of the camera and range of the floor [m].
@@ -97,8 +101,7 @@ def test_a_slope_is_lit_by_the_cosine_to_the_refracted_sun(slope_x, slope_y, azi
 @pytest.mark.parametrize("slope_x", [0.0, 0.5, 1.0])
 def test_the_light_of_the_sky_on_a_slope_is_that_of_quadrature(slope_x):
     """The quadratic form represents the light within 2 % of that on a level floor."""
-    light = floor_daylight(daylight_at(SunConfig(illuminance_lx=1.0, sky_share=1.0), medium(WaterConfig()), 0.0),
-                           medium(WaterConfig()))  # fmt: skip
+    light = floor_daylight(daylight_at(SunConfig(illuminance_lx=1.0, sky_share=1.0), medium(WaterConfig()), 0.0))
     normal = np.array([slope_x, 0.0, 1.0]) / np.hypot(slope_x, 1.0)
     rng = np.random.default_rng(0)
     mu, azimuth = rng.uniform(CRITICAL_COSINE, 1, 200_000), rng.uniform(0, 2 * np.pi, 200_000)
@@ -117,8 +120,7 @@ def wall(height_m, spacing_m=0.05):
 
 
 def test_the_shadow_of_a_wall_is_its_height_over_the_tangent_of_the_refracted_elevation():
-    pose, depth = DOWN.copy(), np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
-    pose[2, 3] = 2.0
+    pose, depth = looking_down(2.0), np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
     to_sun = np.array(direction_to_sun(30.0, 180.0))  # in the west
     lit = Shadows(wall(0.5), RIG, [np.zeros((0, 3))] * 2, to_sun).lit(depth, pose, 0)[0]
     x = rays()[..., 0] * 2.0
@@ -140,8 +142,7 @@ def test_only_the_light_of_the_sky_reaches_a_shadow(shadows):
     water = medium(scenario.water)
     lighting = Illumination(water, daylight_at(scenario.sun, water, 0.0))
     formation = ImageFormation(scenario, lighting, wall(0.5), np.random.default_rng(0))
-    pose = DOWN.copy()
-    pose[2, 3] = 2.0
+    pose = looking_down(2.0)
     shape = rig.height_px, rig.width_px
     white, depth = np.full((*shape, 3), 255, np.uint8), np.full(shape, 2.0, np.float32)
     light = formation.radiance(white, depth, 0, StampedPose(pose, 0.0))[32, :, 1] * np.pi
@@ -203,10 +204,6 @@ def water_of(jerlov):
     return WaterConfig(jerlov=jerlov, phase_function="henyey_greenstein")
 
 
-def green_of(water):
-    return BandWater(float(water.absorption_per_m[1]), float(water.scattering_per_m[1]), phase_of(water.scatterers[1]))
-
-
 def reference_scene(water, elevation_deg, surface_m, sky_share=0.2, albedo=0.0):
     """Returns the scene and the green water of a Jerlov type, with the floor at z = 0."""
     properties = medium(water_of(water))
@@ -231,8 +228,7 @@ def test_the_reference_in_absorbing_water_is_exact():
         assert found.sun.value == pytest.approx(0.8 * np.exp(-a * z / source.sun_cosine), rel=1e-6)
         # the floor returns nothing that reaches the plane from above
         assert abs(found.total.value - found.sun.value - from_sky) < 4 * found.sky.standard_error + 1e-4
-    pose = DOWN.copy()
-    pose[2, 3] = 2.0
+    pose = looking_down(2.0)
     seen = pixel_light(scene, PixelRay(pose, RIG, (RIG.cx_px, RIG.cy_px)), Effort(4000, 20)).direct
     on_floor = 0.8 * np.exp(-a * 5.0 / source.sun_cosine)
     on_floor += 2 * np.pi * np.trapezoid(0.2 * sky_radiance(mu) * mu * np.exp(-a * 5.0 / mu), mu)
@@ -253,8 +249,7 @@ def test_the_reference_keeps_the_net_flux_of_water_that_absorbs_nothing():
 def test_a_disc_of_the_sun_gives_the_light_of_its_centre():
     """The connection to the disc and the walks that meet it are weighted; a narrow disc changes nothing."""
     scene, _, band = reference_scene("II", 60.0, 4.0)
-    pose = DOWN.copy()
-    pose[2, 3] = 2.0
+    pose = looking_down(2.0)
     ray = PixelRay(pose, RIG, (RIG.cx_px, RIG.cy_px))
     water = BandWater(band.absorption_per_m, band.scattering_per_m, henyey_greenstein(0.6))
     lights = []
@@ -269,8 +264,7 @@ def test_a_disc_of_the_sun_gives_the_light_of_its_centre():
 def test_daylight_agrees_with_the_reference(water, elevation_deg, depth_m, range_m):
     """Illuminance within 5 %, veil within 10 %, and 3 standard errors, which are below 15 %."""
     scene, _, _ = reference_scene(water, elevation_deg, depth_m + range_m)
-    pose = DOWN.copy()
-    pose[2, 3] = range_m
+    pose = looking_down(range_m)
     veil = pixel_light(scene, PixelRay(pose, RIG, (RIG.cx_px, RIG.cy_px)), Effort(10_000)).veil
     lux = plane_light(scene, range_m * UP, UP, Effort(2500, 25)).total
     sun = SunConfig(illuminance_lx=1.0, depth_m=depth_m + range_m, elevation_deg=elevation_deg)
@@ -281,6 +275,24 @@ def test_daylight_agrees_with_the_reference(water, elevation_deg, depth_m, range
     assert abs(model_lx - lux.value) < 3 * lux.standard_error + 0.05 * lux.value
     assert veil.standard_error < 0.15 * veil.value
     assert abs(model - veil.value) < 3 * veil.standard_error + 0.1 * veil.value
+
+
+@pytest.mark.parametrize("lamps", [("lamps=[]",), ("lamps.0.intensity_cd=1.0", "lamps.1.intensity_cd=1.0")])
+@pytest.mark.parametrize(("depth_m", "elevation_deg"), [(0.0, 90.0), (6.0, 90.0), (6.0, 40.0)])
+def test_each_path_of_daylight_has_its_own_absorption(lamps, depth_m, elevation_deg):
+    """A sunlit floor in water that only absorbs: the integral over the spectrum and the path sun, floor, camera.
+
+    Lamps of 1 cd, whose light is below 1e-4 of daylight, change the spectrum for which the lamps' absorption holds.
+    """
+    sun = f"sun.depth_m={depth_m}", f"sun.elevation_deg={elevation_deg}", "sun.illuminance_lx=1e5", "sun.sky_share=0"
+    rig = f"rig.image_width_px={RIG.width_px}", f"rig.image_height_px={RIG.height_px}"
+    water = "water.jerlov=II", "water.turbidity=0", "plan.altitude_m=1.5"
+    scenario = load_scenario("quickstart", [*lamps, *sun, *rig, *water])
+    optics = Optics(scenario.believed_rig(), illumination_of(scenario), scenario.lamps)
+    path_m = depth_m / direction_to_sun(elevation_deg, 0.0)[2] + 1.5
+    left = band_weights(spectrum_of("daylight")) @ np.exp(-water_spectrum("II").absorption_per_m * path_m)
+    light = optics.radiance(*level(1.5), 0)[CENTRE]
+    np.testing.assert_allclose(light, 1e5 / np.pi * left, rtol=1e-3)
 
 
 @pytest.mark.parametrize("off_axis_deg", [-30.0, 30.0])
@@ -299,7 +311,7 @@ def test_the_veil_off_the_axis_agrees_with_the_reference(off_axis_deg):
     pose[2, 3] = 2.0
     truth = pixel_light(scene, PixelRay(pose, RIG, (RIG.cx_px, RIG.cy_px)), Effort(12000, 20)).veil
     range_m = 2.0 / np.cos(lean)
-    veil = DaylightVeil(daylight_at(sun, water, 2.0), water, np.array([0.0, range_m])).radiance(axis, 4.0)[1, 1]
+    veil = DaylightVeil(daylight_at(sun, water, 2.0), np.array([0.0, range_m])).radiance(axis, 4.0)[1, 1]
     assert abs(veil - truth.value) < 3 * truth.standard_error + 0.05 * truth.value < 0.2 * truth.value
 
 

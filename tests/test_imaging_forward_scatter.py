@@ -111,6 +111,28 @@ def test_the_image_of_a_point_has_the_kernel_and_its_energy():
     np.testing.assert_allclose(even, np.exp(-0.8 * table_of(PETZOLD).backscatter_fraction), rtol=0.01)
 
 
+def test_off_the_axis_the_kernel_covers_more_pixels_and_keeps_its_light():
+    """Pixels per angle grow by 1 / cos(theta)^1.5. Compared without the core (level 0), which is below a pixel."""
+    floor, water, place = np.zeros((*SHAPE, 3), np.float32), sea(0.0, 0.4), (105, 145)
+    floor[place] = 1000.0
+    blur = ForwardScatter(RIG, water)
+    around = np.zeros((*blur.surroundings.shape, 3), np.float32), np.full(blur.surroundings.shape, 0.0, np.float32)
+    image = np.zeros_like(floor)
+    around[1][:] = at = place_of(np.float64(2.0))
+    blur.add(floor, np.full((SHAPE[0] // 2, SHAPE[1] // 2), at, np.float32), around, image)
+    v, u = np.indices(SHAPE)
+    away, image = np.hypot(v - place[0], u - place[1]), image[..., 1].astype(float) / 1000
+    off = np.hypot(place[0] - (SHAPE[0] - 1) / 2, place[1] - (SHAPE[1] - 1) / 2) / RIG.focal_px
+    wider = (1 + off**2) ** 0.75
+    sigmas = np.array([level_sigma_px(k) for k in range(1, 8)])
+    weights = camera_mixture(water.bands[1], (2.0,), (0.0, *(sigmas / RIG.focal_px).tolist()))[0][1:]
+    for radius in (3.5, 7.5):
+        within = [weights @ (1 - np.exp(-((radius / scale) ** 2) / (2 * sigmas**2))) for scale in (1.0, wider)]
+        assert image[away < radius].sum() == pytest.approx(within[1], rel=0.06)
+        assert image[away < radius].sum() < 0.93 * within[0]
+    np.testing.assert_allclose(blur._moved.sum(0), 0.0, atol=1e-6)
+
+
 def test_a_ray_that_ends_near_collects_less_scattered_light_than_one_that_ends_far():
     blur = ForwardScatter(RIG, sea(0.0, 0.4))
     range_m = np.full(SHAPE, 4.0)
@@ -120,7 +142,7 @@ def test_a_ray_that_ends_near_collects_less_scattered_light_than_one_that_ends_f
     near, far = -np.expm1(-0.4 * np.array([1.0, 4.0])) - 0.02
     # the widest levels take the weights of the mean range within their width, so the near part is up to 30 % too bright
     assert near < light[10] < 1.3 * near and light[150] == pytest.approx(far, rel=0.1)
-    assert (np.diff(light[20:140]) > -1e-3).all()
+    assert (np.diff(light[20:140]) > -2e-3).all()
 
 
 def optics(water):

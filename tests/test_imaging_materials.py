@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from terrains import generate
+from terrains import TextureSource, generate
 from twin.core import geometry
 from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
@@ -128,7 +128,7 @@ def light_of(**terrain: object) -> np.ndarray:
             "terrain": terrain,
         }
     )
-    floor = generate("flat", (8.0, 8.0), 0.0, 0.0, 0.05, 0.05, 0)
+    floor = generate("flat", (8.0, 8.0), 0.0, 0.0, 0.05, TextureSource(0.05), 0)
     formation = ImageFormation(scenario, illumination_of(scenario), floor, np.random.default_rng(0))
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     albedo, depth = np.full((120, 160, 3), 128, np.uint8), np.full((120, 160), 2.0, np.float32)

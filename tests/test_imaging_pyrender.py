@@ -12,6 +12,7 @@ import pytest
 
 import terrains
 from scenes.builder import CameraPair, build
+from terrains import TextureSource
 from twin.core import geometry
 from twin.imaging.renderer import Renderer
 
@@ -75,7 +76,7 @@ def poses() -> np.ndarray:
 
 
 def test_depth_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path) -> None:
-    terrain = terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, 0.02, 5)
+    terrain = terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.02), 5)
     world = build(
         terrain, CameraPair(W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))), 0.01
     )

@@ -20,6 +20,7 @@ from twin.imaging.reference.pixel_light import (
     ReferenceScene,
     Sunlight,
     pixel_light,
+    refined,
 )
 
 RIG = StereoRig(320, 240, 277.0, 0.1)
@@ -227,6 +228,21 @@ def test_equal_seeds_give_equal_light_and_the_error_is_that_of_repetition():
     spread = np.std([result.value for result in results], ddof=1)
     claimed = np.mean([result.standard_error for result in results])
     assert 0.5 < spread / claimed < 1.8  # 16 repetitions: 1 +- 0.18, and the errors scatter
+
+
+def test_rounds_are_added_until_the_standard_error_is_reached():
+    """The first round is the plain computation, later ones have other random numbers, and their number is limited."""
+    scene, ray, effort = lit(BandWater(0.1, 0.1, henyey_greenstein(0.8))), central(looking_down(2.0)), Effort(320, 16)
+    light_of = lambda one: pixel_light(scene, ray, one)  # noqa: E731
+    first = light_of(effort)
+    target = 0.4 * first.total.standard_error
+    light = refined(light_of, lambda found: found.total.standard_error < target, effort, 100_000)
+    assert light.total.standard_error < target and len(light.sums) >= 16 * 4
+    np.testing.assert_array_equal(light.sums[:16], first.sums)
+    assert len(np.unique(light.sums[:, 2])) == len(light.sums)
+    assert_near(light.total, pixel_light(scene, ray, Effort(3200, 16, 9)).total.value, rel=0.05)
+    assert len(refined(light_of, lambda _: False, effort, 3 * 320).sums) == 3 * 16
+    assert len(refined(light_of, lambda _: False, effort, 1).sums) == 16
 
 
 def test_too_few_batches_are_refused():

@@ -15,7 +15,7 @@ import scenes.gl
 import terrains
 from scenes.builder import CameraPair, SceneModel, build
 from scenes.gl import mujoco
-from terrains import Terrain
+from terrains import Terrain, TextureSource
 from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.renderer import Renderer, linear_depth, visible_tiles
@@ -37,7 +37,7 @@ def world_of(terrain: Terrain) -> SceneModel:
 
 @pytest.fixture(scope="module")
 def world() -> SceneModel:
-    return world_of(terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, 0.003, 5))
+    return world_of(terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.003), 5))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_tile_borders_are_invisible(monkeypatch: pytest.MonkeyPatch, world: Scen
 
 
 def test_a_uniform_colour_is_rendered_exactly() -> None:
-    terrain = terrains.generate("reef", (5.0, 5.0), 0.4, 0.0, 0.05, 0.02, 0)
+    terrain = terrains.generate("reef", (5.0, 5.0), 0.4, 0.0, 0.05, TextureSource(0.02), 0)
     colour = np.array([200, 17, 93], np.uint8)
     painted = Terrain(
         terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m,

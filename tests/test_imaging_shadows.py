@@ -12,6 +12,7 @@ import terrains
 from scenes.builder import CameraPair, SceneModel, build
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import mujoco
+from terrains import TextureSource
 from twin.core import geometry
 from twin.core.floor_rays import cast_pixels, height_field
 from twin.imaging import shadows
@@ -53,7 +54,7 @@ def points_of(depth: np.ndarray, world_from_camera: np.ndarray) -> np.ndarray:
 
 def cliffs() -> terrains.Terrain:
     """Returns a rough reef with steep slopes: plateaus 0.7 m above their surroundings."""
-    reef = terrains.generate("reef", (8.0, 6.0), 1.0, 0.0, 0.025, 0.02, 5)
+    reef = terrains.generate("reef", (8.0, 6.0), 1.0, 0.0, 0.025, TextureSource(0.02), 5)
     plateau = np.clip((reef.height_m - np.median(reef.height_m)) / 0.04, 0, 1)
     rough = np.random.default_rng(1).normal(scale=0.004, size=plateau.shape)
     return dataclasses.replace(reef, height_m=(0.2 * reef.height_m + 0.7 * plateau + rough).astype(np.float32))

@@ -9,6 +9,7 @@ from twin.imaging.illumination import daylight_at
 from twin.imaging.lamp_light import LampLight
 from twin.imaging.lamps import light_sources_in_camera
 from twin.imaging.lens_psf import Defocus
+from twin.imaging.ray_sampling import RowMotion, sample_rays
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.snow import APERTURE_M, BOX_M, MarineSnow, diameters
 from twin.imaging.water import medium
@@ -245,6 +246,25 @@ def test_a_rolling_shutter_moves_particles_as_it_moves_the_floor():
     assert delay_s < -0.005
     moved_px = centroid(light[..., 1]) - at_rest
     np.testing.assert_allclose(moved_px, [-RIG.focal_px * speed_mps * delay_s, 0], atol=0.2)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_rolling_shutter_that_is_applied_later_images_particles_at_the_same_place(axis):
+    """The floor lies behind the particle, so it moves less in the image, by which the drawn image is shifted later."""
+    twist, readout_s = 0.8 * np.eye(6)[axis], 0.02
+    depth = np.full(SHAPE, 2.0, np.float32)
+    images = []
+    for rolls_later in (False, True):
+        snow, light = single(0.8, diameter_m=0.002), np.zeros((*SHAPE, 3), np.float32)
+        snow._start_m = geometry.transform(POSE, np.array([[0.1, -0.25, 0.8]]))
+        snow.draw(light, depth, POSE, 0, 0.0, ExposureMotion(twist, 0.0, readout_s, rolls_later))
+        images.append(light)
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    positions = np.stack([u, v], -1).astype(np.float32)
+    motion = RowMotion(twist, readout_s, RIG.focal_px, (RIG.cx_px, RIG.cy_px))
+    rolled = sample_rays(images[1], depth, positions, None, motion)
+    # paths of 0.5 to 2.5 px; pixels sample small discs coarsely
+    np.testing.assert_allclose(centroid(rolled[..., 1]), centroid(images[0][..., 1]), atol=0.1)
 
 
 def test_particles_in_focus_are_smaller_than_those_out_of_focus():

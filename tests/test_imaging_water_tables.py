@@ -144,7 +144,8 @@ def test_a_scenario_takes_absorption_over_twice_the_altitude_under_its_light():
         np.testing.assert_array_equal(illumination_of(scenario).water.absorption_per_m, want)
     deep = load_scenario("quickstart", ["water.jerlov=II", "sun.illuminance_lx=9", "sun.depth_m=20.0"])
     daylight = illumination_of(deep).daylight
-    want = downwelling_per_m(medium(deep.water, path_m=20.0, light="daylight"), daylight.source.mean_cosine)
+    mean_cosine = daylight.source.mean_cosine
+    want = downwelling_per_m(medium(deep.water, path_m=20.0 / mean_cosine, light="daylight"), mean_cosine)
     np.testing.assert_array_equal(daylight.attenuation_per_m, want)
 
 

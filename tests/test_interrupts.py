@@ -64,6 +64,7 @@ def in_first_call(function, number):
 STAGES = {
     "alignment": (Navigator, "finish"),
     "map": (Navigator, "build_map"),
+    "orthomosaic": (twin.session.conclusion, "make_orthomosaic"),
     "evaluation": (twin.session.conclusion, "evaluate"),
     "maps": (mesh, "write_glb"),
     "report": (survey_page, "write_report"),
@@ -98,7 +99,7 @@ def test_an_interrupt_ends_only_the_current_stage(tmp_path, monkeypatch, stage):
     done = {file.name for file in (tmp_path / "run").iterdir()}
     assert {"report", "recording"} - done == {stage} & {"report", "recording"}
     assert ("dem_truth.tif" in done) == (stage != "maps")
-    assert ("dem.tif" in done) == (stage not in ("maps", "map"))
+    assert ("dem.tif" in done) == ("mosaic.tif" in done) == (stage not in ("maps", "map"))
     evaluated = stage not in ("map", "evaluation")
     assert metrics["require"]["map.le90_area_m"]["passed"] == evaluated
     assert (metrics["trajectory"]["final"]["ate_rmse_m"] is not None) == (stage != "evaluation")

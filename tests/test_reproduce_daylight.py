@@ -19,6 +19,9 @@ def test_a_cell_agrees_with_the_reference():
     model, truth = cell.reflectance
     assert truth.standard_error < 0.06 * truth.value
     assert abs(model - truth.value) < 3 * truth.standard_error + 0.02 * truth.value
+    model, truth = cell.bright_reflectance
+    assert truth.standard_error < 0.04 * truth.value
+    assert abs(model - truth.value) < 3 * truth.standard_error + 0.03 * truth.value
     assert cell.model_lx[1] > 1.2 * cell.model_lx[2] > 0  # towards the sun and away from it
 
 

@@ -8,7 +8,6 @@ import pytest
 from typer.testing import CliRunner
 
 from twin.cli import app
-from twin.imaging.phase_function import henyey_greenstein
 from twin.imaging.reference.pixel_light import Effort
 from twin.reproduce.light import (
     LAMP_ARRANGEMENTS,
@@ -31,7 +30,7 @@ def test_in_water_that_only_absorbs_model_and_reference_agree(lamps):
     scenario = load_scenario("quickstart", ["water.jerlov=II", "water.turbidity=0", *LAMP_ARRANGEMENTS[lamps]])
     for pixel in ((160, 120), (250, 30)):
         model = model_light(scenario, 1.5, pixel)
-        truth = reference_light(scenario, 1.5, pixel, Effort(64, 2), henyey_greenstein(0.9))
+        truth = reference_light(scenario, 1.5, pixel, Effort(64, 2))
         assert model.veil == 0 and model.sharp_share == 1
         assert model.total == pytest.approx(truth.total.value, rel=5e-3)
 

@@ -21,7 +21,7 @@ PLAN_KEYS = (
 )
 TOP_KEYS = (
     "name, seed, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, snow, "
-    "current, navigation, plan, control, estimate, map, beacons, require"
+    "current, navigation, plan, control, estimate, map, beacons, objects, require"
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
@@ -421,3 +421,15 @@ def test_every_key_has_a_description_in_plain_words():
     assert len(found) > 130
     assert not [key for key, text in found.items() if not text.strip()]
     assert not {key: text for key, text in found.items() if odd & set(re.findall(r"[a-z]+", text.lower()))}
+
+
+@pytest.mark.parametrize(
+    ("values", "texel_m"),
+    (
+        (["rig.image_width_px=1920", "plan.altitude_m=2"], 4 / 3**0.5 / 1920),
+        (["rig.image_width_px=320", "plan.altitude_m=2"], 0.005),
+        (["terrain.texture_px_m=0.01"], 0.01),
+    ),
+)
+def test_texels_are_as_fine_as_the_pixels_of_the_images_by_default(values: list[str], texel_m: float) -> None:
+    assert load_scenario("quickstart", ["rig.hfov_deg=60", *values]).texel_m == pytest.approx(texel_m)

@@ -10,6 +10,7 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from scenes.builder import CameraPair, SceneModel, build
 from scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
 from scenes.gl import mujoco
+from terrains import TextureSource
 from twin.core import geometry
 
 BODY_FROM_LEFT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.02, 0.1, -0.15]))
@@ -18,7 +19,7 @@ LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]
 
 @pytest.fixture(scope="module")
 def scene() -> SceneModel:
-    terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, 0.02, 3)
+    terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, TextureSource(0.02), 3)
     return build(terrain, CameraPair(160, 120, 45.0, 0.2, BODY_FROM_LEFT), 0.004, LAMPS)
 
 

@@ -193,6 +193,7 @@ def test_more_snow_gives_less_precise_and_fewer_matches():
 
 
 MURKY = ['water.jerlov="9C"', "plan.altitude_m=3"]
+SPARSE = ["plan.overlap_along=0.3", 'plan.overlap_reference="plane"']
 
 
 def world(*sets, fitted=None):
@@ -200,25 +201,28 @@ def world(*sets, fitted=None):
 
 
 def test_a_survey_outside_the_fit_is_refused_with_quantity_value_and_range():
-    with pytest.raises(
-        ScenarioError, match=r"matching precision .* of \d\.\d+ px .allowed: at most 0\.\d+ px.*--extrapolate"
-    ):
-        world(*MURKY)
+    with pytest.raises(ScenarioError, match=r"median overlap .* of 0\.\d+ .allowed: at least 0\.\d+.*--extrapolate"):
+        world(*SPARSE)
 
 
 def test_with_extrapolate_it_flies_with_a_warning():
-    warnings = world(*MURKY, "imaging.extrapolate=true").warnings
+    warnings = world(*SPARSE, "imaging.extrapolate=true").warnings
     assert len(warnings) == 1 and warnings[0].startswith(
-        "The surrogate extrapolates outside the range of its error model: matching"
+        "The surrogate extrapolates outside the range of its error model: median overlap"
     )
-    assert "matching precision" in warnings[0] and "at most" in warnings[0]
+    assert "at least" in warnings[0]
     assert world().warnings == ()
 
 
+def test_no_water_is_too_turbid_for_the_built_in_error_model():
+    """Its most turbid survey was lost, so the surrogate loses vision there as well; see `_fitted_range`."""
+    assert world(*MURKY).warnings == ()
+
+
 def test_a_survey_of_a_study_outside_the_fit_is_a_refused_row(tmp_path):
-    given = scenario(*MURKY)
+    given = scenario(*SPARSE)
     row = fly(Survey(0, 1, {}, given, given.fingerprint(), tmp_path / "runs" / "0", "none"))
-    assert row["status"] == "refused" and "matching precision" in row["reason"]
+    assert row["status"] == "refused" and "median overlap" in row["reason"]
 
 
 def test_extrapolate_of_the_command_line_sets_the_key_of_every_survey():

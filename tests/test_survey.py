@@ -53,6 +53,8 @@ def test_a_survey_by_vision_ends_complete_with_an_accurate_path_and_map(flown):
     assert m["control"]["cross_track_rmse_m"] < 0.05
     assert m["map"]["nmad_m"] < 0.01
     assert m["map"]["completeness"] > 0.9
+    assert m["orthomosaic"]["ce90_px"] < 1.5 and m["orthomosaic"]["pixel_m"] < m["map"]["cell_m"]
+    assert m["orthomosaic"]["matched"] > 0.5 and m["orthomosaic"]["colour_difference_median"] is None
 
 
 def test_the_run_folder_contains_every_documented_file(flown):
@@ -126,8 +128,8 @@ def test_estimates_from_recorded_frames_do_not_depend_on_the_truth(tmp_path):
         assert getattr(first, name).world_from_camera.tobytes() == getattr(second, name).world_from_camera.tobytes()
 
 
-def test_frames_contain_only_images_time_readings_and_the_choice_of_keyframes():
-    fields = {"index", "time_s", "left", "right", "readings", "keyframe"}
+def test_frames_contain_only_images_their_exposure_time_readings_and_the_choice_of_keyframes():
+    fields = {"index", "time_s", "left", "right", "readings", "keyframe", "exposure"}
     assert set(records.Frame.__dataclass_fields__) == fields
     assert set(records.Readings.__dataclass_fields__) == {
         "pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", "beacons",

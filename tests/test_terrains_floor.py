@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 
 import terrains
-from terrains import Terrain
+from terrains import Terrain, TextureSource
+from terrains.ground_cover import COVERS, GRAINS, Cover, paint
+from terrains.textures import COARSEN_TEXELS
 from twin.errors import TwinError
 
 KINDS = ("ripples", "fractal", "reef", "cliffs")
 
 
 def floor(kind: str, seed: int = 1, size_m: tuple[float, float] = (6.0, 4.0)) -> Terrain:
-    return terrains.generate(kind, size_m, 0.6, 0.15, 0.05, 0.01, seed)
+    return terrains.generate(kind, size_m, 0.6, 0.15, 0.05, TextureSource(0.01), seed)
 
 
 def from_heights(height_m: np.ndarray, spacing_m: float = 0.5) -> Terrain:
@@ -38,8 +40,10 @@ def test_a_flat_floor_has_the_height_of_its_base() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_floor_without_relief_is_flat_and_a_floor_can_have_a_single_cell(kind: str) -> None:
-    assert np.all(terrains.generate(kind, (2.0, 1.0), 0.0, 0.15, 0.1, 0.05, 0).height_m == np.float32(0.15))
-    assert np.isfinite(terrains.generate(kind, (0.1, 0.1), 0.2, 0.0, 0.1, 0.05, 0).height_m).all()
+    assert np.all(
+        terrains.generate(kind, (2.0, 1.0), 0.0, 0.15, 0.1, TextureSource(0.05), 0).height_m == np.float32(0.15)
+    )
+    assert np.isfinite(terrains.generate(kind, (0.1, 0.1), 0.2, 0.0, 0.1, TextureSource(0.05), 0).height_m).all()
 
 
 @pytest.mark.parametrize("kind", ("flat", *KINDS))
@@ -74,8 +78,52 @@ def test_a_texture_has_detail_at_every_scale_down_to_the_texel(kind: str) -> Non
         grey = coarser
 
 
+@pytest.mark.parametrize("cover", COVERS)
+def test_a_cover_has_detail_in_the_finest_octave_of_a_wide_image_and_soft_transitions(cover: str) -> None:
+    """At least 3 % of the variance of the albedo lies at wavelengths of 2 to 4 pixels of a 1920 x 1080 image."""
+    gsd_m = 2 * 2.0 * np.tan(np.deg2rad(30.0)) / 1920  # 2 m above the floor, 60 deg
+    texture = TextureSource(gsd_m, cover=cover)
+    grey = cv2.cvtColor(terrains.generate("reef", (1.2, 0.8), 0.6, 0.0, 0.05, texture, 1).texture, cv2.COLOR_RGB2GRAY)
+    grey = grey.astype(np.float32)
+    finest = grey - cv2.pyrUp(cv2.pyrDown(grey), dstsize=grey.shape[::-1])
+    assert finest.var() > 0.03 * grey.var()
+
+
+def test_every_cover_has_its_own_texture_and_the_default_is_that_of_the_kind() -> None:
+    floors = {
+        c: terrains.generate("reef", (1.0, 0.8), 0.6, 0.0, 0.05, TextureSource(0.005, cover=c), 1) for c in COVERS
+    }
+    assert len({floor.texture.tobytes() for floor in floors.values()}) == len(COVERS)
+    default = terrains.generate("reef", (1.0, 0.8), 0.6, 0.0, 0.05, TextureSource(0.005), 1)
+    assert np.array_equal(default.texture, floors["reef"].texture)
+
+
+def test_the_material_changes_gradually() -> None:
+    """Between two materials of one colour each, no step between neighbouring texels is the whole difference."""
+    material = np.tile(np.linspace(32, 96, 400).astype(np.uint8), (50, 1))
+    plain = [Cover(c, c, c, GRAINS, 1.0, 0.0, 0.0) for c in ((40, 40, 40), (200, 200, 200))]
+    COVERS["test"] = (plain[0], plain[1], plain[1], plain[1])
+    try:
+        painted = paint(material, np.full_like(material, 128), 0.005, "test", np.random.default_rng(1))
+    finally:
+        del COVERS["test"]
+    grey = painted[..., 0].astype(int)
+    assert grey[:, 0].max() == 40 and grey[:, -1].min() == 200
+    assert np.abs(np.diff(grey, axis=1)).max() < 0.25 * 160
+
+
+def test_texels_of_a_large_floor_are_coarser_only_by_default() -> None:
+    size_m = (100.0, 50.0)
+    assert TextureSource(0.001, coarsen=True).texel_m((2.0, 3.0)) == 0.001
+    texel_m = TextureSource(0.001, coarsen=True).texel_m(size_m)
+    assert size_m[0] * size_m[1] / texel_m**2 == pytest.approx(COARSEN_TEXELS)
+    assert TextureSource(0.001).texel_m(size_m) == 0.001
+
+
 def test_the_extent_is_rounded_up_to_whole_cells() -> None:
-    assert terrains.generate("flat", (1.0, 0.52), 0.0, 0.0, 0.3, 0.1, 0).size_m == pytest.approx((1.2, 0.6))
+    assert terrains.generate("flat", (1.0, 0.52), 0.0, 0.0, 0.3, TextureSource(0.1), 0).size_m == pytest.approx(
+        (1.2, 0.6)
+    )
 
 
 def test_height_is_linear_on_the_two_triangles_of_a_cell() -> None:
@@ -98,11 +146,13 @@ def test_height_at_the_nodes_is_the_grid_value_and_outside_it_is_nan() -> None:
     [
         ({"kind": "lunar"}, "terrain.kind"),
         ({"grid_m": 0.0011}, "terrain.grid_m"),
-        ({"texture_px_m": 0.0001}, "terrain.texture_px_m"),
+        ({"texture": TextureSource(0.0001)}, "terrain.texture_px_m"),
     ],
 )
 def test_an_invalid_terrain_is_rejected_with_its_scenario_key(change: dict[str, object], field: str) -> None:
-    valid = dict(kind="flat", size_m=(6.0, 4.0), relief_m=0.1, base_m=0.0, grid_m=0.1, texture_px_m=0.01, seed=0)
+    valid = dict(
+        kind="flat", size_m=(6.0, 4.0), relief_m=0.1, base_m=0.0, grid_m=0.1, texture=TextureSource(0.01), seed=0
+    )
     with pytest.raises(TwinError) as caught:
         terrains.generate(**(valid | change))  # pyright: ignore[reportArgumentType]
     assert caught.value.field == field and caught.value.allowed

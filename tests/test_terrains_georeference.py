@@ -38,7 +38,7 @@ def write(file, values, crs=UTM, spacing=0.5, description=None, unit=None, tags=
 
 
 def load(file, z=None) -> Terrain:
-    return terrains.load(file, None, 0.1, 0.5, 3.0, 0, z)
+    return terrains.load(file, terrains.TextureSource(0.1), 0.5, 3.0, 0, z)
 
 
 def test_the_georeference_is_the_centre_of_the_raster_and_its_lowest_point(tmp_path):
@@ -196,5 +196,5 @@ def test_too_large_a_texture_is_rejected_from_the_header(tmp_path):
     np.save(tmp_path / "dem.npy", HEIGHTS)
     texture = huge_png(tmp_path / "t.png", depth=8)
     with pytest.raises(TwinError, match="'t.png' has 30000 x 30000 pixels") as caught:
-        terrains.load(tmp_path / "dem.npy", texture, 0.1, 0.5, 3.0, 0)
+        terrains.load(tmp_path / "dem.npy", terrains.TextureSource(0.1, texture), 0.5, 3.0, 0)
     assert caught.value.field == "terrain.texture_file"

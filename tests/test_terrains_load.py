@@ -30,7 +30,7 @@ def write_tiff(file: Path, bands: np.ndarray, crs: str | None = None, spacing: f
 
 
 def load(file: Path, texture: Path | None = None, texture_px_m: float = 0.1) -> Terrain:
-    return terrains.load(file, texture, texture_px_m, 0.5, 3.0, 0)
+    return terrains.load(file, terrains.TextureSource(texture_px_m, texture), 0.5, 3.0, 0)
 
 
 def write_png(file: Path, image: np.ndarray) -> Path:

@@ -7,7 +7,7 @@ import pytest
 
 import terrains
 from controllers.camera_surface import surface_above_floor
-from terrains import Terrain
+from terrains import Terrain, TextureSource
 from twin.core.records import SurveyResult, Trajectory, Truth
 from twin.errors import ScenarioError, TwinError
 from twin.judge.overlap import overlap_metrics
@@ -69,7 +69,7 @@ def test_all_but_5_percent_of_the_keyframes_keep_the_required_overlap_over_the_f
     if kind == "step":
         terrain = floor(lambda x, y: np.where(x > 0.3, 0.7, 0.0))
     else:
-        terrain = terrains.generate(kind, (9.0, 7.0), 0.8, 0.0, 0.05, 0.2, 3)
+        terrain = terrains.generate(kind, (9.0, 7.0), 0.8, 0.0, 0.05, TextureSource(0.2), 3)
     asked = ("plan.overlap_along=0.8", "plan.overlap_across=0.7")
     kept = forecast_over_floor(over(terrain, monkeypatch, *asked))
     plane = forecast_over_floor(over(terrain, monkeypatch, *asked, "plan.overlap_reference=plane"))
@@ -107,7 +107,7 @@ def test_coverage_counts_the_asked_area_only(monkeypatch):
 
 
 def test_a_survey_flown_as_planned_has_the_planned_overlap(monkeypatch):
-    mission = over(terrains.generate("reef", (9.0, 7.0), 0.8, 0.0, 0.05, 0.2, 5), monkeypatch)
+    mission = over(terrains.generate("reef", (9.0, 7.0), 0.8, 0.0, 0.05, TextureSource(0.2), 5), monkeypatch)
     sequences = [mission.planned_frames(track) for track in mission.tracks]
     reference = np.concatenate([c.reference.position for c in sequences])
     keyframe = np.flatnonzero(np.concatenate([c.keyframe for c in sequences]))

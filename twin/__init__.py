@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from twin.datasets.replay import ReplayOptions, ReplayResult
     from twin.scenario.model import Scenario
     from twin.session.conclusion import RunResult
 
-__all__ = ["load_scenario", "run"]
+__all__ = ["load_scenario", "replay", "run"]
 
 # OpenBLAS reads this variable when numpy is imported. Multithreading slows down operations on small matrices: with two
 # threads, the final alignment of 25 tracks takes more than twice as long.
@@ -50,3 +51,22 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
     from twin import survey
 
     return survey.run(scenario, Path(out))
+
+
+def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:
+    """Runs the estimators on a recorded stereo data set and writes a run folder; see docs/replay.md.
+
+    Args:
+        dataset: folder of the data set.
+        out: run folder to write.
+        options: calibration, truth, alignment and settings (`twin.datasets.replay.ReplayOptions`).
+
+    Returns:
+        Status, metrics and run folder of the replay, the trajectories and the map.
+
+    Raises:
+        TwinError: the data set or one of its files cannot be used; nothing was written.
+    """
+    from twin.datasets import replay as recorded
+
+    return recorded.replay(Path(dataset), Path(out), options)

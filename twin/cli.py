@@ -18,6 +18,7 @@ from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
+    from twin.datasets.replay import ReplayResult
     from twin.scenario.model import Scenario
     from twin.session.conclusion import RunResult
 
@@ -46,12 +47,14 @@ SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
 PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-plan.png.")]
 SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-look.png.")]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Compute a few cells only.")]
-WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Random walks per cell of the Monte Carlo.")]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Smaller plans, images or selections.")]
+WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Most random walks per cell of the Monte Carlo.")]
 PhaseOption = Annotated[
     str,
     typer.Option("--phase", help="Phase function of both: a value of water.phase_function."),
 ]
+ResultsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="results.json of `twin reproduce all`.")]
+ReadmeOption = Annotated[Path | None, typer.Option("--readme", help="README whose chapter is replaced.")]
 TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None,
@@ -106,6 +109,16 @@ VerifyOption = Annotated[
         help="Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
     ),
 ]
+CheckOption = Annotated[
+    int | None,
+    typer.Option(
+        "--verify",
+        min=0,
+        max=1000,
+        metavar="N",
+        help="Fly the N surrogate surveys whose results are closest to the limits also rendered. Default: none.",
+    ),
+]
 ExtrapolateOption = Annotated[
     bool,
     typer.Option(
@@ -114,6 +127,31 @@ ExtrapolateOption = Annotated[
     ),
 ]
 LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
+DatasetArgument = Annotated[
+    Path,
+    typer.Argument(metavar="DATASET", help="Folder of a stereo data set: EuRoC/ASL, KITTI, or left/ and right/."),
+]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option("--calibration", metavar="FILE", help="OpenCV or Kalibr YAML, or COLMAP cameras.txt beside rigs.txt."),
+]
+TruthOption = Annotated[
+    Path | None,
+    typer.Option("--truth", metavar="FILE", help="True poses, only for the comparison: TUM, KITTI or EuRoC."),
+]
+AlignOption = Annotated[
+    str,
+    typer.Option("--align", metavar="NAME", help="Alignment with the truth before the comparison: first, se3 or none."),
+]
+BayerOption = Annotated[
+    str | None, typer.Option("--bayer", metavar="PATTERN", help="Raw images: RGGB, GRBG, GBRG or BGGR.")
+]
+PreviewOption = Annotated[
+    bool, typer.Option("--preview", help="Only draw the first stereo pair with its matches and its disparity.")
+]
+ReplayOutOption = Annotated[
+    Path | None, typer.Option("--out", help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")
+]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
 PlanJsonOption = Annotated[bool, typer.Option("--json", help="Print only the predicted properties, as JSON.")]
 StrictOption = Annotated[
@@ -241,7 +279,7 @@ def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: Summary
 def light(
     out: TurbidityOutOption = Path("runs/light"),
     quick: QuickOption = False,
-    walks: WalksOption = 40_000,
+    walks: WalksOption = 400_000,
     phase: PhaseOption = "sea",
     as_json: SummaryOption = False,
 ) -> None:
@@ -261,6 +299,79 @@ def light(
         console.print_table("Light model and reference, green band", comparison.table(found))
         console.print_table("Daylight, light model and reference, green band", daylight.daylight_table(under_sun))
         print(f"Sheet: {out / 'light.png'}")
+
+
+def _reproduce(name: str, out: Path, quick: bool, as_json: bool) -> None:
+    """Runs one experiment of the paper, and prints its tables or, as JSON, its results."""
+    from twin.reproduce.catalogue import EXPERIMENTS
+
+    outputs.output_file(out / f"{name}.json")
+    _require_rendering()
+    with outputs.writing(out):
+        exhibit = EXPERIMENTS[name](out, quick)
+    if as_json:
+        print(json.dumps(exhibit.as_dict(), indent=1))
+        return
+    for table in exhibit.tables:
+        console.print_table(table.title, list(table.rows))
+    print(f"Figures: {', '.join(str(out / figure.file) for figure in exhibit.figures)}")
+
+
+@reproductions.command()
+def paper(
+    out: TurbidityOutOption = Path("runs/paper-mission"), quick: QuickOption = False, as_json: SummaryOption = False
+) -> None:
+    """Fly the paper's mission of 25 tracks with and without alignment (Figs. 4 to 7); takes hours without --quick."""
+    _reproduce("paper", out, quick, as_json)
+
+
+@reproductions.command()
+def tank1(
+    out: TurbidityOutOption = Path("runs/tank1"), quick: QuickOption = False, as_json: SummaryOption = False
+) -> None:
+    """Survey objects in a tank with 130 stereo pairs on parallel legs (Figs. 9 and 10)."""
+    _reproduce("tank1", out, quick, as_json)
+
+
+@reproductions.command()
+def tank2(
+    out: TurbidityOutOption = Path("runs/tank2"), quick: QuickOption = False, as_json: SummaryOption = False
+) -> None:
+    """Survey objects in a tank with 61 stereo pairs on two loops that cross at the start (Figs. 11 and 12)."""
+    _reproduce("tank2", out, quick, as_json)
+
+
+@reproductions.command()
+def budget(
+    out: TurbidityOutOption = Path("runs/budget"), quick: QuickOption = False, as_json: SummaryOption = False
+) -> None:
+    """Measure the time of each module and compare it with the paper's budget at 30 Hz (section IV)."""
+    _reproduce("budget", out, quick, as_json)
+
+
+@reproductions.command("all")
+def all_experiments(out: TurbidityOutOption = Path("runs/reproduce"), quick: QuickOption = False) -> None:
+    """Run all experiments and write one page with every table and figure."""
+    from twin.reproduce import catalogue
+
+    outputs.output_file(out / catalogue.PAGE_FILE)
+    _require_rendering()
+    with outputs.writing(out):
+        catalogue.run_all(out, quick, report=console.print_error)
+    print(f"Page: {out / catalogue.PAGE_FILE}")
+
+
+@reproductions.command()
+def chapter(file: ResultsArgument, readme: ReadmeOption = None) -> None:
+    """Print the chapter for the README that shows the results of `twin reproduce all`, or replace it in a README."""
+    from twin.reproduce import catalogue, readme_chapter
+
+    exhibits, quick = catalogue.read_all(file)
+    if readme is None:
+        print(readme_chapter.chapter(exhibits, quick))
+        return
+    with outputs.writing(readme, "--readme"):
+        readme_chapter.update(readme, exhibits, quick)
 
 
 @app.command("fit-surrogate")
@@ -293,6 +404,7 @@ def study(
     resume: ResumeOption = False,
     live: LinesOption = False,
     as_json: SummaryOption = False,
+    verify: CheckOption = None,
     extrapolate: ExtrapolateOption = False,
 ) -> None:
     """Run the surveys of a study and estimate the probability that a survey meets the requirements."""
@@ -300,7 +412,7 @@ def study(
 
     if not scheduler:
         _require_rendering()
-    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, extrapolate=extrapolate)
+    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify, extrapolate)
     raise typer.Exit(study_command.run(file, options))
 
 
@@ -323,6 +435,42 @@ def tune(
         _require_rendering()
     options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify, extrapolate)
     raise typer.Exit(study_command.tune(file, options))
+
+
+@app.command()
+def replay(
+    dataset: DatasetArgument,
+    calibration: CalibrationOption = None,
+    truth: TruthOption = None,
+    align: AlignOption = "first",
+    bayer: BayerOption = None,
+    out: ReplayOutOption = None,
+    preview: PreviewOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
+    from twin.datasets import preview as previewing
+    from twin.datasets import replay as recorded
+
+    options = recorded.ReplayOptions(calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer))
+    name = outputs.file_stem(dataset.resolve().name)
+    if preview:
+        file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))
+        opened = recorded.open_dataset(dataset, options)
+        with outputs.writing(file):
+            previewing.draw(opened, file)
+        console.print_table(f"First pair of {opened.name}", previewing.rows(opened))
+        print(f"Sheet: {file}")
+        return
+    folder = outputs.new_folder(out) if out is not None else outputs.unused_folder(Path("runs") / f"{name}-replay")
+    with console.replay_bar() as progress:
+        result = recorded.replay(dataset, folder, options, progress)
+    if as_json:
+        print(json.dumps(result.metrics, indent=1))
+    else:
+        console.print_metrics(result.metrics)
+        console.print_outputs(result.folder)
+    raise typer.Exit(exit_status(result))
 
 
 @app.command()
@@ -362,7 +510,7 @@ def schema() -> None:
     print(json.dumps(Scenario.model_json_schema(), indent=1))
 
 
-def exit_status(result: RunResult) -> int:
+def exit_status(result: RunResult | ReplayResult) -> int:
     """Returns the exit status of a survey: 130 interrupted; 1 aborted, degraded or requirement missed; 0 otherwise."""
     if result.status == "aborted" and result.metrics["reason"].startswith("interrupted"):
         return INTERRUPTED
@@ -397,9 +545,4 @@ def _new_folder(scenario: Scenario, out: Path | None) -> Path:
     """Returns the run folder: `out`, or the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty."""
     if out is not None:
         return outputs.new_folder(out)
-    first = Path("runs") / f"{outputs.file_stem(scenario.name)}-{scenario.seed}"
-    folder, count = first, 1
-    while folder.exists() and not outputs.is_empty(folder):
-        count += 1
-        folder = first.with_name(f"{first.name}-{count}")
-    return outputs.new_folder(folder)
+    return outputs.unused_folder(Path("runs") / f"{outputs.file_stem(scenario.name)}-{scenario.seed}")

@@ -44,6 +44,18 @@ def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
         yield lambda now: bar.update(task, completed=now.share, description=now.stage, note=progress_note(now))
 
 
+@contextmanager
+def replay_bar() -> Iterator[Callable[[str, float], None]]:
+    """Shows a progress bar if stderr is a terminal; yields the function that updates it with stage and fraction."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda stage, share: None
+        return
+    with Bar(TextColumn("{task.description:>7}"), BarColumn(), TaskProgressColumn(), console=console) as bar:
+        task = bar.add_task("replay", total=1.0)
+        yield lambda stage, share: bar.update(task, completed=share, description=stage)
+
+
 def progress_note(now: SurveyProgress) -> str:
     """Returns the progress of a survey as text.
 
@@ -84,9 +96,12 @@ def print_plan(summary: PlanSummary) -> None:
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Prints the verdict on a survey, the reasons and warnings, the key figures, and which requirements it meets."""
     from twin.report.verdict import badge, first_lines
-    from twin.report.wording import key_figures, plain
+    from twin.report.wording import key_figures, plain, replay_summary
 
-    print(f"{metrics['name']}, seed {metrics['seed']}: {badge(metrics).text}")
+    seed = "" if metrics["seed"] is None else f", seed {metrics['seed']}"
+    print(f"{metrics['name']}{seed}: {badge(metrics).text}")
+    if metrics.get("replay"):
+        print(replay_summary(metrics))
     for sentence in first_lines(metrics):
         print(f"- {sentence}")
     print_table("Key figures", [tuple(figure) for figure in key_figures(metrics)])

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import root_scalar
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from twin.core.floor_rays import ray_grid
 from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
+from twin.core.records import StereoRig
 from twin.surrogate import error_model_file
 from twin.surrogate.map_model import WINDOW_PX, roughness, roughness_error_px
 from twin.surrogate.matchability import Matchability
@@ -20,6 +21,7 @@ from twin.world.mission import Mission
 
 #: Largest number of floor points from which the distribution of the height error is computed.
 _POINTS = 20_000
+_GOLDEN_RATIO = 0.6180339887498949  # multiples of it, modulo 1, are spread evenly
 
 
 class ExpectedError(NamedTuple):
@@ -27,8 +29,8 @@ class ExpectedError(NamedTuple):
 
     Args:
         sigma_m: (n,) standard deviation of the height at floor points spread evenly over the images [m].
-        completeness: share of the floor in view for which the depth filter provides a height.
-        bound_px: largest Cramér-Rao bound of image matching over the depths of the plan [px].
+        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height.
+        bound_px: largest Cramér-Rao bound of image matching over the depths of the plan [px of the matched images].
         fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
     """
 
@@ -67,17 +69,19 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     """Returns the expected height error of the map, without the errors of the poses.
 
     The error has three parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
-    length f [px] and baseline b [m]; it decreases with the number of keyframes that observe a point, which is
-    1 / (1 - overlap along the leg), and with their distance. A lateral error of the mapped surface causes a height
-    error proportional to the slope of the floor. Edges and other roughness within the matching window cause an error
-    that increases with the roughness. The standard deviations of all errors come from the error model fitted to
-    rendered surveys. The disparity error depends on the water, light, texture and sensor of the scenario, through the
-    Cramer-Rao bound of image matching (`Matchability`).
+    length f [px] and baseline b [m]; it decreases with the distance between consecutive keyframes and with the number
+    of keyframes that observe a point, which is 1 / (1 - overlap along the leg). A lateral error of the mapped surface
+    causes a height error proportional to the slope of the floor. Edges and other roughness within the matching window
+    cause an error that increases with the roughness. The standard deviations of all errors, and the scatter of the
+    disparity error over the cells of a map, come from the error model fitted to rendered surveys. The disparity error
+    depends on the water, light, texture and sensor of the scenario, through the Cramér-Rao bound of image matching
+    (`Matchability`).
     """
     rig, scenario = mission.rig, mission.scenario
     fitted = error_model_file.load(scenario.imaging.error_model)
     model, matching = fitted.model, Matchability(scenario, mission.illumination, mission.terrain)
-    depth, slope, rough_m = _floor_points(mission, forecast)
+    rig = rig.binned(matching.binning)
+    depth, slope, rough_m = _floor_points(mission, forecast, rig)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
     sigma_px = np.interp(depth, matching.depths_m, model.depth_error.sigma_px(table, matching.lamp_share))
@@ -85,6 +89,9 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
     step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
     share = float(model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m))
+    scatter = np.interp(depth, matching.depths_m, model.depth_cell_scatter(table))
+    evenly = (0.5 + np.arange(len(depth)) * _GOLDEN_RATIO) % 1
+    sigma_px *= np.exp(scatter * ndtri(np.clip(evenly, 1e-6, 1 - 1e-6)))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
     rough_px = rough_m * rig.focal_px * rig.baseline_m / depth**2
@@ -97,8 +104,14 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     )  # fmt: skip
 
 
-def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Array, Array]:
-    """Returns depths (n,) [m], slopes (n,) [m/m] and roughness (n,) [m] at points spread evenly over the images."""
+def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array]:
+    """Returns depths (n,) [m], slopes (n,) [m/m] and roughness (n,) [m] at points spread evenly over the images.
+
+    Args:
+        mission: the survey.
+        forecast: floor points in the keyframes.
+        matched: calibration of the images that are matched, which may be binned.
+    """
     rig, grid = mission.rig, mission.grid
     rays = np.column_stack([rig.normalised(ray_grid(rig, RAY_COLUMNS)), np.ones(forecast.depth_m.shape[1])])
     image, ray = np.nonzero(np.isfinite(forecast.depth_m))
@@ -109,7 +122,7 @@ def _floor_points(mission: Mission, forecast: FloorForecast) -> tuple[Array, Arr
     heights = true_heights(grid, mission.terrain.height_at)
     down, east = np.gradient(heights, grid.cell_m)
     typical_m = float(np.median(depth)) if len(depth) else 1.0
-    rough = roughness(heights, WINDOW_PX * typical_m / rig.focal_px / grid.cell_m)
+    rough = roughness(heights, WINDOW_PX * typical_m / matched.focal_px / grid.cell_m)
     rows = np.clip(((grid.north_m - y) / grid.cell_m).astype(int), 0, grid.rows - 1)
     cols = np.clip(((x - grid.west_m) / grid.cell_m).astype(int), 0, grid.cols - 1)
     return depth, np.nan_to_num(np.hypot(down, east)[rows, cols]), rough[rows, cols].astype(float)

@@ -14,9 +14,9 @@ from twin.study.study_file import load_study
 from twin.study.surveys import surveys
 from twin.study.worker import SINGLE_THREADED
 from twin.surrogate import error_model_file
-from twin.surrogate_fit.rendered_surveys import all_statistics, fit_to_surveys
+from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
 
-DEFAULT_STUDIES = ("fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper")
+DEFAULT_STUDIES = ("fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper", "fit_murky")
 
 
 def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> int:
@@ -34,7 +34,7 @@ def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) ->
     Raises:
         TwinError: a study is invalid, or too few surveys are complete.
     """
-    compared = error_model_file.load().model
+    compared = comparison_model(error_model_file.load().model)
     rendered = [
         (s.scenario, s.folder)
         for file in files or DEFAULT_STUDIES

@@ -23,6 +23,15 @@ def new_folder(folder: Path, option: str = "--out") -> Path:
     return folder
 
 
+def unused_folder(first: Path) -> Path:
+    """Returns the first of FOLDER, FOLDER-2, FOLDER-3, ... that is new or empty; raises TwinError like `new_folder`."""
+    folder, count = first, 1
+    while folder.exists() and not is_empty(folder):
+        count += 1
+        folder = first.with_name(f"{first.name}-{count}")
+    return new_folder(folder)
+
+
 def output_file(file: Path, option: str = "--out") -> Path:
     """Returns `file`. Raises TwinError if this path exists but is not a regular file, or if it cannot be written."""
     _check_path(file, option, "the path of a file")

@@ -82,7 +82,7 @@ def summarise(mission: Mission) -> PlanSummary:
 
 
 def _predicted_metrics(floor: FloorForecast, error: ExpectedError) -> dict[str, dict[str, float | None]]:
-    """Returns the predictable metrics by section and key of metrics.json."""
+    """Returns the metrics that can be predicted before the survey, by section and key of metrics.json."""
     covered = floor.coverage * error.completeness
     along, across = spread(floor.overlap_along), spread(floor.overlap_across)
     return {

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.errors import TwinError
-from twin.study import agreement, agreement_report, summary, tuning, tuning_report, wording
+from twin.study import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
 from twin.study.candidates import tuning_config
 from twin.study.engine import Engine
 from twin.study.local_engine import LocalEngine, default_jobs
@@ -79,14 +79,20 @@ def run(file: str, options: StudyOptions) -> int:
     folder = _folder(options, "study", study)  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
         result = run_study(study, folder, options.resume, engine, progress)
+        checked = None
+        if options.verify and not result.interrupted:
+            checked = rendered_check.check(study, result.analysis, options.verify, folder, engine, progress)
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
     if options.as_json:
         identity = {"name": study.name, "out": str(folder), "throughput": result.throughput._asdict()}
+        identity |= {} if checked is None else {"rendered_check": rendered_check.summary(checked)}
         print(json.dumps(summary.summary(result.analysis, identity), indent=1))
     else:
         _print_result(study, result)
-    return exit_status(result)
+        if checked is not None:
+            print(checked.sentence())
+    return exit_status(result) or int(checked is not None and not checked.agrees)
 
 
 def tune(file: str, options: StudyOptions) -> int:

@@ -1,4 +1,4 @@
-"""Deceleration of a vehicle that has lost vision, the same for the mission, which stops it, and the estimators."""
+"""Deceleration of a vehicle that has lost vision, commanded by the mission and predicted by the estimators."""
 
 from __future__ import annotations
 

@@ -30,6 +30,18 @@ def catmull_rom(a, b, c, e, t):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def catmull_rom_weights(t):
+    """Returns the weights of four samples in the Catmull-Rom cubic at the fraction t (float32) between the middle two.
+
+    See `catmull_rom`, which also returns the derivative.
+    """
+    half, one, two = np.float32(0.5), np.float32(1), np.float32(2)
+    first, last = half * t * (t * (two - t) - one), half * t * t * (t - one)
+    second = one + half * t * t * (np.float32(3) * t - np.float32(5))
+    return first, second, one - first - second - last, last
+
+
+@njit(cache=True, nogil=True, inline="always")
 def bicubic_with_gradient(image, x, y):
     """Returns the value of an image at column x and row y, and its derivatives with respect to x and y.
 

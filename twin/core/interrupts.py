@@ -1,4 +1,4 @@
-"""Handling of interrupts (Ctrl-C, SIGTERM): an interrupt ends the current stage of a survey, the others run."""
+"""Handling of interrupts (Ctrl-C, SIGTERM), which end only the current stage of a survey; later stages still run."""
 
 from __future__ import annotations
 

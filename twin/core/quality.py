@@ -18,11 +18,26 @@ class EpipolarError(NamedTuple):
             row offset [focal lengths].
         sigma: (4,) standard deviations of `estimate`.
         removed: (4,) errors corrected in the right images, in the same units; yaw is never corrected.
+        pattern: RMS over the regions of the image of the mean row difference that `estimate` does not explain, without
+            the part due to matching noise [focal lengths].
     """
 
     estimate: Array
     sigma: Array
     removed: Array
+    pattern: float = 0.0
+
+
+class DisparityOffset(NamedTuple):
+    """Offset that all disparities share, estimated from the motions between keyframes [focal lengths].
+
+    Args:
+        estimate: measured minus true disparity.
+        sigma: standard deviation of `estimate`.
+    """
+
+    estimate: float
+    sigma: float
 
 
 class EstimationQuality(NamedTuple):
@@ -36,8 +51,11 @@ class EstimationQuality(NamedTuple):
             divided by its expected value; None without a measured link.
         link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected.
         epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
-        frame_sigma_m: standard deviation (3-D) that the position of a frame accumulates by frame-to-frame motion until
-            the next node, 90th percentile over the nodes [m]; None without a second node.
+        frame_sigma_m: standard deviation (3-D) of the position of a frame relative to the last keyframe, by
+            frame-to-frame motion alone, just before the next keyframe; 90th percentile over the keyframes [m]; None
+            without a second keyframe.
+        disparity_offset: offset of all disparities that the links imply; None without images, or if the offset is
+            not observable.
     """
 
     frames_lost: int = 0
@@ -48,6 +66,7 @@ class EstimationQuality(NamedTuple):
     link_chi2: float | None = None
     epipolar: EpipolarError | None = None
     frame_sigma_m: float | None = None
+    disparity_offset: DisparityOffset | None = None
 
 
 class Finding(NamedTuple):
@@ -74,7 +93,7 @@ class ActionTimes(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Returns what the vehicle did and why; "" if it flew at the planned speed throughout."""
+        """Returns a sentence on why and for how long the vehicle was slowed or stopped; "" if it was neither."""
         done = [f"slowed for {self.slowed_s:.1f} s because frames were lost"] * (self.slowed_s > 0)
         done += [f"held station for {self.held_s:.1f} s because vision was lost"] * (self.held_s > 0)
         return f"The vehicle {' and '.join(done)}." if done else ""

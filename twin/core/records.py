@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from twin.core.quality import EstimationQuality
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+#: Linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]; see `Frame.exposure`.
+Exposure = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class StereoRig:
 
     @property
     def focals_px(self) -> Array:
-        """(fx, fy) [px]."""
+        """Focal lengths (fx, fy) along the rows and the columns of the image [px]."""
         return np.array([self.fx_px, self.fy_px])
 
     @property
@@ -173,8 +176,8 @@ class Displacement(NamedTuple):
 
     Args:
         since: number of the node.
-        displacement_m: (3,) measured displacement [m]: 1 + s times the true displacement, plus noise. The scale error s
-            is constant over the survey.
+        displacement_m: (3,) measured displacement [m]: (1 + s) times the true displacement, plus noise. The scale error
+            s is constant over the survey.
         cov: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node,
             without the scale error.
     """
@@ -194,6 +197,8 @@ class Frame:
         left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
         readings: readings of the navigation sensors.
         keyframe: whether the frame becomes a keyframe; None leaves the choice to the estimator.
+        exposure: linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)], 1 at full scale,
+            from the exposure time, gain and white balance that the cameras report; None if they report none.
     """
 
     index: int
@@ -202,6 +207,7 @@ class Frame:
     right: Image | None
     readings: Readings = field(default_factory=Readings)
     keyframe: bool | None = None
+    exposure: Exposure | None = None
 
 
 class Estimate(NamedTuple):
@@ -411,6 +417,12 @@ class Truth:
         asked: (rows, cols) bool, cells whose centre lies in the asked area.
         reference_yaw: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: the heading at
             the start.
+        albedo: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from
+            above, 255 = white; NaN where there is no floor or an object lies on it. None: not known.
+        in_area: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
+        objects: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None without
+            objects. `height_m` is that of the highest surface, floor or object.
+        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object; None without objects.
     """
 
     trajectory: Trajectory
@@ -421,3 +433,7 @@ class Truth:
     seen: NDArray[np.bool_]
     asked: NDArray[np.bool_]
     reference_yaw: Array | None = None
+    albedo: Callable[[MapGrid], NDArray[np.float32]] | None = None
+    in_area: Callable[[Array, Array], NDArray[np.bool_]] | None = None
+    objects: NDArray[np.uint16] | None = None
+    overhung: NDArray[np.bool_] | None = None

@@ -30,6 +30,8 @@ class EstimatorSettings:
         patch_px: side of the matching window, the same for stereo and for motion [px]; odd.
         keyframe_overlap: a frame becomes a keyframe if its overlap with the last keyframe is below this fraction; used
             only if the caller does not choose the keyframes.
+        wide_search: whether a link that cannot be measured from the predicted poses is searched for in the whole
+            images, for large or unpredictable motions between keyframes; costs time only where links fail.
 
     Raises:
         TwinError: a value is out of range.
@@ -44,6 +46,7 @@ class EstimatorSettings:
     points: int = 500
     patch_px: int = 11
     keyframe_overlap: float = 0.9
+    wide_search: bool = False
 
     def __post_init__(self) -> None:
         for name, low, high in (

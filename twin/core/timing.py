@@ -12,7 +12,7 @@ import numpy as np
 #: Function, such as a `Stopwatch`, that takes the name of a stage and returns a context manager that times the stage.
 StageTimer = Callable[[str], AbstractContextManager[None]]
 #: Stages of a survey, in processing order.
-STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map")
+STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map", "orthomosaic")
 
 
 class Stopwatch:

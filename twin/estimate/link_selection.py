@@ -123,7 +123,11 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
 
 
 def _links_over_a_footprint(links: Sequence[Link]) -> float:
-    """Returns the number of consecutive links in which a patch of floor is in view, given the links of one node."""
+    """Returns the number m = 1 / (1 - overlap) of consecutive links during which a patch of floor stays in view.
+
+    Args:
+        links: links of one node; the overlap is that of the link from the latest earlier node.
+    """
     overlap = max(links, key=lambda link: link.i).overlap if links else 0.0
     return 1 / (1 - min(overlap, _LARGEST_OVERLAP))
 

@@ -15,6 +15,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
+from twin.core.quality import DisparityOffset
 from twin.core.records import Alignment, Displacement, SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
@@ -85,8 +86,9 @@ class AlignmentHistory:
             NaN where the measurement failed.
         nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
             failed), because the link could not be measured.
-        frame_sigmas_m: for each node after the first, the standard deviation (3-D) of the translation since the
-            previous node, from frame-to-frame motion fused with the DVL [m].
+        disparity_offsets: for each measured link, the offset of all disparities that its points imply.
+        frame_sigmas_m: for each keyframe after the first, the standard deviation (3-D) of the translation since the
+            previous keyframe, from frame-to-frame motion alone [m].
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -94,6 +96,7 @@ class AlignmentHistory:
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
     link_residuals: list[float] = field(default_factory=list[float])
+    disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0
 
@@ -240,7 +243,7 @@ class KeyframeNetwork:
     def truncate(self, n_frames: int) -> None:
         """Removes the keyframes, nodes and links of all frames after the first `n_frames`.
 
-        These are left if the processing of a frame is interrupted.
+        Keyframes of later frames exist if an interrupt stopped the processing of a frame.
 
         Raises:
             OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
@@ -263,6 +266,8 @@ class KeyframeNetwork:
         """Returns the links from earlier nodes (given as pairs of node and overlap) that could be measured."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         self.history.link_residuals += [np.nan if motion is None else motion.residual for motion in motions]
+        offsets = [motion.disparity_offset for motion in motions if motion is not None]
+        self.history.disparity_offsets += [offset for offset in offsets if offset is not None]
         return [
             link_selection.to_link(node, other, overlap, motion)
             for (other, overlap), motion in zip(others, motions, strict=True)

@@ -6,7 +6,7 @@ measurement of links are done at keyframes, and the global alignment (GA) at the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +18,24 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link
+from twin.core.orthomosaic import OrthoTile
 from twin.core.quality import EstimationQuality
-from twin.core.records import ElevationMap, Estimate, Frame, MapGrid, SensorNoise, StereoRig, SurveyResult, Trajectory
+from twin.core.records import (
+    ElevationMap,
+    Estimate,
+    Frame,
+    Image,
+    MapGrid,
+    SensorNoise,
+    StereoRig,
+    SurveyResult,
+    Trajectory,
+)
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
+from twin.estimate import disparity_offset
 from twin.estimate.mapping.footprint import footprint_grid
+from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator
 from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance, transport_covariance
@@ -212,6 +225,35 @@ class Navigator:
         found = self.vision.build_map(turned, cells, result.step_cov, report)
         return replace(found, map_from_world=map_from_world)
 
+    def orthomosaic(
+        self,
+        result: SurveyResult,
+        elevation: ElevationMap,
+        restore: Restore | None = None,
+        progress: Callable[[float], None] | None = None,
+    ) -> Iterator[OrthoTile] | None:
+        """Returns the orthomosaic of the keyframe images, tile by tile; None without images.
+
+        Args:
+            result: result of the survey (`finish`).
+            elevation: map of the survey (`build_map`).
+            restore: removes the effects of lamps and water from an image; None: colours as seen, at equal exposure.
+            progress: called with the finished fraction, 0 to 1.
+        """
+        rows = result.keyframe_rows
+        if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
+            return None
+
+        def load(k: int) -> Image:
+            image = self.vision.left_image(int(rows[k]))
+            assert image is not None
+            return image
+
+        exposures = {k.row: k.exposure for k in self.network.keyframes}
+        poses = elevation.map_from_world @ result.final.world_from_camera[rows]
+        views = Views(poses, result.keyframe_depth_m, [exposures[int(row)] for row in rows], load)
+        return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress)
+
     def _quality(self) -> EstimationQuality:
         """Returns the quality of the estimation: lost frames, failed links, residuals and rectification errors."""
         history = self.network.history
@@ -226,6 +268,9 @@ class Navigator:
             link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
+            disparity_offset=disparity_offset.combine(
+                history.disparity_offsets, len(self.network.nodes) - 1, self.rig.focal_px
+            ),
         )
 
     @property
@@ -277,13 +322,17 @@ class Navigator:
         if points is None:
             self.filter.fuse_position_fixes(frame.readings)
             return "too few points in stereo"
+        if (tracking_cov := self.vision.tracking_cov()) is not None:
+            self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
         pose = self.filter.world_from_camera
         depth_m = float(np.median(points.xyz[:, 2]))
         number = len(self.network.keyframes)
-        keyframe = Keyframe(number, row, track, pose, points, frame.readings, depth_m=depth_m)
+        keyframe = Keyframe(number, row, track, pose, points, frame.readings, depth_m=depth_m, exposure=frame.exposure)
         self.network.add(keyframe)
         is_node = self.network.is_node(keyframe)
         chain = self._follow_chain(keyframe) if is_node else None
+        if chain is not None and status != "ok" and self.settings.wide_search:
+            self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
         self.filter.fuse_position_fixes(frame.readings)  # after `_follow_chain`, to correct its error too
         with self.stopwatch("f2m"):
             self._register_with_mosaic(keyframe, chain)
@@ -342,8 +391,6 @@ class Navigator:
         The motion since the last node then restarts at this node.
         """
         bridge = None
-        if self.network.nodes:
-            self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(self.since_node.cov[3:, 3:]))))
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
             bridge = Link(self.network.nodes[-1].number, node.number, self.since_node.motion, cov, 0.0, 0)

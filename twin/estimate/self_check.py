@@ -18,9 +18,10 @@ MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
 MAX_LINK_CHI2 = 2.5  # mean chi-square per degree of freedom
 MAX_LINK_RESIDUAL = 2.0  # median residual / expected residual
-MAX_ROW_SPREAD = 1.6  # standard deviation of the row differences / expected standard deviation
 MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correction
+MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and a row offset do not explain, RMS
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
+MAX_DISPARITY_OFFSET_PX = 0.08  # the same, estimated from the motions between keyframes
 MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
@@ -38,7 +39,7 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
     """
     return [
         finding
-        for findings in (_tracking(result), _stereo(result), _rectification(result, rig), _consistency(result))
+        for findings in (_tracking(result), _stereo(result), _rectification(result, rig), _consistency(result, rig))
         for finding in findings
     ]
 
@@ -60,7 +61,7 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:
-    """Checks the number of stereo matches, the repetition of the texture and the scatter of the row differences."""
+    """Yields a finding if stereo pairs have too few matched points, and if the texture repeats."""
     pairs = result.stereo_observations
     if not pairs:
         return
@@ -72,14 +73,14 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
     if repeated is not None and repeated > MAX_REPETITION:
         text = f"the texture repeats (autocorrelation {repeated:.2f}), so matches are ambiguous"
         yield Finding("repetition", repeated, MAX_REPETITION, text)
-    ratio = _median(pair.row_spread_ratio for pair in pairs)
-    if ratio is not None and ratio > MAX_ROW_SPREAD:
-        text = f"row differences of stereo matches scatter {ratio:.1f} times as much as expected"
-        yield Finding("row_spread", ratio, MAX_ROW_SPREAD, text)
 
 
 def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
-    """Checks for rectification errors that are not removed from the images: a row offset, and the estimated yaw."""
+    """Yields a finding for each rectification error that remains in the images: row offset, yaw, other patterns.
+
+    The scatter of row differences within a region of the image is not a finding: the covariances of matches include it
+    (`stereo.row_noise_ratio`).
+    """
     offset = _median(pair.row_offset_px for pair in result.stereo_observations)
     if offset is not None and abs(offset) > MAX_ROW_OFFSET_PX:
         text = f"the rows of the right image are offset by {offset:+.2f} px"
@@ -87,21 +88,40 @@ def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
     epipolar = result.quality.epipolar
     if epipolar is not None:
         yaw, sigma = float(epipolar.estimate[1]), float(epipolar.sigma[1])
-        shift_px = abs(yaw) * rig.focal_px
+        shift_px, pattern_px = abs(yaw) * rig.focal_px, epipolar.pattern * rig.focal_px
         if shift_px > MAX_YAW_PX and abs(yaw) > _SIGNIFICANT * sigma:
             text = (
                 f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"
                 f" disparities may be off by {shift_px:.1f} px"
             )
             yield Finding("yaw", shift_px, MAX_YAW_PX, text)
+        if pattern_px > MAX_ROW_PATTERN_PX:
+            text = (
+                f"row differences of stereo matches vary systematically over the image by {pattern_px:.2f} px, which no"
+                " rotation of a camera explains: the distortion or the port is not as calibrated"
+            )
+            yield Finding("row_pattern", pattern_px, MAX_ROW_PATTERN_PX, text)
 
 
-def _consistency(result: SurveyResult) -> Iterator[Finding]:
-    """Checks that the links agree with their covariances and that the position covariances stay small."""
+def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
+    """Yields a finding for each sign of inconsistent links or large uncertainty.
+
+    These are large residuals of matched points, a significant offset of all disparities, a large chi-square of the
+    links, and large standard deviations of positions.
+    """
     quality = result.quality
     if quality.link_residual is not None and quality.link_residual > MAX_LINK_RESIDUAL:
         text = f"residuals of points matched between keyframes are {quality.link_residual:.1f} times their noise"
         yield Finding("link_residual", quality.link_residual, MAX_LINK_RESIDUAL, text)
+    offset = quality.disparity_offset
+    if offset is not None:
+        offset_px = offset.estimate * rig.focal_px
+        if abs(offset_px) > MAX_DISPARITY_OFFSET_PX and abs(offset.estimate) > _SIGNIFICANT * offset.sigma:
+            text = (
+                f"the motions of near and far points imply that all disparities are off by {offset_px:+.2f} px:"
+                " a principal point or the yaw of a camera is not as calibrated"
+            )
+            yield Finding("disparity_offset", abs(offset_px), MAX_DISPARITY_OFFSET_PX, text)
     if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
         text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
         yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -10,6 +11,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
@@ -17,7 +19,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
 from twin.estimate.viewing_plane import viewing_plane
-from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo
+from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo, wide_search
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
@@ -193,6 +195,9 @@ class StereoVision:
             repetition=repeated,
         )
 
+    def tracking_cov(self) -> Array | None:
+        return None if self.f2f.reference is None else self.f2f.cov_since_keyframe
+
     def restart_tracking(self) -> None:
         if self._points is not None:
             self.f2f.restart(self._image, self._points)
@@ -220,8 +225,28 @@ class StereoVision:
         motions: list[Motion | None] = []
         for other, matched in zip(others, matches, strict=True):
             with self.stopwatch("network"):
-                motions.append(None if matched is None else self.matcher.motion(node, other, matched))
+                motion = None if matched is None else self.matcher.motion(node, other, matched)
+            if motion is None and self.settings.wide_search:
+                motion = self._search_widely(node, other)
+            motions.append(motion)
         return motions
+
+    def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
+        """Returns the motion between two nodes, predicted by features of the whole images and then measured.
+
+        None if the features do not give a prediction, or if the measurement fails.
+        """
+        if node.points is None:
+            return None
+        with self.stopwatch("flow"):
+            grays = self.spool.gray(node.row)[0], self.spool.gray(other.row)[0]
+            other_from_node = wide_search.coarse_motion(*grays, node.points, self.rig, self.settings.patch_px)
+            if other_from_node is None:
+                return None
+            moved = replace(other, world_from_camera=node.world_from_camera @ geometry.inverse(other_from_node))
+            matched = self.matcher.match(node, [moved])[0]
+        with self.stopwatch("network"):
+            return None if matched is None else self.matcher.motion(node, moved, matched)
 
     def epipolar_error(self) -> EpipolarError:
         return self.calibration.report()
@@ -239,6 +264,9 @@ class StereoVision:
             grid,
             progress,
         )
+
+    def left_image(self, row: int) -> Image | None:
+        return self.spool.left(row)
 
     def _pair(self, row: int) -> KeyframeImages:
         left, right = self.spool.pair(row)

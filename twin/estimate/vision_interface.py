@@ -11,7 +11,7 @@ from typing import Protocol
 
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
-from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, SurveyResult
+from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, SurveyResult
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
@@ -42,6 +42,14 @@ class Vision(Protocol):
 
         Returns:
             The matched points, or None if there are too few for a keyframe.
+        """
+        ...
+
+    def tracking_cov(self) -> Array | None:
+        """Returns the covariance (6, 6) of the pose of the last frame relative to the last keyframe, by F2F alone.
+
+        Errors are motions [rotation, translation] (rad, m) in the axes of the last frame. None before the first
+        keyframe and where the covariance is unknown.
         """
         ...
 
@@ -86,5 +94,15 @@ class Vision(Protocol):
             grid: grid of the map.
             step_cov: (n_keyframes, 6, 6) covariance of the pose of each keyframe relative to the previous keyframe.
             progress: called with the number of keyframes that are done.
+        """
+        ...
+
+    def left_image(self, row: int) -> Image | None:
+        """Returns the left image (H, W, 3) of the keyframe at frame index `row`, with square pixels.
+
+        None if the implementation has no images.
+
+        Raises:
+            OSError: the image could not be read.
         """
         ...

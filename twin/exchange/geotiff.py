@@ -14,9 +14,11 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
+from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
 from twin.core.georeference import Georeference
+from twin.core.orthomosaic import OrthoTile
 from twin.core.records import ElevationMap, Image, MapGrid
 
 Layer = NDArray[np.float32]
@@ -33,12 +35,15 @@ _ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include 
 _DECIMALS = 6  # to which scene coordinates [m] are rounded; CRS coordinates have up to seven digits before the point
 
 
-def write_map(folder: Path, elevation_map: ElevationMap, georeference: Georeference | None = None) -> None:
-    """Writes dem.tif, dem_sigma.tif and mosaic.tif into a folder."""
+def write_map(
+    folder: Path, elevation_map: ElevationMap, georeference: Georeference | None = None, mosaic: bool = True
+) -> None:
+    """Writes dem.tif and dem_sigma.tif into a folder, and mosaic.tif with the colours of the cells if `mosaic`."""
     grid = elevation_map.grid
     write_elevations(folder / "dem.tif", elevation_map.height_m, grid, "elevation [m]", georeference)
     write_layer(folder / "dem_sigma.tif", elevation_map.sigma_m, grid, "standard deviation [m]", georeference)
-    write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, grid, georeference)
+    if mosaic:
+        write_mosaic(folder / "mosaic.tif", elevation_map.mosaic, grid, georeference)
 
 
 def write_elevations(
@@ -69,12 +74,56 @@ def write_layer(
         file.update_tags(**_tags(georeference))
 
 
+def write_masks(
+    path: Path, masks: dict[str, NDArray[Any]], grid: MapGrid, georeference: Georeference | None = None
+) -> None:
+    """Writes layers (rows, cols) of integers or flags as uint16, one band each; the keys describe the bands."""
+    with rasterio.open(path, "w", **_profile(grid, len(masks), "uint16", georeference)) as file:
+        for band, (description, values) in enumerate(masks.items(), start=1):
+            file.write(values.astype(np.uint16), band)
+            file.set_band_description(band, description)
+        file.update_tags(**_tags(georeference))
+
+
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
     """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
     profile = _profile(grid, 3, "uint8", georeference)
     with rasterio.open(path, "w", **profile, nodata=0, photometric="RGB") as file:
         file.write(np.moveaxis(mosaic, 2, 0))
         file.update_tags(**_tags(georeference))
+
+
+class OrthomosaicFile:
+    """GeoTIFF of an orthomosaic, written tile by tile: R, G, B and alpha, in the CRS of the map files.
+
+    Use as a context manager. An exception within it removes the incomplete file.
+
+    Args:
+        path: path of the file.
+        grid: pixels of the orthomosaic.
+        georeference: position of the scene in the CRS of the DEM; None: local coordinates.
+    """
+
+    def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
+        self._path = path
+        profile = _profile(grid, 4, "uint8", georeference) | {"tiled": True, "blockxsize": 256, "blockysize": 256}
+        self._file = rasterio.open(path, "w", **profile, photometric="RGB", alpha="unspecified")
+        self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+        self._file.update_tags(**_tags(georeference))
+
+    def __enter__(self) -> OrthomosaicFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._file.close()
+        if kind is not None:
+            self._path.unlink(missing_ok=True)
+
+    def write(self, tile: OrthoTile) -> None:
+        """Writes a tile."""
+        rows, cols = tile.rgba.shape[:2]
+        window = (tile.row, tile.row + rows), (tile.col, tile.col + cols)
+        self._file.write(np.moveaxis(tile.rgba, 2, 0), window=window)
 
 
 def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:

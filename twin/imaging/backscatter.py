@@ -44,14 +44,18 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
         (..., n, 3) radiance per metre of range, per colour band in photometric units [cd/m3].
     """
     points = ray[..., None, :] * range_m[..., None]
-    total = lamps.scattered_once_per_m(points, ray)
-    if not water.multiple:  # else daylight is that of `daylight.DaylightVeil`
-        total = total + _of_daylight(lamps, water, ray, points)
-    return total * np.exp(-water.camera_loss_per_m * range_m[..., None])
+    total = lamps.scattered_once_per_m(points, ray) * np.exp(-water.camera_loss_per_m * range_m[..., None])
+    if water.multiple:
+        return total
+    loss = np.exp(-lamps.sources.daylight.camera_loss_per_m * range_m[..., None])
+    return total + _of_daylight(lamps, water, ray, points) * loss
 
 
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
-    """Returns the daylight (..., n, 3) scattered into rays [cd/m3]; it is taken to arrive along the optical axis."""
+    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
+
+    The daylight is assumed to travel along the optical axis, away from the camera.
+    """
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
     light = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[..., 2:])
@@ -83,7 +87,11 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
 
 
 def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
-    """Returns rows and columns of the grid of pixels for beam tables (m, 2) of angle [deg] and intensity."""
+    """Returns the numbers of rows and columns of the pixel grid on which the backscatter of lamps is computed.
+
+    Args:
+        beams: for each lamp, (m, 2) angle from the beam axis [deg] and intensity; narrow beams need a finer grid.
+    """
     half_deg = [float(beam[beam[:, 1] >= beam[0, 1] / 2, 0].max()) for beam in beams]
     return NARROW_GRID if min(half_deg, default=90.0) < NARROW_DEG else GRID
 

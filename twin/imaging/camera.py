@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import Image
+from twin.core.records import Exposure, Image
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
 from twin.imaging.lens_psf import LensPsf
@@ -33,13 +33,15 @@ METERED_PX = 4  # where raw images are sampled from rendered ones, every n-th pi
 class StereoCapture(NamedTuple):
     """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depths (H, W) [m] for the evaluation.
 
-    The right image and its depth are None if only the left camera was used.
+    The right image and its depth are None if only the left camera was used. `exposure` is that of both images, as the
+    cameras report it (`Frame.exposure`).
     """
 
     left: Image
     right: Image | None
     depth_left: Depth
     depth_right: Depth | None
+    exposure: Exposure
 
 
 class DecomposedImage(NamedTuple):
@@ -119,10 +121,11 @@ class StereoCamera:
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
         self._n_captures += 1
         left, depth_left, setting = self._expose(pose, 0, twist_body, None)
+        exposure = self._sensor.signal_per_cd(setting)
         if not stereo:
-            return StereoCapture(left, None, depth_left, None)
+            return StereoCapture(left, None, depth_left, None, exposure)
         right, depth_right, _ = self._expose(pose, 1, twist_body, setting)
-        return StereoCapture(left, right, depth_left, depth_right)
+        return StereoCapture(left, right, depth_left, depth_right, exposure)
 
     def twist_of_camera(self, camera: int, twist_body: Array) -> Array:
         """Returns the [angular, linear] velocity (6,) of a camera (0 left, 1 right) in its own axes [rad/s, m/s]."""
@@ -138,10 +141,11 @@ class StereoCamera:
         """
         albedo, depth = self._renderer.render(world_from_left)
         pose = StampedPose(world_from_left, 0.0)
-        components = self._image_formation.components(albedo, depth, 0, pose)
+        objects = self._image_formation.draw_objects(albedo, depth, 0, pose)
+        components = self._image_formation.components(albedo, depth, 0, pose, objects)
         cameras = self._cameras
         sensor = sensor_of(self._scenario, cameras.raw_rig)
-        floor = self._image_formation.radiance_without_snow(albedo, depth, 0, pose)
+        floor = self._image_formation.radiance_without_snow(albedo, depth, 0, pose, objects)
         setting = self._meter(sensor, components.total, depth)
         motion = sensor.motion(self.twist_of_camera(0, twist_body), setting, len(depth))
         light = self._through_lens(floor, depth, 0, pose, motion)
@@ -161,8 +165,9 @@ class StereoCamera:
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
         with self._stopwatch("render"):
             albedo, depth = self._renderer.render(world_from_camera)
+            objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
         with self._stopwatch("optics"):
-            floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose)
+            floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
             at_rest = None
             if setting is None:
                 at_rest = self._with_snow(floor, depth, pose)
@@ -201,9 +206,10 @@ class StereoCamera:
         """
         light = self._psf.out_of_focus(floor, depth)
         if motion is not None:
+            motion = motion._replace(rolls_later=self._cameras.sampling is not None)
             light = integrate(light, depth, self._focal_px, motion)
         if light is floor and motion is None and at_rest is not None:
             light = at_rest
         else:
             self._image_formation.add_snow(light, depth, camera, pose, motion)
-        return self._cameras.sample(self._psf.transfer(light), depth, camera)
+        return self._cameras.sample(self._psf.transfer(light), depth, camera, motion=motion)

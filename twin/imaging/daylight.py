@@ -44,8 +44,8 @@ class FloorDaylight(NamedTuple):
         to_sun: (3,) unit direction to the refracted sun, east, north, up.
         beam_lx: (3,) illuminance by the beam just below the surface on a plane that faces the sun.
         beam_per_m: (3,) attenuation of the beam with depth.
-        rest_lx: (3, 4, 4) illuminance by all other light at the reference depth, a form in (east, north, up, 1).
-        rest_per_m: (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the change of its logarithm.
+        rest_lx: (3, 4, 4) illuminance by all other light at the reference depth, a quadratic form in (n, 1).
+        rest_per_m: (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the logarithm of the other light.
         reference_depth_m: depth below the surface at which `rest_lx` applies.
         fitted_m: lowest and highest d of the fit.
     """
@@ -59,17 +59,16 @@ class FloorDaylight(NamedTuple):
     fitted_m: tuple[float, float]
 
 
-def floor_daylight(daylight: Daylight, water: Medium) -> FloorDaylight:
+def floor_daylight(daylight: Daylight) -> FloorDaylight:
     """Returns the daylight on the floor.
 
     With single scattering, beam and diffuse light keep their shares, and both decrease with the diffuse attenuation;
     with multiple scattering the beam turns into diffuse light on its way.
 
     Args:
-        daylight: sun, sky and depth of the water.
-        water: optical properties of the water.
+        daylight: sun, sky, depth and properties of the water.
     """
-    source, east_north = daylight.source, _turn(daylight.source)
+    source, water, east_north = daylight.source, daylight.water, _turn(daylight.source)
     beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
     if not (deep and water.multiple and daylight.surface_lx.any()):
         form = east_north @ _in_clear_water(source).slope_form(0.0, 1e-6) @ east_north.T
@@ -102,13 +101,12 @@ class DaylightVeil:
     """Daylight that the water scatters into the lines of sight of a camera, with any order of scattering.
 
     Args:
-        daylight: sun, sky and depth of the cameras.
-        water: optical properties of the water.
-        range_m: (n,) ranges at which it is tabulated [m], increasing from 0; the last one may be infinite.
+        daylight: sun, sky, water and depth of the cameras.
+        range_m: (n,) ranges at which the radiance is tabulated [m], increasing from 0; the last one may be infinite.
     """
 
-    def __init__(self, daylight: Daylight, water: Medium, range_m: Array):
-        self._depth_m, self._source = daylight.camera_depth_m, daylight.source
+    def __init__(self, daylight: Daylight, range_m: Array):
+        self._depth_m, self._source, water = daylight.camera_depth_m, daylight.source, daylight.water
         terms = _veil_terms(self._depth_m, water, self._source, range_m)
         self._terms = np.ascontiguousarray(terms * daylight.surface_lx)
         fields = [_field(band, self._source, 1) for band in water.bands]
@@ -137,7 +135,12 @@ class DaylightVeil:
 
 @njit(cache=True, nogil=True)
 def _interpolate_terms(terms, at, turn, out):
-    """Adds to `out` (n, k) the terms (modes, views, k), interpolated at views `at` (n,), times `turn` (n, modes)."""
+    """Adds the azimuth series `terms` (modes, views, k), at interpolated views, to `out` (n, k).
+
+    Args:
+        at: (n,) fractional index of the view of each line of sight.
+        turn: (n, modes) factor cos(m azimuth) of term m of the series, for each line of sight.
+    """
     for i in range(at.size):
         view = int(at[i])
         part = at[i] - view
@@ -148,7 +151,11 @@ def _interpolate_terms(terms, at, turn, out):
 
 
 def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -> Array:
-    """Returns the terms (modes, views, ranges, 3) of the azimuth series of the veil, per lux at the surface."""
+    """Returns the radiance of the veil, per lux just below the surface, as an azimuth series [cd/m2 per lx].
+
+    Returns:
+        (modes, views, ranges, 3) terms of the series.
+    """
     cosine = np.cos(np.deg2rad(np.linspace(0.0, LARGEST_VIEW_DEG, VIEW_STEPS)))
     share = np.linspace(0.0, 1.0, FLOOR_STEPS + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -164,13 +171,16 @@ def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -
 
 
 def _local_attenuation(field: LightField, depth_m: float) -> float:
-    """Returns the attenuation of the illuminance with depth at a depth in deep water [1/m]."""
+    """Returns the attenuation coefficient of the illuminance at `depth_m` in water of infinite depth [1/m]."""
     above, below = (sum(field.illuminance(z, np.inf)) for z in (max(depth_m - 0.25, 0.0), depth_m + 0.25))
     return float(np.log(above / below) / (depth_m + 0.25 - max(depth_m - 0.25, 0.0)))
 
 
 def _turn(source: SunSky) -> Array:
-    """Returns the matrix (4, 4) from the axes towards the sun, left of it, up to east, north, up; the 1 is kept."""
+    """Returns the rotation (4, 4) of (x, y, z, 1) from the axes of the sun to the axes east, north, up.
+
+    In the axes of the sun, x points horizontally towards the sun, y to the left of it, and z up.
+    """
     east, north, _ = source.to_sun
     length = np.hypot(east, north)
     c, s = (east / length, north / length) if length > 0 else (1.0, 0.0)

@@ -90,6 +90,11 @@ def _stored_normals(height, spacing):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _store(rise_east, rise_north, spacing):
-    """Returns the stored normal (32 bits) of a triangle that rises by these heights per cell [m]."""
+    """Returns the normal of a triangle, packed in 32 bits.
+
+    Args:
+        rise_east, rise_north: change of height over one cell towards east and north [m].
+        spacing: side of a cell [m].
+    """
     per = -UNIT / (spacing + np.sqrt(rise_east * rise_east + rise_north * rise_north + spacing * spacing))
     return np.int32((np.int64(np.round(rise_east * per)) << 16) | (np.int64(np.round(rise_north * per)) & 0xFFFF))

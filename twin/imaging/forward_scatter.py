@@ -1,11 +1,14 @@
 """Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
-Without scattering, the fraction exp(-b r) of the light arrives; the scattered light arrives with a kernel that has a
-sharp core and a long tail (`spread.camera_mixture`). It is a mixture of Gaussians, the levels of an image pyramid: each
-level doubles the width, and its weights depend on band and range. The weights of a pixel are those of its own range:
-its ray receives light from the floor around it. Much of the tail lies outside the image. There the floor is taken to
-be the plane that fits the depth of the image, with the mean albedo of the image; the coarse levels of the pyramid cover
-it. The fine levels are mirrored at the borders of the image.
+Of the light that is not absorbed, the fraction exp(-b r) arrives unscattered; the scattered light is blurred by a
+kernel with a sharp core and a long tail (`spread.camera_mixture`). It is a mixture of Gaussians, the levels of an image
+pyramid: each level doubles the width, and its weights depend on band and range. The weights of a pixel are those of its
+own range: its ray receives light from the floor around it. The kernel is a function of angle. At the angle theta from
+the optical axis, a small angle covers more pixels by the factor k = 1 / cos(theta)^1.5, the geometric mean of 1 / cos^2
+(radially) and 1 / cos (tangentially); therefore a fraction log2(k) of the light of each level moves to the next, wider
+level. Much of the tail lies outside the image. There the floor is taken to be the plane that fits the depth of the
+image, with the mean albedo of the image; the coarse levels of the pyramid cover it. The fine levels are mirrored at the
+borders of the image.
 """
 
 from __future__ import annotations
@@ -32,16 +35,18 @@ Place: TypeAlias = NDArray[np.float32]
 SHARE_STEPS = 512  # number of steps of r / (r + RANGE_SCALE_M) from 0 to 1
 SURROUNDINGS_TAN = 1.6  # extent of the surroundings, as the tangent of the angle from the axis
 SURROUNDINGS_STEP_TAN = 0.035  # side of a pixel of the surroundings, as a tangent, within a factor of 1.4
+WIDENING = 1.5  # exponent of 1 / cos(theta) in the pixels that an angle covers
+WIDENED_TAN = 0.1  # largest standard deviation of a level that is widened; cos(theta) is nearly constant across it
 WIDEST_TAN = 1.2  # largest standard deviation of a level
 PLANE_STEP_PX = 8  # spacing of the pixels to which the plane is fitted
 
 
 class Surroundings(NamedTuple):
-    """The coarse grid of the image and its surroundings.
+    """Coarse grid that covers the image and the floor around it.
 
     Args:
-        level: level of the image pyramid whose pixel size it has.
-        pad: number of pixels before the first of the image, in rows and columns.
+        level: level of the image pyramid with the same pixel size as this grid.
+        pad: number of grid pixels before the first one of the image, in both directions.
         shape: rows and columns of the grid.
         focal_px: focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel.
     """
@@ -77,6 +82,7 @@ class ForwardScatter:
         weights = level_weights(water.bands, rig.focal_px, levels, range_m)
         self._core = weights[0]
         self._weights = weights[1:].astype(np.float32)
+        self._moved = _moved(weights[1:], rig.focal_px).astype(np.float32)
         self.kept = np.zeros((SHARE_STEPS + 1, 4), np.float32)
         self.kept[:, :3] = unscattered + weights[0]
         v, u = (np.arange(0.0, n, PLANE_STEP_PX) - (n - 1) / 2 for n in (rig.height_px, rig.width_px))
@@ -85,11 +91,12 @@ class ForwardScatter:
         focal = self.surroundings.focal_px
         self._terms = _plane_terms(cols / focal, rows / focal)
         self.range_per_depth = np.sqrt((self._terms**2).sum(1)).reshape(self.surroundings.shape).astype(np.float32)
+        self._widening = _widening(rig, self.surroundings, self.range_per_depth, levels)
 
     def plane(self, depth: Depth) -> Depth:
-        """Returns the depth of the plane around the image on the grid `surroundings` [m]; inf beyond `FAR_M`.
+        """Returns the depth [m] of the plane fitted to the floor in an image, on the grid `surroundings`.
 
-        In an image of a plane, 1 / depth is linear in column and row.
+        In an image of a plane, 1 / depth is linear in column and row. The depth is inf beyond `FAR_M`.
         """
         per_m = 1 / depth[::PLANE_STEP_PX, ::PLANE_STEP_PX].astype(np.float64)
         found = np.maximum(self._terms @ (self._fit @ per_m.ravel()), 1e-9)
@@ -115,11 +122,12 @@ class ForwardScatter:
                 images[-1], places[-1] = outer, outer_place
             images.append(np.asarray(cv2.pyrDown(images[-1]), np.float32))
             places.append(np.asarray(cv2.pyrDown(places[-1]), np.float32))
-        _weigh(images[-1], places[-1], self._weights[-1], np.zeros_like(images[-1]))
+        tables = tuple(zip(self._weights, self._moved, self._widening, strict=True))
+        _weigh(images[-1], places[-1], *tables[-1], np.zeros_like(images[-1]))
         for k in reversed(range(len(images) - 1)):
             height, width = places[k].shape
             wider = cv2.pyrUp(images[k + 1], dstsize=(width, height))
-            _weigh(images[k], places[k], self._weights[k], wider)
+            _weigh(images[k], places[k], *tables[k], wider)
             if k + 1 == grid.level:
                 height, width = (n_px_at(n, grid.level) for n in floor.shape[:2])
                 images[k] = images[k][grid.pad : grid.pad + height, grid.pad : grid.pad + width]
@@ -133,11 +141,14 @@ class ForwardScatter:
             floor, around: see `add`.
             range_m: (H, W) distance of the floor from the camera.
         """
-        place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
-        core = np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
-        light = (floor * core).astype(np.float32)
-        self.add(floor, np.ascontiguousarray(place[::2, ::2]), around, light)
+        light = (floor * self.core(range_m)).astype(np.float32)
+        self.add(floor, np.ascontiguousarray(place_of(range_m)[::2, ::2]), around, light)
         return light
+
+    def core(self, range_m: Array) -> Array:
+        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel, at ranges (H, W)."""
+        place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
+        return np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
 
 
 def place_of(range_m: Array) -> Place:
@@ -147,13 +158,25 @@ def place_of(range_m: Array) -> Place:
 
 
 def level_sigma_px(level: int) -> float:
-    """Returns the standard deviation of the blur of a level [px]; each step down and up adds a filter's variance."""
+    """Returns the standard deviation of the blur of a pyramid level [px].
+
+    Each step of downsampling and of upsampling adds the variance of its filter.
+    """
     return float(np.sqrt(2 * (4.0**level - 1) / 3))
 
 
 @lru_cache(maxsize=64)
 def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
-    """Returns the weights (levels + 1, 3, nodes) of the levels at the ranges `NODES_M`."""
+    """Returns the weights of the pyramid levels in the kernel of the blur, at the ranges `NODES_M`.
+
+    Args:
+        bands: water in the bands R, G, B.
+        focal_px: focal length.
+        levels: number of levels of the pyramid.
+
+    Returns:
+        (levels + 1, 3, nodes) weights; level 0 is light that is not blurred.
+    """
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
     return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
@@ -183,7 +206,7 @@ def n_px_at(n_px: int, level: int) -> int:
 
 
 def _surroundings(rig: StereoRig) -> Surroundings:
-    """Returns the grid of the surroundings of an image."""
+    """Returns the coarse grid that covers an image and the floor around it."""
     level = max(round(np.log2(SURROUNDINGS_STEP_TAN * rig.focal_px)), 1)
     side = 2.0**level
     half = max(rig.width_px, rig.height_px) / 2 / side
@@ -201,14 +224,49 @@ def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
     return np.column_stack([np.ones(across.size), across.ravel(), down.ravel()]).astype(np.float64)
 
 
+def _moved(weights: Array, focal_px: float) -> Array:
+    """Returns the change (levels, n, 3) of the weights if the light of each narrow level moves to the next wider one.
+
+    Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths.
+
+    Args:
+        weights: (levels, n, 3) weights of the levels from 1.
+        focal_px: focal length.
+    """
+    leaves = np.array([level_sigma_px(k + 1) <= WIDENED_TAN * focal_px for k in range(len(weights))])
+    leaves[-1] = False
+    leaving = weights * leaves[:, None, None]
+    return np.concatenate([np.zeros_like(weights[:1]), leaving[:-1]]) - leaving
+
+
+def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
+    """Returns the share of the light that moves to the next level, (rows, cols) for each level of the pyramid.
+
+    Args:
+        rig: the camera.
+        grid: grid of the surroundings, which the coarse levels cover.
+        per_depth: range divided by depth, 1 / cos(theta), on that grid.
+        levels: number of levels.
+    """
+    v, u = ((np.arange(0.0, n, 2) - (n - 1) / 2) / rig.focal_px for n in (rig.height_px, rig.width_px))
+    secants = [np.sqrt(1 + v[:, None] ** 2 + u**2)]
+    for level in range(2, levels + 1):
+        secants.append(per_depth[::2, ::2] if level == grid.level + 1 else secants[-1][::2, ::2])
+    if grid.level <= levels:
+        secants[grid.level - 1] = per_depth
+    return [np.ascontiguousarray(np.clip(WIDENING * np.log2(one), 0.0, 1.0), np.float32) for one in secants]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(image, place, weights, wider):
+def _weigh(image, place, weights, moved, widening, wider):
     """Multiplies one level by its weights and adds the wider levels, in place.
 
     Args:
         image: (rows, cols, 3) light of the floor at this level.
-        place: (rows, cols) fractional row of the table for each pixel.
+        place: (rows, cols) fractional row of `weights` and `moved` for each pixel.
         weights: (n, 3) weights of this level.
+        moved: (n, 3) change of the weights if the light of each level moves to the next one.
+        widening: (rows, cols) share of the light that moves, for each pixel.
         wider: (rows, cols, 3) weighted light of the wider levels.
     """
     last = weights.shape[0] - 2
@@ -217,6 +275,8 @@ def _weigh(image, place, weights, wider):
             at = place[v, u]
             k = min(int(at), last)
             w = at - np.float32(k)
+            s = widening[v, u]
             for c in range(3):
-                weight = weights[k, c] + w * (weights[k + 1, c] - weights[k, c])
+                near = weights[k, c] + s * moved[k, c]
+                weight = near + w * (weights[k + 1, c] + s * moved[k + 1, c] - near)
                 image[v, u, c] = image[v, u, c] * weight + wider[v, u, c]

@@ -26,6 +26,8 @@ class Daylight(NamedTuple):
         camera_depth_m: depth of the cameras below the surface at the planned altitude; 0 where there is no surface.
         focused_share: fraction of the daylight that the surface waves focus into caustics.
         source: direction to the sun under water, and share of the sky in the illuminance.
+        water: optical properties of the water, for daylight on the path from the surface and for its backscatter.
+        camera_loss_per_m: (3,) loss of daylight between floor and camera [1/m].
     """
 
     surface_lx: Array
@@ -34,7 +36,9 @@ class Daylight(NamedTuple):
     reference_depth_m: float
     camera_depth_m: float
     focused_share: float
-    source: SunSky = SunSky()
+    source: SunSky
+    water: Medium
+    camera_loss_per_m: Array
 
 
 class Illumination(NamedTuple):
@@ -47,10 +51,11 @@ class Illumination(NamedTuple):
 def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
-    The absorption of a band is the effective one over twice the planned altitude, the path to the floor and back, for
-    the spectrum of the lamps, or of daylight if there are no lamps; the light field of daylight (`daylight`) uses it,
-    too. The diffuse attenuation Kd, which serves snow and single scattering, has the effective absorption of daylight
-    over the path from the surface to the reference plane.
+    The absorption of a band is the effective one over the path of the light, with its spectrum. For lamps (and, for the
+    blur on the path to the camera, for all light) the path is twice the planned altitude: to the floor and back. For
+    daylight it is the slant path from the surface to the reference plane (the planned altitude where there is no
+    surface). The loss of daylight between floor and camera is chosen so that the light is exact for the whole path from
+    the surface to the floor and up to the camera.
 
     Raises:
         TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or
@@ -59,26 +64,46 @@ def illumination_of(scenario: Scenario) -> Illumination:
     altitude_m, sun, scattering = scenario.plan.altitude_m, scenario.sun, scenario.imaging.scattering
     light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
     water = medium(scenario.water, scattering, path_m=2 * altitude_m, light=light)
-    above = medium(scenario.water, scattering, path_m=sun.depth_m, light="daylight")
-    return Illumination(water, daylight_at(sun, above, altitude_m))
+    down_m = sun.depth_m / _source(sun).mean_cosine
+    above = medium(scenario.water, scattering, path_m=down_m or altitude_m, light="daylight")
+    if not down_m:
+        return Illumination(water, daylight_at(sun, above, altitude_m))
+    whole = medium(scenario.water, scattering, path_m=down_m + altitude_m, light="daylight").absorption_per_m
+    from_floor = (whole * (down_m + altitude_m) - above.absorption_per_m * down_m) / altitude_m
+    return Illumination(water, daylight_at(sun, above, altitude_m, from_floor))
 
 
-def daylight_at(sun: SunConfig, water: Medium, altitude_m: float) -> Daylight:
+def _source(sun: SunConfig) -> SunSky:
+    """Returns sun and sky just below the surface."""
+    return SunSky(direction_to_sun(sun.elevation_deg, sun.azimuth_deg), sun.sky_share)
+
+
+def daylight_at(
+    sun: SunConfig, water: Medium, altitude_m: float, absorption_from_floor_per_m: Array | None = None
+) -> Daylight:
     """Returns the daylight for cameras at `altitude_m` above the reference plane, attenuated by the water above them.
+
+    Args:
+        sun: sun, sky and depth.
+        water: optical properties of the water on the path from the surface.
+        altitude_m: planned altitude.
+        absorption_from_floor_per_m: (3,) absorption coefficient between floor and camera; None: that of `water`.
 
     Raises:
         TwinError: the altitude is above the surface, or caustics are requested without a surface.
     """
     surface_lx = np.full(3, sun.illuminance_lx)
-    source = SunSky(direction_to_sun(sun.elevation_deg, sun.azimuth_deg), sun.sky_share)
+    source = _source(sun)
+    absorption = water.absorption_per_m if absorption_from_floor_per_m is None else absorption_from_floor_per_m
+    of_water = source, water, water._replace(absorption_per_m=absorption).camera_loss_per_m
     if not sun.depth_m:
         if sun.caustics:
             raise TwinError("sun.caustics", f"{sun.caustics:g}: there is no surface", "0, or set sun.depth_m")
-        return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0, source)
+        return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0, *of_water)
     if altitude_m >= sun.depth_m:
         raise TwinError(
             "sun.depth_m", f"{sun.depth_m:g}: the cameras are above the surface", f"more than {altitude_m:g}"
         )
     per_m, camera_depth_m = downwelling_per_m(water, source.mean_cosine), sun.depth_m - altitude_m
     illuminance_lx = sun.illuminance_lx * np.exp(-per_m * camera_depth_m)
-    return Daylight(surface_lx, illuminance_lx, per_m, sun.depth_m, camera_depth_m, sun.caustics, source)
+    return Daylight(surface_lx, illuminance_lx, per_m, sun.depth_m, camera_depth_m, sun.caustics, *of_water)

@@ -13,6 +13,9 @@ from twin.imaging.facets import Facets, Heights
 from twin.imaging.illumination import Illumination
 from twin.imaging.lens_psf import defocus_of
 from twin.imaging.materials import material_of
+from twin.imaging.mesh_raster import ObjectView
+from twin.imaging.object_shadows import ObjectShadows
+from twin.imaging.object_view import ObjectRenderer, Objects
 from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface
 from twin.imaging.shadows import Shadows
 from twin.imaging.shutter import ExposureMotion
@@ -62,6 +65,7 @@ class ImageFormation:
             normals follow from its depth.
         snow_rng: random stream of the particle positions.
         rig: the rendered cameras; None = the believed rig.
+        objects: objects on the floor; None = none.
     """
 
     def __init__(
@@ -71,11 +75,13 @@ class ImageFormation:
         floor: Heights | None,
         snow_rng: np.random.Generator,
         rig: StereoRig | None = None,
+        objects: Objects | None = None,
     ):
         rig = scenario.believed_rig() if rig is None else rig
         imaging, snow, (water, daylight) = scenario.imaging, scenario.snow, illumination
         current_mps = np.array(scenario.current.velocity_mps)
         self._rig, self._material = rig, material_of(scenario.terrain)
+        self._objects = None if objects is None else ObjectRenderer(objects, rig)
         self._facets = None if floor is None else Facets(floor)
         self._optics = Optics(rig, illumination, scenario.lamps)
         sources = self._optics.light_sources
@@ -87,11 +93,24 @@ class ImageFormation:
         positions_m = [source.position_m for source in sources]
         shaded = floor if imaging.shadows else None
         self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
+        shading = objects is not None and imaging.shadows
+        self._object_shadows = ObjectShadows(objects, rig, positions_m, to_sun) if objects and shading else None
         snows = snow.density_per_m3 > 0
         particles = snow, current_mps, rig, water, self._optics.lamp_light, snow_rng
         self._snow = MarineSnow(*particles, defocus_of(scenario, rig)) if snows else None
 
-    def radiance(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
+    def draw_objects(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> ObjectView | None:
+        """Draws the objects into albedo and depth of the floor in place; returns their view, None without objects.
+
+        The arguments are those of `radiance`.
+        """
+        if self._objects is None:
+            return None
+        return self._objects.draw(albedo, depth, self._world_from_camera(camera, pose), pose.time_s)
+
+    def radiance(
+        self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
+    ) -> Radiance:
         """Returns the light (H, W, 3) that reaches a camera, per colour band in photometric units [cd/m2].
 
         Args:
@@ -99,14 +118,17 @@ class ImageFormation:
             depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
             pose: pose of the left camera, and time since the start of the survey.
+            objects: the objects that were drawn into `albedo` and `depth`; None: the image shows the floor alone.
         """
-        light = self.radiance_without_snow(albedo, depth, camera, pose)
+        light = self.radiance_without_snow(albedo, depth, camera, pose, objects)
         self.add_snow(light, depth, camera, pose)
         return light
 
-    def radiance_without_snow(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> Radiance:
+    def radiance_without_snow(
+        self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
+    ) -> Radiance:
         """Returns the light (H, W, 3) of floor and water [cd/m2]; the arguments are those of `radiance`."""
-        floor, surface = self._floor_view(depth, camera, pose), self._water_surface(camera, pose)
+        floor, surface = self._floor_view(depth, camera, pose, objects), self._water_surface(camera, pose)
         return self._optics.radiance(albedo, depth, camera, floor, surface)
 
     def add_snow(
@@ -127,9 +149,11 @@ class ImageFormation:
         """Returns whether marine snow is enabled."""
         return self._snow is not None
 
-    def components(self, albedo: Image, depth: Depth, camera: int, pose: StampedPose) -> RadianceComponents:
+    def components(
+        self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
+    ) -> RadianceComponents:
         """Returns the components of the light that reaches a camera; the arguments are those of `radiance`."""
-        floor, surface = self._floor_view(depth, camera, pose), self._water_surface(camera, pose)
+        floor, surface = self._floor_view(depth, camera, pose, objects), self._water_surface(camera, pose)
         direct, forward, backscatter = self._optics.parts(albedo, depth, camera, floor, surface)
         snow = None
         if self._snow is not None:
@@ -137,17 +161,21 @@ class ImageFormation:
             snow = before.copy()
             self.add_snow(snow, depth, camera, pose)
             snow -= before
-        total = self.radiance(albedo, depth, camera, pose)
+        total = self.radiance(albedo, depth, camera, pose, objects)
         floor_lx = self._optics.floor_lx(depth, camera, floor, surface)
         return RadianceComponents(floor_lx, direct, forward, backscatter, snow, total)
 
-    def _floor_view(self, depth: Depth, camera: int, pose: StampedPose) -> FloorView:
-        """Returns facets, shadows and material of the floor for a camera."""
+    def _floor_view(self, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None) -> FloorView:
+        """Returns facets, shadows and material of the floor, and normals of the objects, for a camera."""
         world_from_camera = self._world_from_camera(camera, pose)
         facets = None if self._facets is None else self._facets.seen_from(world_from_camera)
         if self._shadows is None:
-            return FloorView(facets, None, self._material)
-        return FloorView(facets, self._shadows.lit(depth, world_from_camera, camera), self._material)
+            return FloorView(facets, None, self._material, objects)
+        label = None if objects is None else objects.label
+        lit = self._shadows.lit(depth, world_from_camera, camera, label)
+        if objects is not None and self._object_shadows is not None:
+            self._object_shadows.darken(lit, depth, objects, world_from_camera, (camera, pose.time_s))
+        return FloorView(facets, lit, self._material, objects)
 
     def _water_surface(self, camera: int, pose: StampedPose) -> WaterSurface | None:
         """Returns the water surface above a camera; None without daylight."""

@@ -1,4 +1,4 @@
-"""Light of the lamps in the water, unscattered and scattered: by any number of small angles, and once by any angle.
+"""Light of the lamps in the water: unscattered, scattered any number of times by small angles, or once by any angle.
 
 A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular to its light, the illuminance
 
@@ -86,8 +86,8 @@ class LampLight:
 def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray[np.float32] | None:
     """Returns the light of each lamp on a floor (lamps, n, m, 4), relative to the intensity on its axis.
 
-    Axes: lamp, even steps of sqrt(1 - cos(angle)), even steps of d / (d + RANGE_SCALE_M), and R, G, B, 0, so that a
-    cell lies in one cache line. None in water without multiple scattering.
+    Axes: lamp, even steps of sqrt(1 - cos(angle)), even steps of d / (d + RANGE_SCALE_M), and R, G, B, 0. None in water
+    without multiple scattering.
 
     Args:
         sources: lamps in the axes of a camera.
@@ -97,13 +97,20 @@ def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None
     of_beam = _softened if shadows else _all_light
-    return np.pad([of_beam(beam, water, "floor") for beam in sources.beam], ((0, 0), (0, 0), (0, 0), (0, 1))).astype(
-        np.float32
-    )
+    return with_a_zero(np.array([of_beam(beam, water, "floor") for beam in sources.beam]))
+
+
+def with_a_zero(table: Array) -> NDArray[np.float32]:
+    """Returns a table (..., 3) of R, G, B padded with a zero to (..., 4), so that an entry lies in one cache line."""
+    return np.concatenate([table, np.zeros((*table.shape[:-1], 1))], axis=-1).astype(np.float32)
 
 
 def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns I exp(-c d) + S of a beam (ANGLE_STEPS + 1, PATH_STEPS + 1, 3), see `floor_tables`."""
+    """Returns I exp(-c d) + S, all light of a lamp on a floor, relative to the intensity on its axis.
+
+    Returns:
+        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3), with the axes of `floor_tables`.
+    """
     at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
     low = np.minimum(at.astype(int), SOFT_STEPS - 1)
     coarse = _softened(beam, water, receiver)
@@ -139,7 +146,7 @@ def _path_m() -> Array:
 
 @lru_cache(maxsize=64)
 def _on_rings(beam: Beam) -> Array:
-    """Returns the means (SOFT_STEPS + 1, m) of a beam around each direction, weighted with m Gaussians."""
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each direction, weighted by each of m Gaussians."""
     edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
     cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
     azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels a side
+REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels a side; an even number
 GRID = 64  # samples of the MTF from which the kernel is computed
 MTF_ERROR = 5e-3  # separable terms of the kernel are added until the MTF is within this of the closed form
 NEAREST_FOCUS_M = 0.05  # nearest depth in focus
@@ -180,7 +180,9 @@ class _Magnified:
     def __init__(self, lens: LensConfig, rig: StereoRig):
         red, blue = lens.lateral_colour
         scales = 1 + np.array([red, 0.0, blue])
-        self._columns = _positions(rig.width_px, rig.cx_px, scales)
+        source, weights = _positions(rig.width_px, rig.cx_px, scales)
+        in_row = (3 * source + np.arange(3)[:, None, None]).astype(np.uint32)  # indices in a row of R, G, B
+        self._columns = in_row, weights
         self._rows = _positions(rig.height_px, rig.cy_px, scales)
 
     def apply(self, light: Radiance) -> Radiance:
@@ -217,44 +219,54 @@ def _convolve(light, down, across, out, first, end):
             here, weight = light[v], down[i, 0]
             for k in range(n):
                 middle[k] = weight[k] * here[k]
-            for t in range(1, n_taps):
-                above, below, weight = light[max(v - t, 0)], light[min(v + t, rows - 1)], down[i, t]
-                for k in range(n):
-                    middle[k] += weight[k] * (above[k] + below[k])
+            for t in range(1, n_taps, 2):
+                above, below = light[max(v - t, 0)], light[min(v + t, rows - 1)]
+                higher, lower = light[max(v - t - 1, 0)], light[min(v + t + 1, rows - 1)]
+                _add_pairs(above, below, down[i, t], higher, lower, down[i, t + 1], middle)
             for k in range(3 * reach):
                 wide[k] = middle[k % 3]
                 wide[3 * reach + n + k] = middle[n - 3 + k % 3]
             weight = across[i, 0]
             for k in range(n):
                 filled[k] += weight[k] * middle[k]
-            for t in range(1, n_taps):
-                left, right = wide[3 * (reach - t) : 3 * (reach - t) + n], wide[3 * (reach + t) : 3 * (reach + t) + n]
-                weight = across[i, t]
-                for k in range(n):
-                    filled[k] += weight[k] * (left[k] + right[k])
+            for t in range(1, n_taps, 2):
+                left, right = wide[3 * (reach - t) :], wide[3 * (reach + t) :]
+                _add_pairs(left, right, across[i, t], wide[3 * (reach - t - 1) :], right[3:], across[i, t + 1], filled)
         for k in range(n):
             filled[k] = max(filled[k], np.float32(0.0))
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _add_pairs(before, after, weight, earlier, later, other_weight, out):
+    """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weights (n,)."""
+    for k in range(out.size):
+        out[k] += weight[k] * (before[k] + after[k]) + other_weight[k] * (earlier[k] + later[k])
 
 
 @njit(cache=True, nogil=True)
 def _magnify(light, columns, across, lines, down, out, first, end):
     """Fills rows `first` to `end` of `out`; see `_positions` for the tables of columns and rows."""
-    width = light.shape[1]
-    between = np.empty(width, np.float32)
+    rows, width, _ = light.shape
+    flat, between = light.reshape(rows, -1), np.empty(3 * width, np.float32)
     for v in range(first, end):
-        for u in range(width):
-            out[v, u, 1] = light[v, u, 1]
+        filled = out[v].reshape(-1)
+        filled[:] = flat[v]
         for band in (0, 2):
-            a, b, c, d = lines[band, v, 0], lines[band, v, 1], lines[band, v, 2], lines[band, v, 3]
-            p, q, r, s = down[band, v, 0], down[band, v, 1], down[band, v, 2], down[band, v, 3]
+            line, w = lines[band, v], down[band, v]
+            _mix_rows(flat[line[0]], flat[line[1]], flat[line[2]], flat[line[3]], w[0], w[1], w[2], w[3], between)
+            at, share = columns[band].reshape(-1), across[band].reshape(-1)
             for u in range(width):
-                between[u] = (
-                    p * light[a, u, band] + q * light[b, u, band] + r * light[c, u, band] + s * light[d, u, band]
-                )
-            for u in range(width):
-                at, w = columns[band, u], across[band, u]
-                total = w[0] * between[at[0]] + w[1] * between[at[1]] + w[2] * between[at[2]] + w[3] * between[at[3]]
-                out[v, u, band] = max(total, np.float32(0.0))
+                k = 4 * u
+                total = share[k] * between[at[k]] + share[k + 1] * between[at[k + 1]]
+                total += share[k + 2] * between[at[k + 2]] + share[k + 3] * between[at[k + 3]]
+                filled[3 * u + band] = max(total, np.float32(0.0))
+
+
+@njit(cache=True, nogil=True)
+def _mix_rows(a, b, c, d, p, q, r, s, out):
+    """Fills `out` (3 W,) with the sum of the image rows a, b, c, d (3 W,), weighted by p, q, r, s."""
+    for k in range(out.size):
+        out[k] = p * a[k] + q * b[k] + r * c[k] + s * d[k]
 
 
 @njit(cache=True, nogil=True)

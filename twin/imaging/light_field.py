@@ -80,7 +80,11 @@ class _Mode(NamedTuple):
 
 
 def legendre_moments(phase: PhaseTable, orders: int) -> Array:
-    """Returns the moments chi_l = 2 pi integral p P_l dmu for l = 0 to `orders`, by the midpoints of the cells."""
+    """Returns the moments chi_l = 2 pi integral p P_l dmu of a phase function p for l = 0 to `orders`.
+
+    P_l is the Legendre polynomial of degree l, and mu the cosine of the scattering angle. The integral is computed by
+    the midpoint rule over the cells of the table.
+    """
     cells = len(phase.density_per_sr)
     edges = np.linspace(0.0, 1.0, cells + 1) ** 4
     middle = 1 - (edges[1:] + edges[:-1])
@@ -106,7 +110,7 @@ class LightField:
 
     @property
     def beam_per_m(self) -> float:
-        """Attenuation with depth of the beam of the sun, including what is scattered within the forward peak [1/m]."""
+        """Attenuation with depth of the sun's beam, which includes light scattered within the forward peak [1/m]."""
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
@@ -120,7 +124,12 @@ class LightField:
         return np.array(down)[:, 0], np.array(up)[:, 0]
 
     def illuminance(self, depth_m: float, floor_m: float) -> tuple[float, float]:
-        """Returns the illuminance of a horizontal plane by the beam and by all other light from above [lx]."""
+        """Returns the illuminance of a horizontal plane by the beam and by all other light from above [lx].
+
+        Args:
+            depth_m: depth of the plane below the surface.
+            floor_m: depth of the black floor.
+        """
         beam = self._daylight.beam_lx * self._daylight.sun_cosine * np.exp(-self.beam_per_m * depth_m)
         down, _ = self.scattered(depth_m, floor_m)
         return float(beam), float(2 * np.pi * (down[0] * self._weight * self._cosine).sum())
@@ -148,17 +157,24 @@ class LightField:
         return _fitted_form(np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt), light)
 
     def veil(self, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns the terms (modes, views, floors) of the upwelling radiance at a depth, above black floors [cd/m2].
+        """Returns the upwelling radiance at a depth, above black floors, as a cosine series in azimuth [cd/m2].
 
         Args:
             depth_m: depth of the camera.
             cosine: (views,) cosine of the angle between line of sight and straight down, above 0.
             floor_m: (floors,) depths of the floor.
+
+        Returns:
+            (modes, views, floors) terms of the series.
         """
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
     def _mode(self, m: int) -> _Mode:
-        """Returns the solutions of term m, by the sums and differences of downwelling and upwelling radiance."""
+        """Returns the eigenvectors and particular solutions for term m of the cosine series in azimuth.
+
+        The size of the eigenvalue problem is halved by solving for sum and difference of downwelling and upwelling
+        radiance.
+        """
         c, b, chi = self._scaled
         mu, weight, order = self._cosine, self._weight, np.arange(m, ORDERS, dtype=np.float64)
         root = np.sqrt(2 * order + 1)[:, None]
@@ -183,7 +199,10 @@ class LightField:
         return _Mode(decay, down, up, z[: mu.size], z[mu.size :], sky, kernel)
 
     def _coefficients(self, mode: _Mode, floor_m: Array) -> Array:
-        """Returns the weights (floors, 2 n) of decaying and growing eigenvectors, for a sky above and a black floor."""
+        """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions.
+
+        These are the radiance of the sky just below the surface, and a black floor at each of the depths `floor_m`.
+        """
         n, fade = mode.decay_per_m.size, np.exp(-mode.decay_per_m * floor_m[:, None])
         system = np.empty((floor_m.size, 2 * n, 2 * n))
         system[:, :n, :n], system[:, :n, n:] = mode.down, mode.up * fade[:, None]
@@ -194,7 +213,10 @@ class LightField:
         return np.asarray(np.linalg.solve(system, given[..., None])[..., 0], np.float64)
 
     def _at(self, mode: _Mode, floor_m: Array, depth_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance of one term without the beam, each (floors, nodes)."""
+        """Returns the downwelling and the upwelling radiance of one term of the azimuth series, each (floors, nodes).
+
+        The radiance is that at the depth `depth_m`, without the beam of the sun.
+        """
         n, weights = mode.decay_per_m.size, self._coefficients(mode, floor_m)
         decaying = weights[:, :n] * np.exp(-mode.decay_per_m * depth_m)
         growing = weights[:, n:] * np.exp(-mode.decay_per_m * (floor_m[:, None] - depth_m))
@@ -203,7 +225,7 @@ class LightField:
         return down, decaying @ mode.up.T + growing @ mode.down.T + beam * mode.beam_up
 
     def _veil_of(self, m: int, mode: _Mode, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns `veil` for one term: the integral of the light that is scattered into each line of sight."""
+        """Returns one term of `veil`: the integral, over depth, of the light scattered into each line of sight."""
         c, b, chi = self._scaled
         n, weights, order = (
             mode.decay_per_m.size,
@@ -227,7 +249,12 @@ class LightField:
         return (light + source * along / cosine).T
 
     def _exact_once(self, m: int, cosine: Array) -> Array:
-        """Returns a term of the sunlight scattered once into the lines of sight (views,), per metre, at depth 0."""
+        """Returns term m of the azimuth series of sunlight scattered once into lines of sight, per metre, at depth 0.
+
+        Args:
+            m: number of the term, from 0.
+            cosine: (views,) cosine of the angle between line of sight and straight down.
+        """
         turns = 64
         azimuth = 2 * np.pi * (np.arange(turns) + 0.5) / turns
         mu0 = self._daylight.sun_cosine
@@ -243,8 +270,9 @@ class LightField:
 def _without_peak(water: BandOptics) -> _Scaled:
     """Returns the water without the forward peak of its phase function, a narrow Gaussian (delta-M+).
 
-    The peak has the moments f exp(-l^2 / (2 s^2)), with f and s such that the remaining moments reach 0 at l = L with
-    slope 0. Moments that end with a slope (delta-M) cause oscillations of the radiance, up to 6 % opposite the sun.
+    The peak has the moments f exp(-l^2 / (2 s^2)) of degree l, with f and s such that the remaining moments reach 0 at
+    l = `ORDERS` with slope 0. Moments that end with another slope (delta-M) cause oscillations of the radiance, up to
+    6 % opposite the sun.
     """
     chi, b = legendre_moments(water.phase, ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)
@@ -257,7 +285,10 @@ def _without_peak(water: BandOptics) -> _Scaled:
 
 
 def _quadrature() -> tuple[Array, Array]:
-    """Returns cosines and weights of the nodes of one hemisphere: Gauss-Legendre outside and inside the cone."""
+    """Returns cosines and weights of the quadrature nodes of one hemisphere.
+
+    They are Gauss-Legendre nodes, chosen separately outside and inside the cone in which the sky appears under water.
+    """
     parts = []
     for n, low, high in ((NODES[0], 0.0, CRITICAL_COSINE), (NODES[1], CRITICAL_COSINE, 1.0)):
         x, w = np.polynomial.legendre.leggauss(n)
@@ -266,13 +297,19 @@ def _quadrature() -> tuple[Array, Array]:
 
 
 def _legendre(order: Array | int, m: int, cosine: Array) -> Array:
-    """Returns sqrt((l - m)! / (l + m)!) P_l^m without the factor (-1)^m."""
+    """Returns the associated Legendre function P_l^m times sqrt((l - m)! / (l + m)!), without the factor (-1)^m.
+
+    Args:
+        order: degree l.
+        m: order m.
+        cosine: argument of the function.
+    """
     order = np.asarray(order, np.float64)
     return (-1.0) ** m * lpmv(m, order, cosine) / np.sqrt(poch(order - m + 1, 2 * m))
 
 
 def _cosine_moment(order: int) -> float:
-    """Returns the moment l of Lambert's cosine: pi, 2 pi / 3, pi / 4, 0, -pi / 24, ..."""
+    """Returns the Legendre moment of Lambert's cosine for an order: pi, 2 pi / 3, pi / 4, 0, -pi / 24, ..."""
     if order == 1:
         return 2 * np.pi / 3
     half = order // 2
@@ -281,7 +318,10 @@ def _cosine_moment(order: int) -> float:
 
 
 def _fitted_form(x: Array, y: Array, z: Array, light: Array) -> Array:
-    """Returns the form (4, 4) of (x, y, z, 1) that is closest to the light (n,) on slopes of the normals (x, y, z)."""
+    """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors.
+
+    x, y, z are the components (n,) of the unit normals of these floors.
+    """
     terms = np.stack([np.ones_like(z), z, x, z * z, x * z, x * x - y * y], 1)
     weight = np.where(z == 1, LEVEL_WEIGHT, 1.0)
     one, up, side, square, cross, across = np.linalg.lstsq(terms * weight[:, None], light * weight, rcond=None)[0]

@@ -101,16 +101,18 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
-    """Adds to `reflected` (3, W) the reflected light of one lamp for a row of pixels: the radiance at the floor.
+    """Adds the light of one lamp that the floor reflects to the camera to `reflected`, for one row of W pixels.
 
     Args:
         material: `Material`.
-        lamp: position of the lamp in its first three numbers, in the axes of the camera [m].
+        lamp: lamp; the first three numbers are its position in the axes of the camera [m].
         albedo: (W, 3) uint8, 255 = white.
         here: (W,) depth [m].
         y: tangent of the row's angle from the optical axis.
+        focal: focal length [px].
         normal: (3, W) unit normals in the axes of the camera.
-        arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor.
+        arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor [lx].
+        reflected: (3, W) radiance at the floor, before attenuation on the path to the camera [cd/m2].
     """
     one, half, tiny = np.float32(1), np.float32(0.5), np.float32(1e-4)
     for u in range(here.size):

@@ -17,7 +17,7 @@ and is blurred (`backscatter`). Shadows and caustics are computed in other modul
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -30,9 +30,10 @@ from twin.imaging.daylight import DaylightVeil, FloorDaylight, floor_daylight
 from twin.imaging.facets import FacetView
 from twin.imaging.forward_scatter import ForwardScatter, Place, place_of
 from twin.imaging.illumination import Illumination
-from twin.imaging.lamp_light import LampLight, floor_tables
+from twin.imaging.lamp_light import LampLight, floor_tables, with_a_zero
 from twin.imaging.lamps import beam_share, light_sources_in_camera
 from twin.imaging.materials import Material
+from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import PATH_MAX_M, PATH_STEP_M, shade
 from twin.imaging.water import Medium
@@ -68,14 +69,16 @@ class FloorView(NamedTuple):
 
     Args:
         facets: triangles of the floor; None = the normals are computed from the depth.
-        lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; the sun may follow the lamps;
-            None = no shadows.
+        lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; the last one is for the sun if
+            it casts shadows; None = no shadows.
         material: reflection of the unscattered light of lamps; None = Lambertian.
+        objects: normals of the pixels that show objects; None = the image shows the floor alone.
     """
 
     facets: FacetView | None = None
     lit: Lit | None = None
     material: Material | None = None
+    objects: ObjectView | None = None
 
 
 class LightParts(NamedTuple):
@@ -90,6 +93,26 @@ class LightParts(NamedTuple):
     direct: Radiance
     forward: Radiance | None
     backscatter: Radiance
+
+
+class WhiteFloor(NamedTuple):
+    """Light of an image of a white floor, from which the light of a floor of any albedo follows.
+
+    Args:
+        floor: (H, W, 3) light of the white floor, attenuated by absorption alone with multiple scattering, else by
+            absorption and scattering [cd/m2].
+        backscatter: (H, W, 3) light that the water scatters into the camera [cd/m2].
+        unscattered: (H, W, 3) share of `floor` that is not scattered; 1 with single scattering.
+        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel.
+        spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
+            alone, and its albedo, of which the mean is that of the floor around the image; None with single scattering.
+    """
+
+    floor: Radiance
+    backscatter: Radiance
+    unscattered: Array
+    core: Array
+    spread: Callable[[Radiance, Radiance], Radiance] | None
 
 
 class _Tables(NamedTuple):
@@ -140,13 +163,13 @@ class Optics:
         self.lamp_light = [LampLight(sources, self._medium) for sources in self.light_sources]
         scatters = self._medium.scatters_repeatedly
         sunny = scatters and bool(daylight.surface_lx.any())
-        self._veil = DaylightVeil(daylight, self._medium, table_range_m()) if sunny else None
+        self._veil = DaylightVeil(daylight, table_range_m()) if sunny else None
         # computed on demand, as some callers need one camera only
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
         self._floor = np.empty((rig.height_px, rig.width_px, 3), np.float32) if scatters else None
         self._place = np.empty(((rig.height_px + 1) // 2, (rig.width_px + 1) // 2), np.float32)
-        self._floor_daylight = floor_daylight(daylight, self._medium)
+        self._floor_daylight, self._daylight_loss_per_m = floor_daylight(daylight), daylight.camera_loss_per_m
         level = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
         self._calm_surface = WaterSurface(None, level)
 
@@ -171,10 +194,10 @@ class Optics:
         """
         out = np.empty(albedo.shape, np.float32)
         if self._forward is None or self._floor is None:
-            self._run(albedo, depth, camera, floor, surface, _Output(out))
+            self._run((albedo, depth), camera, floor, surface, _Output(out))
         else:
             target = _Output(self._floor, out, self._forward.kept, self._place)
-            self._run(albedo, depth, camera, floor, surface, target)
+            self._run((albedo, depth), camera, floor, surface, target)
             self._forward.add(self._floor, self._place, self.around(albedo, depth, camera, surface), out)
         return out
 
@@ -203,10 +226,30 @@ class Optics:
         It is computed from the light of a white floor, divided by the transmission from floor to camera.
         """
         matt = None if floor is None else floor._replace(material=None)
-        white, _ = self._floor_and_backscatter(np.full((*depth.shape, 3), 255, np.uint8), depth, camera, matt, surface)
-        back = np.exp(-self._medium.camera_loss_per_m * range_of(depth, self._rig)[..., None])
+        white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
+        light, loss = np.empty(shape, np.float32), self._medium.camera_loss_per_m
+        self._run((white, depth), camera, matt, surface, _Output(light, np.empty(shape, np.float32)), None, loss)
+        back = np.exp(-loss * range_of(depth, self._rig)[..., None])
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(back > LEAST_TRANSMISSION, np.pi * white / back, np.nan).astype(np.float32)
+            return np.where(back > LEAST_TRANSMISSION, np.pi * light / back, np.nan).astype(np.float32)
+
+    def white_floor(
+        self, depth: Depth, camera: int, floor: FloorView | None = None, surface: WaterSurface | None = None
+    ) -> WhiteFloor:
+        """Returns the light of an image of a white floor; the arguments are those of `radiance`."""
+        white = np.full((*depth.shape, 3), 255, np.uint8)
+        light, backscatter = self._floor_and_backscatter(white, depth, camera, floor, surface)
+        forward, range_m = self._forward, range_of(depth, self._rig)
+        if forward is None:
+            return WhiteFloor(light, backscatter, np.ones(3), np.zeros(3), None)
+        around, place = self.around(white, depth, camera, surface)
+
+        def spread(floor_light: Radiance, albedo: Radiance) -> Radiance:
+            mean = np.mean(albedo, axis=(0, 1)).astype(np.float32)
+            return forward.spread(floor_light, range_m, (around * mean, place.copy()))
+
+        unscattered = np.exp(-self._medium.scattering_per_m * range_m[..., None])
+        return WhiteFloor(light, backscatter, unscattered, forward.core(range_m), spread)
 
     def around(
         self, albedo: Image, depth: Depth, camera: int, surface: WaterSurface | None = None
@@ -217,34 +260,41 @@ class Optics:
         light = np.empty((*grid.shape, 3), np.float32)
         mean = albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX].mean((0, 1)).round().astype(np.uint8)
         uniform = np.broadcast_to(mean, light.shape)
-        self._run(uniform, plane, camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
+        self._run((uniform, plane), camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
         return light, place_of(plane * self._forward.range_per_depth)
 
     def _floor_and_backscatter(
         self, albedo: Image, depth: Depth, camera: int, floor: FloorView | None, surface: WaterSurface | None
     ) -> tuple[Radiance, Radiance]:
-        """Returns the light of the floor, attenuated by `Medium.camera_loss_per_m`, and the backscatter [cd/m2]."""
+        """Returns the light of the floor, attenuated on the path to the camera, and the backscatter [cd/m2]."""
         light, backscatter = np.empty(albedo.shape, np.float32), np.empty(albedo.shape, np.float32)
-        self._run(albedo, depth, camera, floor, surface, _Output(light, backscatter))
+        self._run((albedo, depth), camera, floor, surface, _Output(light, backscatter))
         return light, backscatter
 
     def _run(
         self,
-        albedo: Image,
-        depth: Depth,
+        image: tuple[Image, Depth],
         camera: int,
         floor: FloorView | None,
         surface: WaterSurface | None,
         out: _Output,
         focal_px: float | None = None,
+        day_loss_per_m: Array | None = None,
     ) -> None:
         """Fills `out` by `shading.shade`.
 
-        With a `focal_px`, the image is that of the surroundings, which has this focal length and no backscatter.
+        Args:
+            image: albedo and depth.
+            camera, floor, surface: see `radiance`.
+            out: arrays to fill.
+            focal_px: given if the image is that of the surroundings, which has this focal length and no backscatter.
+            day_loss_per_m: (3,) loss of daylight between floor and camera; None: that of the illumination.
         """
+        albedo, depth = image
         sources, focal = self.light_sources[camera], np.float32(focal_px or self._rig.focal_px)
         above = self._calm_surface if surface is None else surface
-        sky = _sky(self._floor_daylight, self._medium, above)
+        day_loss = self._daylight_loss_per_m if day_loss_per_m is None else day_loss_per_m
+        sky = _sky(self._floor_daylight, np.stack([self._medium.camera_loss_per_m, day_loss]), above)
         lamps = np.column_stack([sources.position_m, sources.axis, sources.intensity_cd, sources.colour])
         lamps, tables = lamps.astype(np.float32), self._tables_of(camera)
         backscatter = _NO_BACKSCATTER if focal_px else self._backscatter(camera, above)
@@ -260,7 +310,7 @@ class Optics:
         if self._veil is None:
             return of_lamps
         rays = grid_rays(self._rig, grid_of(self.light_sources[camera].beam)) @ _world_axes(surface)
-        return of_lamps + _with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
+        return of_lamps + with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:
@@ -276,7 +326,7 @@ def _world_axes(surface: WaterSurface) -> Array:
     return np.column_stack([rows[0], rows[1], -rows[2]])
 
 
-def _sky(daylight: FloorDaylight, water: Medium, surface: WaterSurface) -> tuple:
+def _sky(daylight: FloorDaylight, loss_per_m: Array, surface: WaterSurface) -> tuple:
     """Returns the daylight as the argument `sky` of `shading.shade`."""
     axes = _world_axes(surface)
     turn = np.eye(4)
@@ -286,7 +336,7 @@ def _sky(daylight: FloorDaylight, water: Medium, surface: WaterSurface) -> tuple
     form = np.stack([q[:, 0, 0], q[:, 1, 1], q[:, 2, 2], *pairs, q[:, 3, 3]], 1)
     beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1)
     fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m])
-    given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, water.camera_loss_per_m
+    given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, loss_per_m
     arrays = [np.ascontiguousarray(value, np.float32) for value in given]
     return *arrays, surface.caustics, np.asarray(surface.from_camera, np.float32)
 
@@ -295,15 +345,10 @@ def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:
     """Returns the lookup tables for one camera."""
     cosines, sources = 1 - np.linspace(0.0, 1.0, BEAM_STEPS + 1) ** 2, lamps.sources
     beams = np.array([beam_share(cosines, beam) for beam in sources.beam]).reshape(-1, cosines.size)
-    backscatter = _with_a_zero(backscatter_table(rig, water, lamps))
+    backscatter = with_a_zero(backscatter_table(rig, water, lamps))
     all_light, scattered = (floor_tables(sources, water, shadows) for shadows in (False, True))
     transmission = _transmission(water.attenuation_per_m)
     return _Tables(beams.astype(np.float32), all_light, scattered, transmission, backscatter)
-
-
-def _with_a_zero(table: Array) -> NDArray[np.float32]:
-    """Returns a table (..., 3) of R, G, B padded with a zero to (..., 4), so that an entry lies in one cache line."""
-    return np.concatenate([table, np.zeros((*table.shape[:-1], 1))], axis=-1).astype(np.float32)
 
 
 def _transmission(per_m: Array) -> NDArray[np.float32]:

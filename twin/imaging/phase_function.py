@@ -187,7 +187,7 @@ def tabulate(phase: PhaseFunction) -> PhaseTable:
 
 
 def phase_of(scatterer: Scatterer) -> PhaseFunction:
-    """Returns the phase function of the molecules and particles of one band."""
+    """Returns the phase function of the mixture of molecules and particles in one band."""
     particles: PhaseFunction = petzold
     if scatterer.particles == "fournier_forand":
         particles = fournier_forand(*scatterer.parameters)
@@ -198,7 +198,7 @@ def phase_of(scatterer: Scatterer) -> PhaseFunction:
 
 @lru_cache(maxsize=64)
 def table_of(scatterer: Scatterer) -> PhaseTable:
-    """Returns the table of the phase function of the molecules and particles of one band."""
+    """Returns the table of the phase function of the mixture of molecules and particles in one band."""
     return tabulate(phase_of(scatterer))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.core.records import Image, StereoRig
+from twin.core.records import Exposure, Image, StereoRig
 from twin.imaging.photons import electrons_per_cd, vignetting
 from twin.imaging.pixels import PixelResponse, Raw, read_out
 from twin.imaging.row_parallel import in_row_bands
@@ -30,6 +30,8 @@ class Sensor(Protocol):
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None: ...
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image: ...
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure: ...
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
@@ -107,6 +109,12 @@ class PhotoSensor:
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
         """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
         return self.develop(self.raw(light, setting, rng), setting.white)
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
+        """Returns the linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]."""
+        white = np.ones(3) if setting.white is None else self._white.relative(np.array(setting.white)) * np.ones(3)
+        red, green, blue = (setting.gain * white).tolist()
+        return red, green, blue
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
         """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""

@@ -6,10 +6,10 @@ illuminant E). In each band, one lux of white light yields, per second and squar
 
     photons = integral of S lambda / (h c Km Y) over wavelength,    Y = integral of V over wavelength
 
-with S the sensitivity of the band relative to its largest, lambda the wavelength, h Planck's constant, c the speed of
-light, Km = 683 lm/W the luminous efficacy at 555 nm, and V the photopic luminous efficiency function (CIE 1924;
-Y = 106.857 nm). Using the luminous efficacy at the centre of each band instead would describe the light of three
-lasers, under which a white floor looks violet.
+with S the sensitivity of the band relative to its largest value, lambda the wavelength, h Planck's constant, c the
+speed of light, Km = 683 lm/W the luminous efficacy at 555 nm, and V the photopic luminous efficiency function (CIE
+1924; Y = 106.857 nm). If the luminous efficacy at the centre of each band were used instead, the light would consist of
+three spectral lines, and a white floor would appear violet.
 
 On the axis of a lens of f-number N, focused at infinity, the illuminance of the sensor is
 
@@ -39,7 +39,7 @@ LUMINOUS_EFFICIENCY_NM = 106.857  # integral of V over wavelength
 def photons_per_lux() -> Array:
     """Returns the photons of white light per lux, square metre and second in the bands R, G, B (3,) [1/(lx m2 s)].
 
-    Each photon is weighted with the sensitivity of the band relative to its largest.
+    Each photon is weighted with the sensitivity of the band at its wavelength, relative to the largest sensitivity.
     """
     watts_per_nm = 1 / (LUMENS_PER_WATT * LUMINOUS_EFFICIENCY_NM)  # per square metre
     return watts_per_nm * (sensitivity() * NM).sum(1) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)  # in steps of 1 nm

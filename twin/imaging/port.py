@@ -83,7 +83,11 @@ def air_coordinates(port: PortConfig, points_m: Array) -> Array:
     normalised = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
 
     def miss(at: Array) -> Array:
-        """Returns the lateral distance (..., 2) from the points to the rays at the same depth, divided by the depth."""
+        """Returns the lateral distance (..., 2) by which rays miss their points, divided by the depth of the points.
+
+        Args:
+            at: (..., 2) normalised coordinates of the rays in air.
+        """
         origin, direction = water_rays(port, at)
         along = (points_m[..., 2:] - origin[..., 2:]) / direction[..., 2:]
         return (origin + along * direction - points_m)[..., :2] / points_m[..., 2:]

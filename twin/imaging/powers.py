@@ -13,7 +13,8 @@ LEAST = -126.0  # exponent of the smallest normal number in single precision; sm
 def two_to(t):
     """Returns 2^t for t from -126 to 127 with a relative error of 2e-7, exactly 1 at 0; a smaller t counts as -126.
 
-    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is a minimax polynomial, 2^n sets the bits of a float32.
+    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is computed by a minimax polynomial, 2^n by setting the
+    exponent bits of a float32.
     """
     one, t = np.float32(1.0), max(t, np.float32(LEAST))
     n = np.floor(t + np.float32(0.5))

@@ -11,10 +11,9 @@ from scenes.builder import SceneModel
 from scenes.floor import FLOOR_GROUP
 from scenes.gl import MjModel, MjvScene, mujoco, offscreen_context
 from twin.errors import TwinError
+from twin.imaging.mesh_raster import NEAR_M
 
 Array = NDArray[np.float64]
-
-NEAR_M = 0.05  #: depth of the near clipping plane
 
 
 class Renderer:

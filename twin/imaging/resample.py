@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import Image
+from twin.imaging.pixel_sum import sum_of_pixels
 from twin.imaging.row_parallel import in_row_bands
 
 Radiance = NDArray[np.float32]
@@ -20,9 +21,8 @@ Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [
 
 REACH_PX = 2  # support of the spline to each side
 POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
+BLOCK = 128  # columns filtered at a time, so that they stay in the second-level cache
 TAPS = 10  # pixels to each side in the prefilter of rows; POLE^10 is 2e-6
-INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
-INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
 
 
 def sample(light: Radiance, positions: Positions) -> Radiance:
@@ -35,11 +35,10 @@ def sample(light: Radiance, positions: Positions) -> Radiance:
 
 def interpolate(image: Image, positions: Positions) -> Image:
     """Returns the image (h, w, 3) interpolated from `image` (H, W, 3) at `positions`; exact at pixel centres."""
-    spline = image.reshape(len(image), -1).astype(np.float32)
+    spline, out = image.reshape(len(image), -1).astype(np.float32), np.empty((*positions.shape[:2], 3), np.uint8)
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
-    between, out = _sampled(spline, positions), np.empty((*positions.shape[:2], 3), np.uint8)
-    in_row_bands(lambda first, end: _round(between, out, first, end), len(positions))
+    in_row_bands(lambda first, end: _fill_rounded_from(spline, positions, out, first, end), len(positions))
     return out
 
 
@@ -49,81 +48,117 @@ def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
     return out
 
 
-def intersect(depth: NDArray[np.float32], positions: Positions, parallax_px_m: Positions) -> Positions:
-    """Returns the image positions where rays that do not pass through the camera centre intersect the floor.
-
-    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
-    vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
-    is linear for a plane, is interpolated bilinearly.
-
-    Args:
-        depth: (H, W) depth [m]; inf where there is no floor.
-        positions: (h, w, 2) vanishing points of the rays.
-        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m].
-    """
-    out, near = np.empty_like(positions), np.reciprocal(depth)
-    in_row_bands(lambda first, end: _intersect(near, positions, parallax_px_m, out, first, end), len(positions))
-    return out
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _weights(t):
-    """Returns the B-spline weights of four consecutive pixels for a position t in [0, 1] pixels after the second."""
-    s, sixth = np.float32(1.0) - t, np.float32(1 / 6)
-    four, three = np.float32(4.0), np.float32(3.0)
-    a, d = s * s * s * sixth, t * t * t * sixth
-    b = (four + three * t * t * (t - np.float32(2.0))) * sixth
-    return a, b, np.float32(1.0) - a - b - d, d
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _fill_from(source, positions, out, first, end):
     """Fills rows `first` to `end` of `out` (h, w, 3) from `source` (H, 3 W)."""
-    rows, cols = source.shape[0], source.shape[1] // 3
+    n = out.shape[1]
+    x, y, weights, cells = _row_memory(n)
     for v in range(first, end):
-        for u in range(out.shape[1]):
-            x, y = positions[v, u, 0], positions[v, u, 1]
-            col, row = int(np.floor(x)), int(np.floor(y))
-            wx, wy = _weights(x - np.float32(col)), _weights(y - np.float32(row))
-            if 0 < col < cols - 2 and 0 < row < rows - 2:
-                weighted_sum(source, row - 1, row, row + 1, row + 2, 3 * (col - 1), wx, wy, out[v, u])
-                continue
-            for band in range(3):
-                total = np.float32(0.0)
-                for j in range(4):
-                    line = source[min(max(row - 1 + j, 0), rows - 1)]
-                    for i in range(4):
-                        total += wy[j] * wx[i] * line[3 * min(max(col - 1 + i, 0), cols - 1) + band]
-                out[v, u, band] = total
-
-
-@njit(cache=True, nogil=True, inline="always")
-def weighted_sum(image, a, b, c, d, at, across, down, out):
-    """Writes to `out` (3,) the weighted sum of 4 x 4 pixels of an image (H, 3 W): rows a to d, from element `at` on."""
-    above, here, below, last = image[a], image[b], image[c], image[d]
-    k, three = np.uint64(at), np.uint64(3)
-    for band in range(3):
-        total = np.float32(0.0)
-        i = k + np.uint64(band)
-        for j in range(4):
-            total += across[j] * (down[0] * above[i] + down[1] * here[i] + down[2] * below[i] + down[3] * last[i])
-            i += three
-        out[band] = total
+        _unpack(positions[v].reshape(-1), x, y)
+        spline_row(source, x, y, weights, cells, out[v].reshape(-1))
 
 
 @njit(cache=True, nogil=True)
-def _round(numbers, out, first, end):
-    """Fills rows `first` to `end` of `out` with numbers rounded and clipped to 8 bits."""
-    least, most = np.float32(0.0), np.float32(255.0)
+def _fill_rounded_from(source, positions, out, first, end):
+    """Same as `_fill_from`, but for 8-bit `out`: numbers are rounded and clipped."""
+    n = out.shape[1]
+    x, y, weights, cells = _row_memory(n)
+    row, least, most = np.empty(3 * n, np.float32), np.float32(0.0), np.float32(255.0)
     for v in range(first, end):
-        row, filled = numbers[v].reshape(-1), out[v].reshape(-1)
+        _unpack(positions[v].reshape(-1), x, y)
+        spline_row(source, x, y, weights, cells, row)
+        filled = out[v].reshape(-1)
         for k in range(row.size):
             filled[k] = np.uint8(min(max(row[k] + np.float32(0.5), least), most))
 
 
 @njit(cache=True, nogil=True)
+def _row_memory(n):
+    """Returns working memory for a row of n pixels: columns and rows (n,), `weights` and `cells` of `spline_row`."""
+    x, y = np.empty(n, np.float32), np.empty(n, np.float32)
+    return x, y, np.empty((8, n), np.float32), np.empty(n, np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _unpack(place, x, y):
+    """Copies columns and rows, which alternate in `place` (2 w,), to x and y (w,)."""
+    for u in range(x.size):
+        x[u], y[u] = place[2 * u], place[2 * u + 1]
+
+
+@njit(cache=True, nogil=True)
+def spline_row(source, x, y, weights, cells, out):
+    """Fills `out` (3 w,) with the B-splines of an image (H, 3 W) at columns x and rows y (w,).
+
+    `weights` (8, w) float32 and `cells` (w,) int32 are working memory.
+    """
+    _spline_weights(x, weights[0], weights[1], weights[2], weights[3])
+    _spline_weights(y, weights[4], weights[5], weights[6], weights[7])
+    sum_row(source, x, y, weights, cells, out)
+
+
+@njit(cache=True, nogil=True)
+def sum_row(source, x, y, weights, cells, out):
+    """Same as `spline_row`, for any weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
+    rows, cols = source.shape[0], source.shape[1] // 3
+    _inner_cells(x, y, rows, cols, cells)
+    for u in range(x.size):
+        if cells[u] >= 0:
+            red, green, blue = sum_of_pixels(source, np.int64(cells[u]), 3 * cols, weights, u)  # pyright: ignore
+            out[3 * u], out[3 * u + 1], out[3 * u + 2] = red, green, blue
+        else:
+            _sum_at_border(source, x[u], y[u], weights, u, out)
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _spline_weights(at, before, here, after, last):
+    """Computes the B-spline weights (w,) of the pixels at -1, 0, 1, 2 from the pixel that contains `at` (w,)."""
+    one, sixth, four, three = np.float32(1.0), np.float32(1 / 6), np.float32(4.0), np.float32(3.0)
+    for u in range(at.size):
+        t = at[u] - np.floor(at[u])
+        s = one - t
+        a, d = s * s * s * sixth, t * t * t * sixth
+        b = (four + three * t * t * (t - np.float32(2.0))) * sixth
+        before[u], here[u], after[u], last[u] = a, b, one - a - b - d, d
+
+
+@njit(cache=True, nogil=True)
+def _inner_cells(x, y, rows, cols, cells):
+    """Computes the index of the first of the 4 x 4 pixels around each position; -1 if not all are inside the image."""
+    zero, last_x, last_y = np.float32(0.0), np.float32(cols - 2), np.float32(rows - 2)
+    stride, three, one = np.int32(3 * cols), np.int32(3), np.int32(1)
+    for u in range(x.size):
+        col, row = np.floor(x[u]), np.floor(y[u])
+        inside = (col > zero) & (col < last_x) & (row > zero) & (row < last_y)
+        cell = (np.int32(row) - one) * stride + three * (np.int32(col) - one)
+        cells[u] = cell if inside else -one
+
+
+@njit(cache=True, nogil=True)
+def _sum_at_border(source, x, y, weights, u, out):
+    """Same as `sum_of_pixels` for pixel u of `out`, but the pixels of the image border are repeated beyond it."""
+    rows, cols = source.shape[0], source.shape[1] // 3
+    col, row = int(np.floor(x)), int(np.floor(y))
+    for band in range(3):
+        total = np.float32(0.0)
+        for j in range(4):
+            line = source[min(max(row - 1 + j, 0), rows - 1)]
+            for i in range(4):
+                weight = weights[4 + j, u] * weights[i, u]
+                total += weight * line[3 * min(max(col - 1 + i, 0), cols - 1) + band]
+        out[3 * u + band] = total
+
+
+@njit(cache=True, nogil=True)
 def _filter_columns(image, first, end):
-    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored ends.
+    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored ends."""
+    for start in range(first, end, BLOCK):
+        _filter_block(image, start, min(start + BLOCK, end))
+
+
+@njit(cache=True, nogil=True)
+def _filter_block(image, first, end):
+    """Filters columns `first` to `end` of an image, see `_filter_columns`.
 
     Applies 6 times the filter 1 / (1 - p z^-1), then the filter -p / (1 - p z), with p the pole (Unser et al. 1993).
     """
@@ -184,31 +219,3 @@ def _mirrored(at, size):
     period = max(2 * (size - 1), 1)
     at = abs(at) % period
     return min(at, period - at) if size > 1 else 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _intersect(near, positions, parallax, out, first, end):
-    """Writes the intersections of rows `first` to `end` (exclusive) to `out`; `near` is the inverse depth.
-
-    See `intersect` for the fixed-point iteration.
-    """
-    rows, cols = near.shape
-    for v in range(first, end):
-        inverse = near[v * rows // len(out), 0]
-        for u in range(out.shape[1]):
-            x = positions[v, u, 0] + parallax[v, u, 0] * inverse  # start from the inverse depth at the last pixel
-            y = positions[v, u, 1] + parallax[v, u, 1] * inverse
-            for _ in range(INTERSECTION_STEPS):
-                col = min(max(int(np.floor(x)), 0), cols - 2)
-                row = min(max(int(np.floor(y)), 0), rows - 2)
-                s = min(max(x - np.float32(col), np.float32(0.0)), np.float32(1.0))
-                t = min(max(y - np.float32(row), np.float32(0.0)), np.float32(1.0))
-                above = near[row, col] + s * (near[row, col + 1] - near[row, col])
-                below = near[row + 1, col] + s * (near[row + 1, col + 1] - near[row + 1, col])
-                inverse = above + t * (below - above)
-                was_x, was_y = x, y
-                x = positions[v, u, 0] + parallax[v, u, 0] * inverse
-                y = positions[v, u, 1] + parallax[v, u, 1] * inverse
-                if abs(x - was_x) + abs(y - was_y) < np.float32(INTERSECTION_PX):
-                    break
-            out[v, u, 0], out[v, u, 1] = x, y

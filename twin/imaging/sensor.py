@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.core.records import Image
+from twin.core.records import Exposure, Image
 from twin.imaging.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shutter import ExposureMotion
@@ -59,7 +59,10 @@ class AutoExposure:
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
-        """Same as `gain`, given the mean of the brightest channel [cd/m2]; the target gain is clipped to the limits."""
+        """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest channel [cd/m2].
+
+        Except for the first frame, this mean affects only the gain of later frames. Their target gain is clipped.
+        """
         least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
         metered = float(np.log(wanted))
@@ -105,6 +108,10 @@ class PlainSensor:
             return expose(light, setting.gain, self._imaging, rng)
         noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
         return expose(light, setting.gain, noiseless, np.random.default_rng(0))
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
+        """Returns the signal of R, G and B per unit of radiance [1 / (cd/m2)]."""
+        return setting.gain, setting.gain, setting.gain
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:

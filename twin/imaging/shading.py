@@ -12,6 +12,7 @@ from numba import njit
 
 from twin.imaging.facets import UNIT
 from twin.imaging.materials import add_reflected
+from twin.imaging.pixel_sum import sum_of_entries
 from twin.imaging.powers import LOG2_E, two_to
 
 PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the transmission tables
@@ -23,14 +24,17 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depth
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def shade(
-    albedo, depth, focal, lamps, beams, soft, transmission, scatter_table, sky, facets, lit, material, out, other, kept,
-    place, first, end,
+    albedo, depth, focal, lamps, beams, soft, transmission, scatter_table, sky, facets, lit, material, objects, out,
+    other, kept, place, first, end,
 ):  # fmt: skip
-    """Fills rows `first` to `end` of `out` (H, W, 3) with the light of the floor, and of `other` with the rest.
+    """Computes the light of the floor and the backscatter in rows `first` to `end` of an image.
 
     The compiler removes the code for arguments that are None.
 
     Args:
+        albedo: (H, W, 3) uint8, 255 = white.
+        depth: (H, W) depth along the optical axis [m].
+        focal: focal length [px].
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)), 0 to 1.
         soft: (n, k, l, 4) light of each lamp on the floor, at even steps of sqrt(1 - cos(angle)) and, for a distance d,
@@ -41,17 +45,19 @@ def shade(
         sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], light of the sky (3, 10) [lx]
             and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy, zz,
             2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and range of the fit (3,) [m]; attenuation with
-            range from the camera (3,) [1/m]; caustics (m + 1, m + 1) or None; (3, 4) map from a point in the camera
-            axes to column and row in the caustics and depth below the surface.
+            range from the camera (2, 3) of lamp light and of daylight [1/m]; caustics (m + 1, m + 1) or None; (3, 4)
+            map from a point in the camera axes to column and row in the caustics and depth below the surface.
         facets: triangles of the floor (`facets.FacetView`); None = normals from the depth.
         lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no
             shadows.
         material: reflection of the unscattered light of lamps (`materials.Material`); None = Lambertian.
+        objects: normals and labels of the pixels that show objects (`object_view.ObjectView`); None = no objects.
+        out: (H, W, 3) image, filled with the light of the floor that reaches the camera.
+        other: (H, W, 3) image for the backscatter, to which the share `kept` of the light of the floor is added; if it
+            is None, the backscatter is added to `out`.
         kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale); None
             without blur.
         place: array to fill with the fractional row of `kept` for every second pixel of every second row.
-        other: (H, W, 3) image for the backscatter, to which the share `kept` of the light of the floor is added; if it
-            is None, the backscatter is added to `out`.
     """
     height, width = depth.shape
     rows, cols, ranges, _ = scatter_table.shape
@@ -70,6 +76,8 @@ def shade(
             _range_and_normal(depth, v, y, focal, range_m, normal)
         else:
             _range_and_facet_normal(facets, depth[v], y, focal, cells, range_m, normal)
+        if objects is not None:
+            _take_normals(objects, v, normal)
         light[:] = np.float32(0.0)
         if material is not None:
             reflected[:] = np.float32(0.0)
@@ -89,16 +97,16 @@ def shade(
             elif soft is None:
                 _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
         if lamps.shape[0]:
-            _attenuate(loss, range_m, light)
+            _attenuate(loss[0], range_m, light)
             if material is not None:
-                _attenuate(loss, range_m, reflected)
+                _attenuate(loss[0], range_m, reflected)
         if sunny:
             _sample_caustics(depth[v], y, focal, caustics, surface, lookup, lamp[0])
             _face_sun(depth[v], y, focal, to_sun, surface, normal, lamp)
             if lit is not None and lit.shape[0] > lamps.shape[0]:
                 for u in range(width):
                     lamp[1, u] = lamp[1, u] if lit[lamps.shape[0], v, u] else np.float32(0.0)
-            _add_daylight((beam, diffuse, change, fitted, loss), normal, range_m, lamp, light)
+            _add_daylight((beam, diffuse, change, fitted, loss[1]), normal, range_m, lamp, light)
         if ranges:
             _interpolate_rows(scatter_table, np.float32(v) * np.float32(rows - 1) / np.float32(height - 1), row_table)
             _interpolate_backscatter(row_table, range_m, lookup, backscatter)
@@ -153,6 +161,15 @@ def _range_and_facet_normal(facets, here, y, focal, cells, range_m, normal):
         normal[0, u] = t00 * nx + t01 * ny + t02 * nz
         normal[1, u] = t10 * nx + t11 * ny + t12 * nz
         normal[2, u] = t20 * nx + t21 * ny + t22 * nz
+
+
+@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+def _take_normals(objects, v, normal):
+    """Replaces the unit normals (3, W) of row v by those of the objects, in pixels that show objects."""
+    normals, labels = objects
+    for u in range(labels.shape[1]):
+        if labels[v, u]:
+            normal[0, u], normal[1, u], normal[2, u] = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -253,13 +270,11 @@ def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
         i, w, s, e = np.uint32(cell[u]), part_of_row[u], part_of_col[u], lamplight[0, u]
         j, k = i + np.uint32(4), i + np.uint32(stride)
         m = k + np.uint32(4)
-        here = (one - w) * (one - s)
-        further, wider, both = (one - w) * s, w * (one - s), w * s
-        light[0, u] += e * red * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
-        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
-        light[1, u] += e * green * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
-        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
-        light[2, u] += e * blue * (here * flat[i] + further * flat[j] + wider * flat[k] + both * flat[m])
+        shares = (one - w) * (one - s), (one - w) * s, w * (one - s), w * s
+        r, g, b = sum_of_entries(flat, (i, j, k, m), shares)  # pyright: ignore
+        light[0, u] += e * red * r
+        light[1, u] += e * green * g
+        light[2, u] += e * blue * b
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -300,10 +315,11 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
-    """Fills row 1 of `daylight` (3, W) with the cosine to the sun times row 0, and row 2 with the depth [m].
+    """Computes the cosine of the angle between floor normal and sun, and the depth in water, for a row of W pixels.
 
-    Row 0 is the daylight on the floor relative to its mean, see `_sample_caustics`; it is 0 without floor. The normals
-    of pixels without floor are replaced by 0.
+    Fills row 1 of `daylight` (3, W) with this cosine (at least 0) times row 0, and row 2 with the depth of the floor
+    below the water surface [m]. Row 0 is the daylight on the floor relative to its mean, see `_sample_caustics`; it is
+    0 in pixels without floor. The normals of these pixels are replaced by 0.
     """
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
@@ -375,12 +391,8 @@ def _interpolate_backscatter(table, range_m, lookup, backscatter):
         i, w, s = np.uint32(cell[u]), part_of_col[u], part_of_range[u]
         j, k = i + np.uint32(4), i + np.uint32(stride)
         m = k + np.uint32(4)
-        here, further, across, both = (one - w) * (one - s), (one - w) * s, w * (one - s), w * s
-        backscatter[0, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
-        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
-        backscatter[1, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
-        i, j, k, m = i + np.uint32(1), j + np.uint32(1), k + np.uint32(1), m + np.uint32(1)
-        backscatter[2, u] = here * flat[i] + further * flat[j] + across * flat[k] + both * flat[m]
+        shares = (one - w) * (one - s), (one - w) * s, w * (one - s), w * s
+        backscatter[0, u], backscatter[1, u], backscatter[2, u] = sum_of_entries(flat, (i, j, k, m), shares)  # pyright: ignore
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -400,9 +412,12 @@ def _reflect(albedo, light, backscatter, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
-    """Fills `out` (W, 3) with the backscatter, plus the share `kept` of the light of the floor (W, 3) if given.
+    """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept` of the floor's light (W, 3).
 
-    Fills half a row of `place` if v is even, see `shade`.
+    If `kept` is None, the light of the floor is not added.
+
+    If `kept` is given and v is even, it also fills row v / 2 of `place` with the fractional row of `kept` for every
+    second pixel.
     """
     of_row, shown = out.reshape(-1), floor.reshape(-1)
     if kept is None:
@@ -423,9 +438,7 @@ def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
     flat = kept.reshape(-1)
     for u in range(range_m.size):
         i, w = np.uint32(4 * cell[u]), part[u]
-        j = i + np.uint32(4)
-        of_row[3 * u] = backscatter[0, u] + shown[3 * u] * (flat[i] + w * (flat[j] - flat[i]))
-        i, j = i + np.uint32(1), j + np.uint32(1)
-        of_row[3 * u + 1] = backscatter[1, u] + shown[3 * u + 1] * (flat[i] + w * (flat[j] - flat[i]))
-        i, j = i + np.uint32(1), j + np.uint32(1)
-        of_row[3 * u + 2] = backscatter[2, u] + shown[3 * u + 2] * (flat[i] + w * (flat[j] - flat[i]))
+        red, green, blue = sum_of_entries(flat, (i, i + np.uint32(4)), (one - w, w))  # pyright: ignore
+        of_row[3 * u] = backscatter[0, u] + shown[3 * u] * red
+        of_row[3 * u + 1] = backscatter[1, u] + shown[3 * u + 1] * green
+        of_row[3 * u + 2] = backscatter[2, u] + shown[3 * u + 2] * blue

@@ -67,15 +67,16 @@ class Shadows:
         self._grid = _Grid(height, *_tops(height), floor.west_m, floor.south_m, floor.spacing_m)
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
-    def lit(self, depth: Depth, world_from_camera: Array, camera: int) -> Lit:
+    def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
         """Returns a mask (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
 
-        The sun, if there is one, follows the lamps.
+        The last mask is that of the sun if it casts shadows.
 
         Args:
             depth: (H, W) depth along the optical axis [m].
             world_from_camera: (4, 4) pose of this camera.
             camera: 0 left, 1 right.
+            label: (H, W) not 0 where the pixel shows an object above the floor; None: all show the floor.
         """
         lamps = geometry.transform(world_from_camera, self._lamps[camera])
         if self._to_sun is not None:
@@ -83,7 +84,7 @@ class Shadows:
         out = np.empty((len(lamps), *depth.shape), np.uint8)
         pose = np.ascontiguousarray(world_from_camera)
         scene = self._grid, depth, self._rig.focal_px, pose, lamps
-        in_row_bands(lambda first, end: _test_facing(*scene, out, first, end), len(depth))
+        in_row_bands(lambda first, end: _test_facing(*scene, label, out, first, end), len(depth))
         in_row_bands(lambda first, end: _grow_shadows(*scene, out, first, end), len(lamps), len(depth))
         return out
 
@@ -96,32 +97,89 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _test_facing(grid, depth, focal, pose, lamps, out, first, end):
-    """Fills rows `first` to `end` of `out` (lamps, H, W): DARK where facets face away, CLEAR without floor, or OPEN."""
+def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
+    """Marks the pixels of rows `first` to `end` in `out` (lamps, H, W).
+
+    The mark is DARK where facets face away, CLEAR without floor, else OPEN. Pixels that show an object, i.e. whose
+    `label` is not 0, are OPEN; without objects, `label` is None.
+    """
     height, _, _, west, south, spacing = grid
-    rows, cols = height.shape
-    per_m = 1 / spacing
+    width, cols = depth.shape[1], height.shape[1]
+    points, parts, cells = np.empty((3, width)), np.empty((2, width)), np.empty(width, np.int32)
+    rises, there = np.empty((2, width), np.float32), np.empty(width, np.uint8)
     for v in range(first, end):
-        for u in range(depth.shape[1]):
-            if not np.isfinite(depth[v, u]):
-                out[:, v, u] = CLEAR
-                continue
-            x, y, z = _point_of(depth, focal, pose, v, u)
-            col, row = (x - west) * per_m, (y - south) * per_m
-            c, r = min(max(int(np.floor(col)), 0), cols - 2), min(max(int(np.floor(row)), 0), rows - 2)
-            south_west, north_east = height[r, c], height[r + 1, c + 1]
-            if col - c >= row - r:
-                east, north = height[r, c + 1] - south_west, north_east - height[r, c + 1]
-            else:
-                east, north = north_east - height[r + 1, c], height[r + 1, c] - south_west
-            for k in range(lamps.shape[0]):
-                facing = (lamps[k, 2] - z) * spacing - (lamps[k, 0] - x) * east - (lamps[k, 1] - y) * north
-                out[k, v, u] = OPEN if facing > 0 else DARK
+        y = (v - 0.5 * (depth.shape[0] - 1)) / focal
+        _find_floor(depth[v], y, focal, pose, there, points[0], points[1], points[2])
+        _find_cells(points[0], west, spacing, cols, parts[0], cells, 1, True)
+        _find_cells(points[1], south, spacing, height.shape[0], parts[1], cells, cols, False)
+        _find_rises(height.reshape(-1), cols, parts[0], parts[1], cells, rises[0], rises[1])
+        for k in range(lamps.shape[0]):
+            _face_lamp(lamps[k], spacing, points[0], points[1], points[2], rises[0], rises[1], there, out[k, v])
+        if label is not None:
+            for u in range(width):
+                if label[v, u]:
+                    out[:, v, u] = OPEN
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_floor(here, y, focal, pose, there, east, north, up):
+    """Computes for a row of pixels whether each shows the floor, and where it is in the world [m]."""
+    a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
+    d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
+    g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
+    far, middle, per_focal = np.float32(np.inf), 0.5 * (here.size - 1), 1 / focal
+    for u in range(here.size):
+        shows = here[u] < far
+        z = np.float64(here[u]) if shows else 0.0
+        x = (u - middle) * per_focal
+        there[u] = shows
+        east[u], north[u], up[u] = z * (a * x + b) + c, z * (d * x + e) + f, z * (g * x + h) + i
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_cells(at, start, spacing, n, part, cells, stride, is_first):
+    """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells.
+
+    The number of the cell, times `stride`, is added to `cells`, or replaces its values if `is_first`.
+    """
+    per_m, last = 1 / spacing, n - 2.0
+    for u in range(at.size):
+        x = (at[u] - start) * per_m
+        cell = min(max(np.floor(x), 0.0), last)
+        part[u] = x - cell
+        cells[u] = np.int32(cell) * np.int32(stride) + (np.int32(0) if is_first else cells[u])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_rises(height, cols, part_x, part_y, cells, to_east, to_north):
+    """Computes the rise of the facet in each cell towards east and north [m per cell]."""
+    for u in range(cells.size):
+        k = np.uint32(cells[u])
+        m = k + np.uint32(cols)
+        south_west, south_east = height[k], height[k + np.uint32(1)]
+        north_west, north_east = height[m], height[m + np.uint32(1)]
+        is_south_east = part_x[u] >= part_y[u]
+        to_east[u] = south_east - south_west if is_south_east else north_east - north_west
+        to_north[u] = north_east - south_east if is_south_east else north_west - south_west
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
+    """Fills a row `out` (w,) with the marks of `_test_facing`, for one lamp at the position (3,) [m]."""
+    x, y, z = lamp[0], lamp[1], lamp[2]
+    for u in range(out.size):
+        facing = (z - up[u]) * spacing - (x - east[u]) * to_east[u] - (y - north[u]) * to_north[u]
+        tested = OPEN if facing > 0 else DARK
+        out[u] = tested if there[u] else CLEAR
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
-    """Completes the masks of the lamps `first` to `end`: casts rays at seeds and around all dark pixels; 0 or 1."""
+    """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing.
+
+    A ray is cast for every `STRIDE_PX`-th open pixel along rows and columns, and for every open neighbour of a dark
+    pixel. In the completed masks, 0 is dark and 1 is lit.
+    """
     height, width = depth.shape
     stack = np.empty(height * width, np.int32)
     for k in range(first, end):
@@ -131,9 +189,10 @@ def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
                 if out[k, v, u] == OPEN:
                     out[k, v, u] = _cast(grid, depth, focal, pose, lamps[k], v, u)
         for v in range(height):
-            for u in range(width):
-                if out[k, v, u] == DARK:
-                    stack[n], n = v * width + u, n + 1
+            if _any_dark(out[k, v]):
+                for u in range(width):
+                    if out[k, v, u] == DARK:
+                        stack[n], n = v * width + u, n + 1
         while n:
             n -= 1
             above, left = stack[n] // width, stack[n] % width
@@ -143,9 +202,18 @@ def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
                         out[k, v, u] = _cast(grid, depth, focal, pose, lamps[k], v, u)
                         if out[k, v, u] == DARK:
                             stack[n], n = v * width + u, n + 1
-        for v in range(height):
-            for u in range(width):
-                out[k, v, u] = min(out[k, v, u], OPEN)
+        mask = out[k].reshape(-1)
+        for i in range(mask.size):
+            mask[i] = min(mask[i], OPEN)
+
+
+@njit(cache=True, nogil=True)
+def _any_dark(row):
+    """Returns whether a row (w,) of marks has dark pixels; without branches, so that the compiler can vectorize it."""
+    least = OPEN
+    for u in range(row.size):
+        least = min(least, row[u])
+    return least == DARK
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -8,8 +8,9 @@ A point of the floor at depth Z moves through the image of a camera with twist (
 
 Both effects are computed from the image at mid-exposure. With motion blur, the value of a pixel is the mean along a
 path: a line centred on the pixel, with the length and direction of the flow times the exposure time. With a rolling
-shutter, it is the value at the position of the pixel minus the flow times the delay of its row. The pose and the true
-depth of a frame refer to mid-exposure of the middle row.
+shutter, it is the value at the position of the pixel minus the flow times the delay of its row; where images are
+sampled for a lens or a port, the rolling shutter is part of that sampling (`twin.imaging.ray_sampling`). The pose and
+the true depth of a frame refer to mid-exposure of the middle row.
 
 Limits: the flow of a pixel is constant during the exposure time T, so paths are straight (a rotation would bend them by
 less than f (|w| T)^2 / 8); vibration is not modelled. A path is computed with the depth at its own pixel: the blur of a
@@ -27,7 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from twin.imaging.resample import weighted_sum
+from twin.imaging.resample import sum_row
 from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
@@ -44,11 +45,14 @@ class ExposureMotion(NamedTuple):
         twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
         exposure_s: exposure time of each row; 0 = no motion blur.
         readout_s: time from the first row of the rendered image to the last; 0 = global shutter.
+        rolls_later: whether the rolling shutter is applied where the raw image is sampled from the rendered one
+            (`true_cameras.TrueCameras.sample`), so that the image is resampled only once.
     """
 
     twist: Array
     exposure_s: float
     readout_s: float
+    rolls_later: bool = False
 
 
 def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
@@ -60,7 +64,7 @@ def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMo
         focal_px: focal length.
         motion: velocity of the camera and duration of exposure and read-out.
     """
-    if motion.readout_s:
+    if motion.readout_s and not motion.rolls_later:
         light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
     if motion.exposure_s:
         light = blur_by_motion(light, depth, focal_px, motion.twist, motion.exposure_s)
@@ -122,7 +126,10 @@ def _cubic(t):
 
 @njit(cache=True, nogil=True)
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Fills rows `first` to `end` of `out` (see `blur_by_motion`); `flat` is the radiance (H W, 3)."""
+    """Fills rows `first` to `end` of `out` (H, W, 3) with motion blur; compiled kernel of `blur_by_motion`.
+
+    `flat` (H W, 3) is the radiance at mid-exposure.
+    """
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, near = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
@@ -168,12 +175,12 @@ def _blur_row(above, here, below, near, x, y, scale, twist, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
-    """Writes to `out` the mean radiance over a path centred on pixel (a, b), from 2 m + 1 samples.
+    """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples.
 
     The path extends by `length` along the first image axis and by `aside`, which is not longer, along the second [px].
     The samples are one pixel apart along the first axis and are interpolated along the second, which does not change
-    the variance of their positions along the first. Their weights are equal except at the two ends, where they give
-    this variance the value of a uniform distribution, length^2 / 12.
+    the variance of their positions along the first. All samples have the same weight, except the two at the ends: their
+    weight gives this variance the value of a uniform distribution, length^2 / 12.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]
@@ -202,12 +209,13 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` of `out`; see `apply_rolling_shutter`."""
+    """Fills rows `first` to `end` of `out` (H, W, 3) as read out by a rolling shutter; see `apply_rolling_shutter`."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     right, low = np.float32(width - 1), np.float32(height - 1)
     values, x = light.reshape(height, 3 * width), np.empty(width, np.float32)
     at_u, at_v = np.empty(width, np.float32), np.empty(width, np.float32)
+    weights, cells = np.empty((8, width), np.float32), np.empty(width, np.int32)
     for u in range(width):
         x[u] = (np.float32(u) - half * right) / focal
     for v in range(first, end):
@@ -217,19 +225,16 @@ def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, en
             du, dv = _flow(x[u], y, np.float32(1.0) / line[u], scale, twist)
             at_u[u] = min(max(np.float32(u) - du, zero), right)
             at_v[u] = min(max(np.float32(v) - dv, zero), low)
-        for u in range(width):
-            j, i = int(at_u[u]), int(at_v[u])
-            across, down = _cubic(at_u[u] - np.float32(j)), _cubic(at_v[u] - np.float32(i))
-            filled = out[v, u]
-            if 0 < j < width - 2 and 0 < i < height - 2:
-                weighted_sum(values, i - 1, i, i + 1, i + 2, 3 * (j - 1), across, down, filled)
-            else:
-                for band in range(3):
-                    total = zero
-                    for b in range(4):
-                        row = values[min(max(i + b - 1, 0), height - 1)]
-                        for a in range(4):
-                            total += down[b] * across[a] * row[3 * min(max(j + a - 1, 0), width - 1) + band]
-                    filled[band] = total
-            for band in range(3):
-                filled[band] = max(filled[band], zero)
+        _cubic_weights(at_u, weights[0], weights[1], weights[2], weights[3])
+        _cubic_weights(at_v, weights[4], weights[5], weights[6], weights[7])
+        filled = out[v].reshape(-1)
+        sum_row(values, at_u, at_v, weights, cells, filled)
+        for k in range(filled.size):
+            filled[k] = max(filled[k], zero)
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _cubic_weights(at, before, here, after, last):
+    """Computes the weights (w,) of `_cubic` for positions `at` (w,)."""
+    for u in range(at.size):
+        before[u], here[u], after[u], last[u] = _cubic(at[u] - np.floor(at[u]))

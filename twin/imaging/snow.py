@@ -5,7 +5,9 @@ side re-enters on the opposite side. Both cameras and consecutive frames therefo
 of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Its image is blurred by one
 pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of diameter A, focused
 at depth s. During the exposure the particle moves through the image; its light is spread evenly along this path, whose
-length is its velocity in the image times the exposure time.
+length is its velocity in the image times the exposure time. A rolling shutter images it where it is when its row is
+read. If the rolling shutter is applied to the whole image after the particles are drawn, it displaces them like the
+floor behind them; they are therefore drawn displaced by the difference between their own displacement and this one.
 
 The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
 diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is
@@ -26,6 +28,7 @@ from twin.imaging.lamp_light import LampLight
 from twin.imaging.lens_psf import Defocus
 from twin.imaging.optics import Depth, Radiance
 from twin.imaging.row_parallel import in_row_bands
+from twin.imaging.shading import FAR_M
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.water import Medium
 from twin.scenario.model import SnowConfig
@@ -36,6 +39,7 @@ BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible 
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
 PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
+FOOTPRINT_PX = 4096  # largest footprint whose weights are stored; those of a larger one are computed twice
 BLOCK = 512  # number of particles whose positions are computed at a time
 
 
@@ -152,7 +156,9 @@ class MarineSnow:
         centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
         if not still:
             flow = self._flow(seen.points_m, world_from_left, camera, motion.twist)
-            centre_px = _read_out(centre_px, flow, motion.readout_s, len(light))
+            delay_s = _delay_s(centre_px, flow, motion.readout_s, len(light))[:, None]
+            at_floor = self._floor_flow(centre_px + flow * delay_s, depth, motion.twist) if motion.rolls_later else 0.0
+            centre_px = centre_px + (flow - at_floor) * delay_s
             path_px = flow * motion.exposure_s
         scene = light, depth, centre_px, path_px, z, seen.radiance, width_px, cover_px2
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
@@ -164,9 +170,30 @@ class MarineSnow:
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
 
     def _flow(self, points: Array, world_from_left: Array, camera: int, twist: Array) -> Array:
-        """Returns the velocities (n, 2) of particles in the image of a moving camera [px/s]; `points` in its axes."""
+        """Returns the velocities (n, 2) of particles in the image of a moving camera [px/s].
+
+        Args:
+            points: (n, 3) positions of the particles in the axes of the camera [m].
+            world_from_left: (4, 4) pose of the left camera.
+            camera: 0 left, 1 right.
+            twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        """
         left_from_camera = self._rig.left_from_right if camera else np.eye(4)
         drift = (world_from_left @ left_from_camera)[:3, :3].T @ self._current_mps
+        return self._image_velocity(points, drift, twist)
+
+    def _floor_flow(self, pixel: Array, depth: Depth, twist: Array) -> Array:
+        """Returns the velocities (n, 2) of the floor at positions (n, 2) in the image of a moving camera [px/s]."""
+        last, middle = np.array(depth.shape[::-1]) - 1, np.array([self._rig.cx_px, self._rig.cy_px])
+        u, v = np.clip(np.rint(pixel), 0, last).astype(np.int64).T
+        z = np.minimum(depth[v, u], FAR_M)[:, None].astype(np.float64)
+        return self._image_velocity(np.hstack([(pixel - middle) / self._rig.focal_px * z, z]), np.zeros(3), twist)
+
+    def _image_velocity(self, points: Array, drift: Array, twist: Array) -> Array:
+        """Returns the image velocities (n, 2) [px/s] of points (n, 3) that drift at `drift` (3,) [m/s].
+
+        Points and drift are in the axes of the camera.
+        """
         velocity = drift - twist[3:] - np.cross(twist[:3], points)
         along = points[:, :2] / points[:, 2:]
         return self._rig.focal_px * (velocity[:, :2] - along * velocity[:, 2:]) / points[:, 2:]
@@ -205,14 +232,14 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
 
 
-def _read_out(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
-    """Returns the positions (n, 2) at which a rolling shutter records particles [px].
+def _delay_s(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
+    """Returns the times (n,) after mid-exposure at which a rolling shutter records particles [s].
 
-    The row v is read t = readout (v / (n_rows - 1) - 1/2) after mid-exposure; v = v_0 + v' t is solved for v.
+    The row v is read t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row v_0 at mid-exposure
+    and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t.
     """
     row_s = readout_s / (n_rows - 1)
-    delay_s = (pixel[:, 1] * row_s - readout_s / 2) / np.maximum(1 - flow[:, 1] * row_s, 0.1)
-    return pixel + flow * delay_s[:, None]
+    return (pixel[:, 1] * row_s - readout_s / 2) / np.maximum(1 - flow[:, 1] * row_s, 0.1)
 
 
 @njit(cache=True, nogil=True)
@@ -223,28 +250,48 @@ def _in_view(start, shift, low, camera_from_world, focal, middle, size, margin_p
     positions in the box at time 0, to which `shift` is added before they are wrapped into the box at `low`.
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
-    turn, at, per_box = camera_from_world[:3, :3], camera_from_world[:3, 3], 1 / BOX_M
-    xs, ys, zs = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    xs, ys, zs, seen = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.uint8)
     for begin in range(0, len(start), BLOCK):
         block = start[begin : begin + BLOCK]
-        for k in range(len(block)):  # without branches, so that the compiler can vectorize it
-            a, b, c = block[k, 0] + shift[0], block[k, 1] + shift[1], block[k, 2] + shift[2]
-            a = low[0] + a - BOX_M * np.floor(a * per_box)
-            b = low[1] + b - BOX_M * np.floor(b * per_box)
-            c = low[2] + c - BOX_M * np.floor(c * per_box)
-            xs[k] = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + at[0]
-            ys[k] = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + at[1]
-            zs[k] = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + at[2]
+        _into_camera(block.reshape(-1), shift, low, camera_from_world, xs, ys, zs)
+        _test_view(xs, ys, zs, focal, middle[0], middle[1], size[0], size[1], margin_px, reach_px_m, farthest_m, seen)
         for k in range(len(block)):
-            z = zs[k]
-            if z <= NEAREST_M or z > farthest_m:
-                continue
-            margin = margin_px * z + reach_px_m
-            u, v = focal * xs[k] + middle[0] * z, focal * ys[k] + middle[1] * z
-            if -margin < u < size[0] * z + margin and -margin < v < size[1] * z + margin:
-                found[n], points[n, 0], points[n, 1], points[n, 2] = begin + k, xs[k], ys[k], z
+            if seen[k]:
+                found[n], points[n, 0], points[n, 1], points[n, 2] = begin + k, xs[k], ys[k], zs[k]
                 n += 1
     return found[:n], points[:n]
+
+
+@njit(cache=True, nogil=True)
+def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
+    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened.
+
+    Has neither branches nor reads of other arrays in the loop, so that the compiler can vectorize it.
+    """
+    per_box, (px, py, pz), (lx, ly, lz) = 1 / BOX_M, (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
+    pose = camera_from_world
+    a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    i, j, m, o = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    for k in range(start.size // 3):
+        x, y, z = start[3 * k] + px, start[3 * k + 1] + py, start[3 * k + 2] + pz
+        x = lx + x - BOX_M * np.floor(x * per_box)
+        y = ly + y - BOX_M * np.floor(y * per_box)
+        z = lz + z - BOX_M * np.floor(z * per_box)
+        xs[k] = a * x + b * y + c * z + d
+        ys[k] = e * x + f * y + g * z + h
+        zs[k] = i * x + j * y + m * z + o
+
+
+@njit(cache=True, nogil=True)
+def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m, seen):
+    """Computes which particles are in view, see `_in_view`; without branches, so that the compiler can vectorize it."""
+    for k in range(seen.size):
+        z = zs[k]
+        margin = margin_px * z + reach_px_m
+        u, v = focal * xs[k] + cx * z, focal * ys[k] + cy * z
+        across = (u > -margin) & (u < width * z + margin)
+        seen[k] = across & (v > -margin) & (v < height * z + margin) & (z > NEAREST_M) & (z <= farthest_m)
 
 
 @njit(cache=True, nogil=True)
@@ -253,7 +300,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
     A particle is a disc with an antialiased edge that moves along a straight path (n, 2) [px] around its centre.
     """
-    cols = depth.shape[1]
+    cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5
         reach_u, reach_v = radius + 0.5 * abs(path[k, 0]), radius + 0.5 * abs(path[k, 1])
@@ -264,17 +311,22 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
         steps = int(np.ceil(np.sqrt(path[k, 0] ** 2 + path[k, 1] ** 2))) + 1
         spacing = 1 / np.sqrt(max(steps * steps - 1, 1))  # positions have the variance of a uniform path
         step_u, step_v = path[k, 0] * spacing, path[k, 1] * spacing
-        total = 0.0
+        total, at, across = 0.0, 0, u1 + 1 - u0
         for v in range(v0, v1 + 1):
             for u in range(u0, u1 + 1):
-                total += _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
+                weight = _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
+                weights[min(at, FOOTPRINT_PX - 1)] = weight
+                total, at = total + weight, at + 1
         if total <= 0:
             continue
         for v in range(max(v0, first), min(v1 + 1, end)):
             for u in range(max(u0, 0), min(u1 + 1, cols)):
                 if depth[v, u] < z[k]:
                     continue
-                weight = _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
+                if at <= FOOTPRINT_PX:
+                    weight = weights[(v - v0) * across + u - u0]
+                else:
+                    weight = _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
                 share = min(cover[k] * weight / total, 1.0)
                 for c in range(3):
                     light[v, u, c] += np.float32(share * (radiance[k, c] - light[v, u, c]))
@@ -282,7 +334,10 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
 @njit(cache=True, nogil=True, inline="always")
 def _swept(radius, du, dv, step_u, step_v, steps):
-    """Returns the mean coverage of a pixel at offset (du, dv) from the middle of `steps` evenly spaced positions."""
+    """Returns the mean coverage (0 to 1) of a pixel by a disc of `radius` [px] at `steps` evenly spaced positions.
+
+    (du, dv) is the offset of the pixel from the middle position, (step_u, step_v) the step between positions [px].
+    """
     total, first = 0.0, 0.5 * (1 - steps)
     for i in range(steps):
         total += _rim(radius, du - (first + i) * step_u, dv - (first + i) * step_v)
@@ -291,5 +346,5 @@ def _swept(radius, du, dv, step_u, step_v, steps):
 
 @njit(cache=True, nogil=True, inline="always")
 def _rim(radius, du, dv):
-    """Returns the coverage (0 to 1) of a pixel at offset (du, dv) from the centre of a disc with antialiased edge."""
+    """Returns the coverage (0 to 1) of a pixel by a disc with antialiased edge whose centre is (du, dv) px away."""
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

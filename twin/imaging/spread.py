@@ -86,7 +86,12 @@ def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[f
 
 
 def ring_shares(edges: Array, sigmas: Array) -> Array:
-    """Returns the share (n, m) of each normalised Gaussian of width `sigmas` (m,) in the rings between n + 1 edges."""
+    """Returns the share (n, m) of each normalised Gaussian that lies in each of n rings.
+
+    Args:
+        edges: (n + 1,) edges of the rings.
+        sigmas: (m,) standard deviations of the Gaussians.
+    """
     beyond = np.exp(-(edges[:, None] ** 2) / (2 * sigmas**2))
     return beyond[:-1] - beyond[1:]
 
@@ -94,7 +99,8 @@ def ring_shares(edges: Array, sigmas: Array) -> Array:
 def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
     """Returns values (..., m) at path lengths (m,), interpolated from `share` (..., nodes) at `NODES_M`.
 
-    The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d).
+    The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d),
+    with b the scattering coefficient and d the path length.
     """
     of_scattered = share / -np.expm1(-scattering_per_m * np.array(NODES_M))
     at = np.interp(np.log(np.maximum(path_m, 1e-9)), np.log(NODES_M), np.arange(len(NODES_M)))
@@ -106,18 +112,22 @@ def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
 
 @cache
 def _rings(most: float) -> Array:
-    """Returns the edges (ANGLES + 1,) of the rings from 0 to `most`, even in their logarithm."""
+    """Returns the edges (ANGLES + 1,) of rings: 0, then values up to `most` with a constant ratio."""
     return np.concatenate([[0.0], np.geomspace(LEAST_RAD, most, ANGLES)])
 
 
 def _middle(edges: Array) -> Array:
-    """Returns the geometric mean of each pair of neighbouring edges; half of the first edge that is not 0."""
+    """Returns the middle of each ring: the geometric mean of its edges; for the innermost ring, half its outer edge."""
     return np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
 
 
 @cache
 def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
-    """Returns response times width of the cell of beta, and relative excess path, each (ANGLES, ANGLES) for t, beta."""
+    """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp.
+
+    The first is the response of the receiver times the width of the cell of beta, the second the excess length of the
+    scattered path relative to the straight one, path / d - 1.
+    """
     edges = _rings(np.pi)
     t = _middle(edges)[:, None]
     inside = np.clip(t - edges[:-1], 0.0, np.diff(edges))  # the part of each cell of beta that is below t
@@ -129,7 +139,10 @@ def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
 
 
 def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array:
-    """Returns the light scattered once in each ring of the angle at the lamp, divided by b d exp(-a d)."""
+    """Returns the light (ANGLES,) scattered once in each ring of the angle at the lamp, divided by b d exp(-a d).
+
+    d is the distance from the lamp, a and b are absorption and scattering coefficient of the water.
+    """
     width, excess = _lamp_geometry(receiver)
     edges = _rings(np.pi)
     density = phase_at((water.scatterer,), np.cos(_middle(edges)))[:, 0] * np.diff(edges)
@@ -138,7 +151,12 @@ def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array
 
 @cache
 def _camera_geometry() -> tuple[Array, Array, Array]:
-    """Returns ring of tan(beta) and relative excess path, each (STEPS, ANGLES) for u and t, and solid angles of t."""
+    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera.
+
+    Returns:
+        Ring of tan(beta) and excess length of the path relative to the range, each (STEPS, ANGLES) over u and t; solid
+        angles (ANGLES,) of the cells of t [sr].
+    """
     edges = _rings(np.pi / 2 * 0.999)
     t = _middle(edges)
     u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
@@ -150,7 +168,11 @@ def _camera_geometry() -> tuple[Array, Array, Array]:
 
 
 def _camera_rings(water: Absorbed, range_m: float) -> Array:
-    """Returns the light scattered once in each ring of tan(beta), divided by b r exp(-a r)."""
+    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r).
+
+    There is one value per ring of tan(beta), where beta is the angle at the camera between the point of the floor and
+    the pixel's ray. r is the range; a and b are absorption and scattering coefficient of the water.
+    """
     ring, excess, solid = _camera_geometry()
     density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
     light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)
@@ -179,7 +201,13 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
 
 
 def _fit(basis: Array, wanted: Array) -> Array:
-    """Returns the weights of 0 or more that fit one transform; the first row of `basis` is weighted."""
+    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel.
+
+    Args:
+        basis: (frequencies, m) transforms of the Gaussians; the first row, at frequency 0, is multiplied by
+            `WEIGHT_OF_TOTAL`, so that the integral is fitted best.
+        wanted: (frequencies,) transform of the kernel.
+    """
     total = wanted[0]
     if total <= 0:
         return np.zeros(basis.shape[1])
@@ -189,7 +217,11 @@ def _fit(basis: Array, wanted: Array) -> Array:
 
 
 def _frequencies(least: float, most: float) -> Array:
-    """Returns the frequencies of the fit: 0, where a transform is the integral, and those of the range of widths."""
+    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least.
+
+    Args:
+        least, most: smallest and largest standard deviation of the Gaussians.
+    """
     return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
 
 

@@ -68,7 +68,10 @@ def sky_radiance(cosine: Array) -> Array:
 
 
 def _transmitted(cosine: Array) -> Array:
-    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water; 0 beyond the cone."""
+    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water.
+
+    It is 0 beyond the critical angle.
+    """
     under = np.asarray(cosine, np.float64)
     above = np.sqrt(np.maximum(1 - WATER_INDEX**2 * (1 - under**2), 0.0))
     inside = (under > 0) & (above > 0)
@@ -79,7 +82,10 @@ def _transmitted(cosine: Array) -> Array:
 
 
 def _sky_moments() -> tuple[float, float]:
-    """Returns the illuminance [lx] by a sky of transmitted radiance T, and the scalar illuminance per lx."""
+    """Returns two integrals over the light of a sky whose radiance just below the surface is the transmittance [cd/m2].
+
+    They are the illuminance of a horizontal plane [lx], and the ratio of scalar illuminance to this illuminance.
+    """
     # nodes are even in the cosine in air squared, which removes the root at the edge of the cone
     x, w = np.polynomial.legendre.leggauss(64)
     above = (x + 1) / 2

@@ -25,7 +25,9 @@ from twin.imaging import port as ports
 from twin.imaging import resample
 from twin.imaging.lens import Distortion
 from twin.imaging.port import Pinhole
+from twin.imaging.ray_sampling import RowMotion, sample_rays
 from twin.imaging.resample import Positions
+from twin.imaging.shutter import ExposureMotion
 from twin.scenario.model import CalibrationErrorConfig, PortConfig, Scenario
 
 Array = NDArray[np.float64]
@@ -123,7 +125,9 @@ class TrueCameras:
     believed: CameraModel
     rectified_depth_m: float
 
-    def sample(self, light: Radiance, depth: Depth, camera: int, every_px: int = 1) -> Radiance:
+    def sample(
+        self, light: Radiance, depth: Depth, camera: int, every_px: int = 1, motion: ExposureMotion | None = None
+    ) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
 
         Args:
@@ -131,6 +135,8 @@ class TrueCameras:
             depth: (H, W) depth in the rendered image [m].
             camera: 0 left, 1 right.
             every_px: number n; only every n-th raw pixel along columns and rows is sampled.
+            motion: motion of the camera during the exposure, of which the rolling shutter is applied if the rendered
+                images are resampled (`sampling` is not None); None = no motion.
         """
         if self.sampling is None:
             return (
@@ -146,7 +152,17 @@ class TrueCameras:
                 if parallax is None
                 else np.ascontiguousarray(parallax[every_px // 2 :: every_px, every_px // 2 :: every_px])
             )
-        return resample.sample(light, positions if parallax is None else resample.intersect(depth, positions, parallax))
+        rows = self._row_motion(motion, len(light), len(positions))
+        if parallax is None and rows is None:
+            return resample.sample(light, positions)
+        return sample_rays(light, depth, positions, parallax, rows)
+
+    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
+        """Returns the motion during the read-out of the raw rows; None without rolling shutter."""
+        if motion is None or not motion.readout_s:
+            return None
+        rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
+        return RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
 
     def rectify(self, raw: Image) -> Image:
         """Returns the frame: the raw image of either camera, rectified with the believed calibration."""

@@ -46,7 +46,7 @@ class Medium(NamedTuple):
 
     @property
     def camera_loss_per_m(self) -> Array:
-        """Loss of light between floor and camera (3,) [1/m]: a if scattered light arrives blurred, else c."""
+        """Loss of light between floor and camera (3,) [1/m]: a with multiple scattering, else c = a + b."""
         return self.absorption_per_m if self.multiple else self.attenuation_per_m
 
     @property

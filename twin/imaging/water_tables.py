@@ -2,8 +2,8 @@
 
 The tables are those of the package `jerlov`, interpolated linearly between their wavelengths (25 nm apart in the first
 source, 5 nm in the second). Solonenko & Mobley (2015) derived a and b from the diffuse attenuation that Jerlov
-measured, Williamson & Hollins (2022) measured them. They differ: at 550 nm, b of the second is 2.3 (IB), 0.49 (II),
-0.29 (III), 1.2 (1C), 0.61 (3C) and 0.89 (5C) times b of the first.
+measured, Williamson & Hollins (2022) measured a and b. The two sources differ: at 550 nm, b of the second is 2.3 (IB),
+0.49 (II), 0.29 (III), 1.2 (1C), 0.61 (3C) and 0.89 (5C) times b of the first.
 
 In the printed table of Solonenko & Mobley, the rows of 3C from 675 nm and of 5C from 600 nm are those of other
 wavelengths. There the absorption is interpolated: it lies between those of types 1C and 7C, in the same proportion as
@@ -89,7 +89,10 @@ def _filled(values: Array, clearer: Array, murkier: Array) -> Array:
 
 
 def provenance_of(water: WaterConfig) -> str:
-    """Returns the name and the source of a scenario's water, and b of the other source relative to this one."""
+    """Returns the name and the source of a scenario's water as text.
+
+    If another source has the same Jerlov type, the text also compares the scattering coefficients b of both sources.
+    """
     if not water.is_jerlov_type:
         return water.label
     here = _scattering_at(_COMPARED_NM, water.jerlov, water.source)

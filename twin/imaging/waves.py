@@ -77,11 +77,11 @@ def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
 
 
 def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[float, float]:
-    """Returns the variance of the slopes along and across the wind due to the waves shorter than a wave length.
+    """Returns the variances of the slope along and across the wind, due to waves above a given wave number.
 
     Args:
         wind_mps: wind speed 10 m above the sea.
-        above_rad_per_m: wave number of the longest wave that counts.
+        above_rad_per_m: wave number of the longest wave that is included.
     """
     k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
     per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4

@@ -72,15 +72,25 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
     """Returns the RMSE [m] of estimated positions (n, 3) of the last n keyframes in `frames`; None if there are none.
 
+    Arguments as for `keyframe_errors_m`.
+    """
+    return rms(keyframe_errors_m(positions, frames, result, truth))
+
+
+def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> Array:
+    """Returns the position errors (n,) [m] of the last n keyframes in `frames`.
+
     The positions are anchored at the first true pose before they are compared.
 
     Args:
         positions: (n, 3) estimated positions, not yet anchored [m].
         frames: frame numbers of the keyframes.
+        result: output of the estimators.
+        truth: true trajectory.
     """
     n = min(len(positions), len(frames))
     if n == 0:
-        return None
+        return np.zeros(0)
     true_from_estimated = anchor(result.online.world_from_camera[0], truth.trajectory.world_from_camera[0])
     anchored = geometry.transform(true_from_estimated, positions[-n:])
-    return rms(np.linalg.norm(anchored - truth.trajectory.positions[frames[-n:]], axis=1))
+    return np.linalg.norm(anchored - truth.trajectory.positions[frames[-n:]], axis=1)

@@ -20,7 +20,7 @@ ALONG_NODES = 2
 
 
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
-    """Returns `links` of metrics.json: errors of the links to the two previous nodes (along) and of others (across).
+    """Returns `links` of metrics.json: errors of links to the two previous nodes (along) and of all others (across).
 
     `bridged` is the number of links that consist of frame-to-frame motion because no points were matched. The errors of
     these links are not evaluated.

@@ -11,6 +11,7 @@ import numpy as np
 from twin.core.quality import ActionTimes
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
+from twin.judge import orthomosaic
 from twin.judge.alignment import track_metrics
 from twin.judge.consistency import consistency_metrics
 from twin.judge.control import control_metrics
@@ -48,6 +49,7 @@ class EvaluationInput:
         warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
         idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
         actions: times for which the mission slowed and stopped the vehicle because visual measurements failed.
+        orthomosaic: errors of the orthomosaic (`OrthomosaicJudge.metrics`); None if none was made.
     """
 
     result: SurveyResult
@@ -61,6 +63,7 @@ class EvaluationInput:
     warnings: Sequence[str] = ()
     idealisations: Sequence[str] = ()
     actions: ActionTimes = ActionTimes()
+    orthomosaic: Mapping[str, float | None] | None = None
 
 
 def evaluate(survey: EvaluationInput) -> dict[str, Any]:
@@ -79,6 +82,7 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
         "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in paths.items()},
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),
+        "orthomosaic": dict(survey.orthomosaic or dict.fromkeys(orthomosaic.KEYS)),
         "consistency": consistency_metrics(result, elevation, truth),
         "links": link_metrics(result, truth),
         "vision": stereo_quality(result),
@@ -86,7 +90,7 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth) | survey.actions._asdict(),
         "overlap": overlap_metrics(result, truth, survey.rig, grid, dict(survey.plan)),
-        "timing": _timing(survey.timing, len(result.online), len(result.keyframe_rows)),
+        "timing": timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows)),
     }
     return _judged(finite_tree(metrics), survey)
 
@@ -104,7 +108,7 @@ def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
     A requirement on a metric that is None fails.
     """
     result, known = survey.result, {key: survey.identity.get(key) for key in _IDENTITY}
-    timing = _timing(survey.timing, len(result.online), len(result.keyframe_rows))
+    timing = timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows))
     return _judged(empty_metrics() | finite_tree(known | {"timing": timing}), survey)
 
 
@@ -149,8 +153,8 @@ def empty_metrics() -> dict[str, Any]:
     return evaluate(EvaluationInput(result, None, truth, rig, timing={"stages": Stopwatch().summary()}))
 
 
-def _timing(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
-    """Returns `timing` of metrics.json."""
+def timing_metrics(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
+    """Returns `timing` of metrics.json: wall and simulated time, real-time factor, memory, and time by stage."""
     wall, simulated = timing.get("wall_s"), timing.get("simulated_s")
     return {
         "wall_s": finite_float(wall),

@@ -17,6 +17,7 @@ from twin.judge.trajectory import path_errors
 from twin.report import recording_surfaces, wording
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
+from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.report.verdict import badge, first_lines
@@ -43,7 +44,7 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
-    rig = scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
+    rig = replayed_rig(run.scenario) or scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_overview(run)))
     log_scene(recording, run)

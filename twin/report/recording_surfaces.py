@@ -46,8 +46,11 @@ def floor_surface(raster: Raster) -> Surface:
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
     """Returns the estimated map as a surface in the colours of the orthomosaic, or coloured by height without one."""
-    if mosaic is not None and mosaic.values.shape[:2] == dem.values.shape:
-        return _surface(dem, mosaic.values)
+    if mosaic is not None and mosaic.values.shape[0] * dem.values.shape[1] == (
+        mosaic.values.shape[1] * dem.values.shape[0]
+    ):
+        size = dem.values.shape[::-1]
+        return _surface(dem, np.asarray(cv2.resize(mosaic.values, size, interpolation=cv2.INTER_AREA), np.uint8))
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
     level = np.nan_to_num(255 * (dem.values - low) / max(high - low, 1e-6)).astype(np.uint8)
     return _surface(dem, cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[..., ::-1])

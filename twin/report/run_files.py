@@ -122,7 +122,7 @@ def _join(key: str, name: str) -> str:
 
 
 def _scalar_rule(template: Any, given: Any) -> tuple[str, bool]:
-    """Returns what the template of a single value allows, in words, and whether the given value is allowed."""
+    """Returns a description of the values that a template allows for a single value, and whether it allows `given`."""
     is_number = isinstance(given, int | float) and not isinstance(given, bool)
     if isinstance(template, str):
         return "a string", isinstance(given, str)

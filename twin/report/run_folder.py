@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 
 from twin.core.paths import is_file
@@ -23,7 +24,8 @@ from twin.scenario.toml_text import parse_toml
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
 SCENARIO_FILE = "scenario.resolved.toml"
 _OBSERVATION_KEYS = ("row", "n_points", "contrast")  # columns of `Keyframes.stereo_observations`
-RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error", "mosaic")
+RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
+MAX_MOSAIC_PX = 16_000_000
 
 
 class Raster(NamedTuple):
@@ -115,7 +117,8 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         _read_json(folder / "env.json", checked_environment) or {},
         metrics or _read_json(folder / "metrics.json", checked_metrics),
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
-        _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster),
+        _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster)
+        | _read_existing({"mosaic": folder / "mosaic.tif"}, read_mosaic),
         _read_existing({"network": folder / "posegraph.g2o"}, read_network).get("network", _empty_network()),
         _read_keyframes(folder / "keyframes" / "index.json"),
     )
@@ -136,6 +139,18 @@ def read_raster(file: Path) -> Raster:
     if len(bands) == 1:
         return Raster(grid, bands[0].astype(float).filled(np.nan) - elevation_m)
     return Raster(grid, np.moveaxis(bands[:3], 0, 2))
+
+
+def read_mosaic(file: Path) -> Raster:
+    """Reads the orthomosaic as `read_raster` does, reduced to at most `MAX_MOSAIC_PX` pixels by averaging."""
+    with rasterio.open(file) as source:
+        grid, _ = geotiff.scene_placement(source)
+        step = int(np.ceil(np.sqrt(source.width * source.height / MAX_MOSAIC_PX)))
+        rows, cols = source.height // step, source.width // step
+        whole = (0, rows * step), (0, cols * step)
+        bands = source.read((1, 2, 3), window=whole, out_shape=(3, rows, cols), resampling=Resampling.average)
+    cells = MapGrid(grid.west_m, grid.north_m, grid.cell_m * step, rows, cols)
+    return Raster(cells, np.moveaxis(bands, 0, 2))
 
 
 def read_network(file: Path) -> Network:

@@ -6,11 +6,12 @@ import json
 import os
 import platform
 from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,14 +22,42 @@ from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajec
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import posegraph
+from twin.report.replay_description import RunDescription
 from twin.scenario import file as scenario_file
 from twin.scenario.model import Scenario
+
+if TYPE_CHECKING:
+    from twin.exchange.geotiff import OrthomosaicFile
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 OPTIONAL_OUTPUTS = ("report", "recording")
 #: Glob patterns of the files that each interruptible stage of the writing creates.
 _FILES = {"maps": ("*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
+
+
+class PlannedTruth(NamedTuple):
+    """Truth, map grid and plan of a simulated survey.
+
+    Args:
+        truth: true trajectory and floor, and the reference path.
+        grid: cells of the maps.
+        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless
+            the truth has a planned heading per frame.
+    """
+
+    truth: Truth
+    grid: MapGrid
+    start: Array
+
+    def reference(self) -> Trajectory:
+        """Returns the planned path as poses world_from_camera."""
+        truth = self.truth
+        planned = np.tile(self.start, (len(truth.reference), 1, 1))
+        planned[:, :3, 3] = truth.reference
+        if truth.reference_yaw is not None:
+            planned[:, :3, :3] = geometry.rotations_of_down_camera(truth.reference_yaw)
+        return Trajectory(truth.trajectory.times_s, planned)
 
 
 @dataclass(frozen=True)
@@ -38,25 +67,25 @@ class SurveyRecord:
     Args:
         result: output of the estimators.
         elevation: elevation map; None if none was built.
-        truth: true trajectory and floor, and the reference path.
-        grid: cells of the maps.
-        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless
-            the truth has a planned heading per frame.
-        n_frames_per_keyframe: planned frames from one keyframe to the next.
+        simulated: truth and plan of a simulated survey; None for recorded data.
+        n_frames_per_keyframe: planned frames from one keyframe to the next; None without a plan.
         stopwatch: durations of the processing stages.
         metrics: contents of metrics.json.
         georeference: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
+        has_orthomosaic: whether mosaic.tif has been written as an orthomosaic (`RunFolder.orthomosaic_file`); otherwise
+            it is written with the cells of the map.
+        recorded_truth: recorded poses at all frames, in the world of the estimates; None if there are none.
     """
 
     result: SurveyResult
     elevation: ElevationMap | None
-    truth: Truth
-    grid: MapGrid
-    start: Array
-    n_frames_per_keyframe: int
+    simulated: PlannedTruth | None
+    n_frames_per_keyframe: int | None
     stopwatch: Stopwatch
     metrics: dict[str, Any]
     georeference: Georeference | None = None
+    has_orthomosaic: bool = False
+    recorded_truth: Trajectory | None = None
 
 
 class RunFolder:
@@ -64,7 +93,7 @@ class RunFolder:
 
     Args:
         folder: path of the run folder, which is created if it does not exist.
-        scenario: the resolved scenario of the run.
+        scenario: the resolved scenario of the run, or the description of a run without a scenario.
         outputs: members of `OPTIONAL_OUTPUTS` to write at the end; writing them may take longer than a short survey.
             None: write only the metrics, without trajectories and maps.
 
@@ -72,12 +101,15 @@ class RunFolder:
         TwinError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, outputs: Collection[str] | None = OPTIONAL_OUTPUTS):
+    def __init__(
+        self, folder: Path, scenario: Scenario | RunDescription, outputs: Collection[str] | None = OPTIONAL_OUTPUTS
+    ):
+        text = scenario.text if isinstance(scenario, RunDescription) else scenario_file.dump_toml(scenario)
         self.path, self._reserve, self._outputs = folder, folder / ".reserve", outputs
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._log = (folder / "log.jsonl").open("w", encoding="utf-8")
-            self._write("scenario.resolved.toml", scenario_file.dump_toml(scenario))
+            self._write("scenario.resolved.toml", text)
             self._write("env.json", json.dumps(environment(), indent=1))
             self._reserve.write_bytes(bytes(_RESERVE_BYTES))
         except OSError as error:
@@ -132,6 +164,19 @@ class RunFolder:
         self.log(metrics["status"], reason=metrics["reason"])
         return metrics
 
+    @property
+    def writes_maps(self) -> bool:
+        """Returns whether `finish` writes trajectories and maps."""
+        return self._outputs is not None
+
+    def orthomosaic_file(
+        self, grid: MapGrid, georeference: Georeference | None
+    ) -> AbstractContextManager[OrthomosaicFile | None]:
+        """Returns mosaic.tif, opened to write the tiles of an orthomosaic; None if no maps are written."""
+        from twin.exchange.geotiff import OrthomosaicFile
+
+        return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
+
     def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None]) -> None:
         """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete."""
         n_skipped = len(guard.skipped)
@@ -146,13 +191,13 @@ class RunFolder:
 
     def _write_trajectories(self, record: SurveyRecord) -> None:
         """Writes trajectories, network and the index of the keyframes."""
-        result, truth = record.result, record.truth
-        planned = np.tile(record.start, (len(truth.reference), 1, 1))
-        planned[:, :3, 3] = truth.reference
-        if truth.reference_yaw is not None:
-            planned[:, :3, :3] = geometry.rotations_of_down_camera(truth.reference_yaw)
-        paths = {"truth": truth.trajectory, "f2f": result.f2f, "online": result.online, "final": result.final}
-        for name, path in (paths | {"reference": Trajectory(truth.trajectory.times_s, planned)}).items():
+        result = record.result
+        paths = {"f2f": result.f2f, "online": result.online, "final": result.final}
+        if record.simulated is not None:
+            paths |= {"truth": record.simulated.truth.trajectory, "reference": record.simulated.reference()}
+        elif record.recorded_truth is not None:
+            paths["truth"] = record.recorded_truth
+        for name, path in paths.items():
             path.save(self.path / f"trajectory_{name}.tum")
         posegraph.write(self.path / "posegraph.g2o", result)
         index = {
@@ -169,15 +214,23 @@ class RunFolder:
         """Writes the true, estimated and error rasters, the orthomosaic and the mesh."""
         from twin.exchange import geotiff, mesh
 
-        truth, grid, elevation, origin = record.truth, record.grid, record.elevation, record.georeference
-        geotiff.write_elevations(self.path / "dem_truth.tif", truth.height_m, grid, "true elevation [m]", origin)
-        if elevation is None:
-            return
-        geotiff.write_map(self.path, elevation, origin)
-        error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
-        description = "estimated minus true elevation [m]"
-        geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, description, origin)
-        mesh.write_glb(self.path / "mesh.glb", elevation)
+        elevation, origin = record.elevation, record.georeference
+        if record.simulated is not None:
+            truth, grid, _ = record.simulated
+            geotiff.write_elevations(self.path / "dem_truth.tif", truth.height_m, grid, "true elevation [m]", origin)
+            if truth.objects is not None and truth.overhung is not None:
+                masks = {
+                    "object, 1 + its number; 0: floor": truth.objects,
+                    "1: floor below an overhang": truth.overhung,
+                }
+                geotiff.write_masks(self.path / "objects_truth.tif", masks, grid, origin)
+            if elevation is not None:
+                error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
+                description = "estimated minus true elevation [m]"
+                geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, description, origin)
+        if elevation is not None:
+            geotiff.write_map(self.path, elevation, origin, mosaic=not record.has_orthomosaic)
+            mesh.write_glb(self.path / "mesh.glb", elevation)
 
     def _write_optional_output(self, name: str, metrics: dict[str, Any]) -> None:
         """Writes the report or the recording; the libraries for each are imported only when needed."""

@@ -60,7 +60,7 @@ def context(run: Run) -> dict[str, Any]:
         "key_figures": wording.key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
-        "closed_form_comparison": wording.closed_form_comparison(metrics["links"]) if "links" in metrics else "",
+        "closed_form_comparison": _closed_form_comparison(metrics),
         "stage_times": stage_times(metrics, run.scenario, run.keyframes.n_frames_per_keyframe) if metrics else [],
         "processing_stages": wording.PROCESSING_STAGES,
         "figures": draw_all(run),
@@ -71,6 +71,11 @@ def context(run: Run) -> dict[str, Any]:
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,
     }
+
+
+def _closed_form_comparison(metrics: Mapping[str, Any]) -> str:
+    """Returns the comparison of the links with the closed form; "" for a replay, which has no link errors."""
+    return "" if "links" not in metrics or metrics.get("replay") else wording.closed_form_comparison(metrics["links"])
 
 
 def mosaic_image(run: Run) -> str | None:

@@ -15,7 +15,7 @@ _STATUSES = {"aborted": "The survey was aborted", "degraded": "The survey is deg
 
 
 class Badge(NamedTuple):
-    """Verdict on a survey in a few words, with its level."""
+    """Verdict on a survey in a few words, with its severity level."""
 
     text: str
     level: Level

@@ -22,6 +22,7 @@ PROCESSING_STAGES = {
     "network": "keyframe network",
     "ga": "global alignment (GA)",
     "map": "elevation map",
+    "orthomosaic": "orthomosaic",
     "keyframe": "all keyframe processing",
 }
 
@@ -35,6 +36,10 @@ TERMS = {
     "values mean that the estimate is overconfident.",
     "NEES": "Normalised estimation error squared, e' C^-1 e, of an error e with the estimated covariance C. Its mean "
     "is 3 for consistent positions and 6 for consistent motions; larger values mean overconfident covariances.",
+    "CE90": "90th percentile of the horizontal error (circular error at 90 %), for the orthomosaic that of "
+    "patches against the true albedo.",
+    "CIEDE2000": "Colour difference of CIE 142-2001. About 1 is barely visible.",
+    "Edge width": "Distance over which the image of a sharp edge rises from 10 % to 90 %.",
     "Completeness": "Fraction of the map cells with an estimated height, of the asked area or of the observed floor. A "
     "cell is observed if both images of at least one keyframe show it.",
     "Asked area": "Area that the planned tracks are to cover. LE90 over this area counts a cell without a height as an "
@@ -45,6 +50,14 @@ TERMS = {
     "F2M": "Registration of a keyframe with the mosaic of earlier keyframes.",
     "GA": "Global alignment: least-squares adjustment of all keyframe poses to all links.",
     "Eq. (2)": "Closed-form motion between two keyframes (Negahdaripour & Madjidi 2003), which treats depth as exact.",
+}
+
+
+#: How the estimates of a replay were moved to the recorded truth, by the name of the alignment.
+REPLAY_ALIGNMENTS = {
+    "se3": "aligned with the truth by the best rigid motion (SE(3))",
+    "first": "anchored at the first true pose",
+    "none": "without alignment",
 }
 
 
@@ -135,7 +148,32 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
     if metrics is None:
         return f"This survey is unfinished: it has no metrics.json. The survey is planned {conditions(scenario)}."
     verb = "was" if metrics["status"] == "aborted" else "is"
+    if metrics.get("replay"):
+        return f"The replay {verb} {metrics['status']}. {replay_summary(metrics)}"
     return f"The survey {verb} {metrics['status']}. It was flown {conditions(scenario)}. {_results(metrics)}"
+
+
+def replay_summary(metrics: Mapping[str, Any]) -> str:
+    """Returns a summary of a replay as text: frames, errors against a recorded truth, consistency of the network."""
+    replay, timing = metrics["replay"], metrics["timing"]
+    network, final = replay.get("network") or {}, metrics["trajectory"]["final"]
+    sentences = [
+        f"{timing['frames']} frames of recorded stereo data ({replay.get('reader')}) gave {timing['keyframes']} "
+        "keyframes."
+    ]
+    if final["ate_rmse_m"] is None:
+        sentences.append("There is no truth to compare with; the numbers show consistency only.")
+    else:
+        path = f"{length(final['ate_rmse_m'])} (RMSE) over a path of {length(final['path_m'])}"
+        aligned = REPLAY_ALIGNMENTS.get(str(replay.get("alignment")), "")
+        sentences.append(f"The position error of the final trajectory is {path}, {aligned}.")
+    if network.get("loops"):
+        residual, chi2 = length(network["loop_translation_m"]), plain(network["loop_chi2"])
+        sentences.append(
+            f"{network['loops']} links close loops; their median residual is {residual}, chi-square {chi2}."
+        )
+    skipped = [f"{reason}: {count}" for reason, count in (replay.get("skipped") or {}).items()]
+    return " ".join([*sentences, *([f"Skipped: {'; '.join(skipped)}."] if skipped else [])])
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
@@ -195,7 +233,15 @@ def closed_form_comparison(links: Mapping[str, Any]) -> str:
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     """Returns the key figures of a survey; an empty list if `metrics` is empty."""
-    return [*_position_figures(metrics), *_map_figures(metrics), *_survey_figures(metrics)] if metrics else []
+    if not metrics:
+        return []
+    mosaic = metrics.get("orthomosaic") or {}
+    return [
+        *_position_figures(metrics),
+        *_map_figures(metrics),
+        *(_orthomosaic_figures(mosaic) if mosaic.get("pixel_m") else []),
+        *_survey_figures(metrics),
+    ]
 
 
 def _position_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
@@ -225,6 +271,24 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
         KeyFigure("Map bias", bias, f"{mapped}; RMSE {rmse}"),
         KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), f"RMS of error / sigma, 1 is right; {mapped}"),
     ]
+
+
+def _orthomosaic_figures(mosaic: Mapping[str, Any]) -> list[KeyFigure]:
+    """Returns the key figures of the orthomosaic, from `orthomosaic` of metrics.json."""
+    pixel, matched = length(mosaic["pixel_m"]), percent(mosaic["matched"])
+    figures = [
+        KeyFigure(
+            "Orthomosaic CE90",
+            length(mosaic["ce90_m"]),
+            f"horizontal error of the {matched} of patches found in the true albedo; pixel size {pixel}",
+        ),
+        KeyFigure("Orthomosaic edge width", length(mosaic["edge_width_m"]), f"10 % to 90 %; pixel size {pixel}"),
+    ]
+    if mosaic["colour_difference_median"] is not None:
+        p90 = plain(mosaic["colour_difference_p90"])
+        text = f"CIEDE2000 against the true albedo, median; 90th percentile {p90}"
+        figures.append(KeyFigure("Orthomosaic colour error", plain(mosaic["colour_difference_median"]), text))
+    return figures
 
 
 def _survey_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:

@@ -1,13 +1,15 @@
-"""Comparison of the daylight model with the Monte Carlo reference: illuminance, also of slopes, and upwelling light.
+"""Comparison of the daylight model with the Monte Carlo reference: illuminance of planes and slopes, upwelling light.
 
 One cell is one water, elevation of the sun, depth of the camera and range of a level floor, in the green band, with the
-default share of the sky. Model and reference use the same absorption, scattering and phase function.
+default share of the sky. The upwelling light is compared over a black floor and over one of albedo 0.5. Model and
+reference use the same absorption, scattering and phase function.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,33 +18,35 @@ from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
 from twin.imaging.daylight import DaylightVeil, floor_daylight
-from twin.imaging.illumination import Daylight, daylight_at
-from twin.imaging.phase_function import PhaseFunction, phase_of
+from twin.imaging.illumination import Daylight, Illumination, daylight_at
+from twin.imaging.optics import Optics
 from twin.imaging.reference.pixel_light import (
-    BandWater,
     BatchMean,
     Effort,
+    PixelLight,
     PixelRay,
+    PlaneLight,
     ReferenceScene,
     Sunlight,
     pixel_light,
     plane_light,
+    refined,
 )
-from twin.imaging.sun_sky import sky_radiance
+from twin.imaging.sun_sky import WATER_INDEX, sky_radiance
 from twin.imaging.water import Medium, medium
+from twin.reproduce.light_cell import ALBEDO, GREEN, green_of, looking_down
 from twin.scenario.model import SunConfig, WaterConfig
 
 Array = NDArray[np.float64]
 
-GREEN = 1
 WATERS, DEPTHS_M, RANGES_M, ELEVATIONS_DEG = ("IB", "II", "III", "1C", "3C"), (2.0, 5.0, 15.0), (1.0, 3.0), (90.0, 45.0)
 LIFT_M = 1e-3  # height of the slopes above the floor
 SLOPE_DEG = 45.0  # angle of the slopes that face the sun and face away from it
-SUN_RADIUS_RAD = 0.0047 / 1.34  # angular radius of the sun's disc, under water
+SUN_RADIUS_RAD = 0.0047 / WATER_INDEX  # angular radius of the sun's disc, under water
 SKY_STEPS = 4000  # number of steps of the table of the sky's radiance
-WALKS = 40_000
-DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # pose of a camera that points straight down
-RIG = StereoRig(2, 2, 1000.0, 0.1)  # only its principal ray is used
+ROUND, MOST_WALKS = 8_000, 400_000  # walks of a round, and the most of each value
+LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # relative standard errors at which upwelling light and illuminance are accurate
+RIG = StereoRig(64, 48, 100.0, 0.1)  # the pixel next to its principal point is compared
 
 
 class DaylightSelection(NamedTuple):
@@ -59,18 +63,22 @@ QUICK_DAYLIGHT = DaylightSelection(("IB", "III"), (5.0,), (2.0,), ELEVATIONS_DEG
 
 
 class DaylightCell(NamedTuple):
-    """One cell: key, light of the model, and light of the reference with standard errors, per lux at the surface.
+    """One cell of the comparison: conditions, light by the model, and light by the reference with standard errors.
+
+    All light is given for an illuminance of 1 lx just below the water surface.
 
     Args:
         water: Jerlov type.
         elevation_deg: elevation of the sun, in air.
         depth_m: depth of the camera below the surface.
         range_m: range of the floor, straight below.
-        model_lx: illuminance, by the model, of a level plane at the camera, of a slope of `SLOPE_DEG` on the floor that
-            faces the sun, and of one that faces away from it.
-        truth_lx: the same by the reference, over a black floor.
+        model_lx: illuminance, by the model, of a level plane at the camera, and of two slopes of `SLOPE_DEG` on the
+            floor: one that faces the sun and one that faces away from it.
+        truth_lx: the same illuminances by the reference, over a black floor.
         model_veil: upwelling radiance at the camera over a black floor, by the model [cd/m2].
-        truth_veil: the same by the reference.
+        truth_veil: the same radiance by the reference.
+        model_lu: upwelling radiance at the camera over a floor of albedo `ALBEDO` / 255, by the model [cd/m2].
+        truth_lu: the same radiance by the reference.
     """
 
     water: str
@@ -81,80 +89,111 @@ class DaylightCell(NamedTuple):
     truth_lx: tuple[BatchMean, ...]
     model_veil: float
     truth_veil: BatchMean
+    model_lu: float
+    truth_lu: BatchMean
 
     @property
     def reflectance(self) -> tuple[float, BatchMean]:
-        """Upwelling radiance divided by illuminance at the camera, Lu/Ed [1/sr], of model and reference."""
-        veil, lux = self.truth_veil, self.truth_lx[0]
-        value = veil.value / lux.value
-        relative = np.hypot(veil.standard_error / veil.value, lux.standard_error / lux.value)
-        return self.model_veil / self.model_lx[0], BatchMean(value, float(value * relative))
+        """Upwelling radiance over a black floor divided by illuminance at the camera [1/sr]: model, reference."""
+        return self.model_veil / self.model_lx[0], _quotient(self.truth_veil, self.truth_lx[0])
+
+    @property
+    def bright_reflectance(self) -> tuple[float, BatchMean]:
+        """Same as `reflectance`, over a floor of albedo `ALBEDO` / 255."""
+        return self.model_lu / self.model_lx[0], _quotient(self.truth_lu, self.truth_lx[0])
 
 
-def daylight_cells(selection: DaylightSelection = ALL_DAYLIGHT, walks: int = WALKS) -> Iterable[DaylightCell]:
-    """Yields the cells of a selection; `walks` is the number of Monte Carlo walks for each value."""
+def _quotient(part: BatchMean, whole: BatchMean) -> BatchMean:
+    """Returns the quotient of two independent means, with its standard error."""
+    value = part.value / whole.value
+    relative = np.hypot(part.standard_error / part.value, whole.standard_error / whole.value)
+    return BatchMean(value, float(value * relative))
+
+
+def daylight_cells(selection: DaylightSelection = ALL_DAYLIGHT, walks: int = MOST_WALKS) -> Iterable[DaylightCell]:
+    """Yields the cells of a selection; `walks` is the largest number of Monte Carlo walks for each value."""
     for water in selection.waters:
         for elevation_deg in selection.elevations_deg:
             for depth_m in selection.depths_m:
                 for range_m in selection.ranges_m:
-                    yield _cell((water, elevation_deg, depth_m, range_m), Effort(walks))
+                    yield _cell((water, elevation_deg, depth_m, range_m), walks)
 
 
-def _cell(key: tuple[str, float, float, float], effort: Effort) -> DaylightCell:
+def _cell(key: tuple[str, float, float, float], walks: int) -> DaylightCell:
     """Returns one cell; `key`: Jerlov type, elevation of the sun [deg], depth of the camera [m], range [m]."""
     water_type, elevation_deg, depth_m, range_m = key
     water = medium(WaterConfig.model_validate({"jerlov": water_type}))
     sun = SunConfig(illuminance_lx=1.0, depth_m=depth_m + range_m, elevation_deg=elevation_deg)
     daylight = daylight_at(sun, water, range_m)
-    veil = DaylightVeil(daylight, water, np.array([0.0, range_m])).radiance(np.array([0.0, 0.0, -1.0]), depth_m)
+    veil = DaylightVeil(daylight, np.array([0.0, range_m])).radiance(np.array([0.0, 0.0, -1.0]), depth_m)
     places = tuple(zip(_normals(), (range_m, LIFT_M, LIFT_M), strict=True))  # normal, height above the floor
-    model_lx = tuple(plane_lx(daylight, water, normal, depth_m + range_m - height) for normal, height in places)
-    scene = reference_scene(daylight, water, phase_of(water.scatterers[GREEN]), depth_m + range_m)
-    pose = DOWN.copy()
-    pose[2, 3] = range_m
-    truth_lx = tuple(
-        plane_light(scene, np.array([0.0, 0.0, height]), normal, effort).total for normal, height in places
-    )
-    truth = pixel_light(scene, PixelRay(pose, RIG, (RIG.cx_px, RIG.cy_px)), effort).veil
-    return DaylightCell(*key, model_lx, truth_lx, float(veil[1, GREEN]), truth)
+    model_lx = tuple(plane_lx(daylight, normal, depth_m + range_m - height) for normal, height in places)
+    scene = reference_scene(daylight, water, depth_m + range_m)
+    truth_lx = tuple(_plane_truth(scene, np.array([0.0, 0.0, height]), normal, walks) for normal, height in places)
+    above_floor, ray = replace(scene, albedo=ALBEDO / 255), PixelRay(looking_down(range_m), RIG, (RIG.cx_px, RIG.cy_px))
+    effort = Effort(min(walks, ROUND))
+    truth = refined(lambda one: pixel_light(above_floor, ray, one), _is_accurate, effort, walks)
+    model_lu = _model_lu(daylight, water, range_m)
+    return DaylightCell(*key, model_lx, truth_lx, float(veil[1, GREEN]), truth.veil, model_lu, truth.total)
+
+
+def _plane_truth(scene: ReferenceScene, point_m: Array, normal: Array, walks: int) -> BatchMean:
+    """Returns the illuminance [lx] of a plane at a point by the Monte Carlo reference, with its standard error."""
+
+    def enough(light: PlaneLight) -> bool:
+        return light.total.standard_error <= PLANE_ERROR * light.total.value
+
+    effort = Effort(min(walks, ROUND))
+    return refined(lambda one: plane_light(scene, point_m, normal, one), enough, effort, walks).total
+
+
+def _is_accurate(light: PixelLight) -> bool:
+    return all(mean.standard_error <= LIGHT_ERROR * mean.value for mean in (light.total, light.veil))
+
+
+def _model_lu(daylight: Daylight, water: Medium, range_m: float) -> float:
+    """Returns the upwelling green light [cd/m2] at the camera over a floor of albedo `ALBEDO` / 255, by the model."""
+    shape = RIG.height_px, RIG.width_px
+    albedo, depth = np.full((*shape, 3), ALBEDO, np.uint8), np.full(shape, range_m, np.float32)
+    light = Optics(RIG, Illumination(water, daylight), ()).radiance(albedo, depth, 0)
+    return float(light[shape[0] // 2, shape[1] // 2, GREEN])
 
 
 def _normals() -> tuple[Array, Array, Array]:
-    """Returns the normals of a level plane and of slopes that face the sun, in the east, and face away."""
+    """Returns unit normals (3,) of a level plane, a slope that faces the sun (in the east), and one that faces away."""
     s, c = np.sin(np.deg2rad(SLOPE_DEG)), np.cos(np.deg2rad(SLOPE_DEG))
     return np.array([0.0, 0.0, 1.0]), np.array([s, 0.0, c]), np.array([-s, 0.0, c])
 
 
-def plane_lx(daylight: Daylight, water: Medium, normal: Array, depth_m: float) -> float:
+def plane_lx(daylight: Daylight, normal: Array, depth_m: float) -> float:
     """Returns the green illuminance [lx] of a floor at a depth with a unit normal, by the model."""
-    floor = floor_daylight(daylight._replace(reference_depth_m=depth_m), water)
+    floor = floor_daylight(daylight._replace(reference_depth_m=depth_m))
     four = np.append(normal, 1.0)
     beam = floor.beam_lx[GREEN] * np.exp(-floor.beam_per_m[GREEN] * depth_m)
     return float(beam * max(normal @ floor.to_sun, 0.0) + max(four @ floor.rest_lx[GREEN] @ four, 0.0))
 
 
-def reference_scene(daylight: Daylight, water: Medium, phase: PhaseFunction, surface_m: float) -> ReferenceScene:
+def reference_scene(daylight: Daylight, water: Medium, surface_m: float) -> ReferenceScene:
     """Returns the scene of the reference: daylight of 1 lx in green, over a black level floor at z = 0."""
     source = daylight.source
     sky = source.sky_share * sky_radiance(np.linspace(0.0, 1.0, SKY_STEPS + 1))
     sun = Sunlight(source.to_sun, source.beam_lx, surface_m, SUN_RADIUS_RAD, sky)
-    band = BandWater(float(water.absorption_per_m[GREEN]), float(water.scattering_per_m[GREEN]), phase)
-    return ReferenceScene(band, np.zeros((0, 7)), (), 0.0, sun=sun)
+    return ReferenceScene(green_of(water), np.zeros((0, 7)), (), 0.0, sun=sun)
 
 
 def daylight_table(found: Sequence[DaylightCell]) -> list[tuple[str, ...]]:
     """Returns the cells as rows of text, the header first; standard errors follow +-."""
     header = (
         "water, sun", "depth, range", "Ed, model / truth", f"{SLOPE_DEG:g} deg to the sun", "away from it",
-        "Lu/Ed, truth", "model / truth",
+        "Lu/Ed, truth", "model / truth", "albedo 0.5, truth", "model / truth",
     )  # fmt: skip
     rows = []
     for cell in found:
-        model, truth = cell.reflectance
+        pairs = cell.reflectance, cell.bright_reflectance
         over = [_over(value, mean) for value, mean in zip(cell.model_lx, cell.truth_lx, strict=True)]
         rows.append((
             f"{cell.water} {cell.elevation_deg:g} deg", f"{cell.depth_m:g} m, {cell.range_m:g} m", *over,
-            f"{truth.value:.3g}", _over(model, truth),
+            *(text for model, truth in pairs for text in (f"{truth.value:.3g}", _over(model, truth))),
         ))  # fmt: skip
     return [header, *rows]
 
@@ -183,4 +222,5 @@ def _row(cell: DaylightCell) -> dict[str, Any]:
     for name, model, truth in zip(("level", "to_sun", "from_sun"), cell.model_lx, cell.truth_lx, strict=True):
         row |= {f"{name}_model_lx": model, f"{name}_truth_lx": truth.value, f"{name}_truth_se": truth.standard_error}
     row |= {"veil_model_cd_m2": cell.model_veil, "veil_truth_cd_m2": cell.truth_veil.value}
-    return row | {"veil_truth_se": cell.truth_veil.standard_error}
+    row |= {"veil_truth_se": cell.truth_veil.standard_error, "lu_model_cd_m2": cell.model_lu}
+    return row | {"lu_truth_cd_m2": cell.truth_lu.value, "lu_truth_se": cell.truth_lu.standard_error}

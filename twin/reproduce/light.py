@@ -19,9 +19,7 @@ from twin.imaging.forward_scatter import ForwardScatter
 from twin.imaging.illumination import illumination_of
 from twin.imaging.lamps import light_sources_in_camera
 from twin.imaging.optics import Optics, range_of
-from twin.imaging.phase_function import PhaseFunction, phase_of
 from twin.imaging.reference.pixel_light import (
-    BandWater,
     BatchMean,
     Effort,
     PixelLight,
@@ -29,15 +27,15 @@ from twin.imaging.reference.pixel_light import (
     ReferenceScene,
     lamps_in_world,
     pixel_light,
+    refined,
 )
 from twin.reproduce import light_sheet
-from twin.reproduce.light_cell import LightCell, ModelLight
+from twin.reproduce.light_cell import ALBEDO, GREEN, LightCell, ModelLight, green_of, looking_down
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]
 
-GREEN, ALBEDO = 1, 128
 WATERS, HEIGHTS_M = ("IB", "II", "III", "1C", "3C"), (1.0, 2.0, 3.0)
 #: Pixels as fractions of image width and height: centre, right of it, lower right corner.
 PIXELS = ((0.5, 0.5), (0.8, 0.5), (0.95, 0.95))
@@ -55,7 +53,10 @@ LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {
     ),
 }
 NEAR_PX, FAR_PX = 2.0, 40.0
-WALKS = 40_000
+ROUND, MOST_WALKS = 8_000, 400_000  # pairs of walks of a round, and the most of a cell
+#: Standard errors at which the reference of a cell is accurate enough: of all light and of the veil (relative), of the
+#: sharp share (absolute), of the blur shares (relative).
+LIGHT_ERROR, SHARP_ERROR, BLUR_ERROR = 0.019, 0.01, 0.1
 
 
 class Selection(NamedTuple):
@@ -71,12 +72,12 @@ ALL = Selection()
 QUICK = Selection(("IB", "III"), (2.0,), ("leds",), PIXELS[:2])
 
 
-def cells(selection: Selection = ALL, walks: int = WALKS, phase: str = "sea") -> Iterable[LightCell]:
-    """Yields the cells of a selection.
+def cells(selection: Selection = ALL, walks: int = MOST_WALKS, phase: str = "sea") -> Iterable[LightCell]:
+    """Yields the cells of a selection: conditions, with the light of a pixel by the model and by the reference.
 
     Args:
         selection: the cells to compute.
-        walks: number of pairs of random walks in each cell.
+        walks: largest number of pairs of random walks in a cell; fewer if the reference is accurate enough.
         phase: phase function of model and reference, a value of `water.phase_function`.
     """
     for water in selection.waters:
@@ -85,31 +86,44 @@ def cells(selection: Selection = ALL, walks: int = WALKS, phase: str = "sea") ->
             scenario = load_scenario("quickstart", [*settings, *LAMP_ARRANGEMENTS[lamps]])
             for height_m in selection.heights_m:
                 for place in selection.pixels:
-                    yield _cell(scenario, (water, lamps, height_m, place), Effort(walks))
+                    yield _cell(scenario, (water, lamps, height_m, place), walks)
 
 
-def _cell(scenario: Scenario, key: tuple[str, str, float, tuple[float, float]], effort: Effort) -> LightCell:
+def _cell(scenario: Scenario, key: tuple[str, str, float, tuple[float, float]], walks: int) -> LightCell:
     """Returns one cell; `key`: water type, name of the lamp arrangement, camera height [m], pixel as in `PIXELS`."""
     water, lamps, height_m, place = key
-    rig, medium = scenario.believed_rig(), illumination_of(scenario).water
+    rig = scenario.believed_rig()
     pixel = round(place[0] * (rig.width_px - 1)), round(place[1] * (rig.height_px - 1))
-    light = reference_light(scenario, height_m, pixel, effort, phase_of(medium.scatterers[GREEN]))
-    shares = light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
+    light = refined(
+        lambda effort: reference_light(scenario, height_m, pixel, effort),
+        _is_accurate,
+        Effort(min(walks, ROUND)),
+        walks,
+    )
+    shares = _blur_shares(light)
     truth = (light.total, light.direct, light.sharp_share, light.veil, light.veil_once, *shares)
     return LightCell(water, height_m, lamps, pixel, model_light(scenario, height_m, pixel), *truth)
 
 
-def reference_light(
-    scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort, phase: PhaseFunction
-) -> PixelLight:
+def _is_accurate(light: PixelLight) -> bool:
+    """Returns whether the standard errors are at most `LIGHT_ERROR`, `SHARP_ERROR` and `BLUR_ERROR`."""
+    means = [(light.total, LIGHT_ERROR), (light.veil, LIGHT_ERROR), *((s, BLUR_ERROR) for s in _blur_shares(light))]
+    within = all(mean.standard_error <= limit * mean.value for mean, limit in means)
+    return within and light.sharp_share.standard_error <= SHARP_ERROR
+
+
+def _blur_shares(light: PixelLight) -> tuple[BatchMean, BatchMean]:
+    """Returns the shares of the blurred light displaced by up to `NEAR_PX`, and by more than `FAR_PX`."""
+    return light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
+
+
+def reference_light(scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort) -> PixelLight:
     """Returns the Monte Carlo estimate of the green light of a pixel of the left camera, which points straight down."""
     rig, illumination = scenario.believed_rig(), illumination_of(scenario)
-    pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[2, 3] = height_m
+    pose = looking_down(height_m)
     sources = light_sources_in_camera(rig, scenario.lamps, illumination.daylight, 0)
-    water = illumination.water
-    band = BandWater(float(water.absorption_per_m[GREEN]), float(water.scattering_per_m[GREEN]), phase)
-    scene = ReferenceScene(band, lamps_in_world(sources, pose, GREEN), sources.beam, ALBEDO / 255)
+    water, lamps = green_of(illumination.water), lamps_in_world(sources, pose, GREEN)
+    scene = ReferenceScene(water, lamps, sources.beam, ALBEDO / 255)
     return pixel_light(scene, PixelRay(pose, rig, pixel), effort)
 
 

@@ -1,10 +1,17 @@
-"""Records of the light of one pixel by the light model and by the Monte Carlo reference."""
+"""Light of one pixel by the light model and by the Monte Carlo reference: records and functions of all comparisons."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from twin.imaging.reference.pixel_light import BatchMean
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.imaging.phase_function import phase_of
+from twin.imaging.reference.pixel_light import BandWater, BatchMean
+from twin.imaging.water import Medium
+
+GREEN, ALBEDO = 1, 128  # band that is compared, and albedo of the floor; 255 = white
 
 
 class ModelLight(NamedTuple):
@@ -62,3 +69,16 @@ class LightCell(NamedTuple):
     veil_once: BatchMean
     blur_near: BatchMean
     blur_far: BatchMean
+
+
+def green_of(water: Medium) -> BandWater:
+    """Returns the optical properties of the water in the green band, for the Monte Carlo reference."""
+    phase = phase_of(water.scatterers[GREEN])
+    return BandWater(float(water.absorption_per_m[GREEN]), float(water.scattering_per_m[GREEN]), phase)
+
+
+def looking_down(height_m: float) -> NDArray[np.float64]:
+    """Returns the pose world_from_camera (4, 4) of a camera that points straight down, `height_m` above the origin."""
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = height_m
+    return pose

@@ -25,10 +25,10 @@ def draw(cells: Sequence[LightCell], file: Path) -> Path:
         figure = Figure(figsize=(12.0, 7.5))
         grid = figure.subplots(2, 2)
         figure.suptitle(
-            "Light model and Monte Carlo reference, green band; truth with two standard errors", fontsize=12
+            "Light model and Monte Carlo reference, green band; bars: two standard errors of the reference", fontsize=12
         )
-        _ratios(grid[0, 0], cells, "total light, model / truth", lambda cell: _over(cell.model.total, cell.total))
-        _ratios(grid[0, 1], cells, "veil, truth / model", lambda cell: _scaled(cell.veil, cell.model.veil))
+        _ratios(grid[0, 0], cells, "total light, model / reference", lambda cell: _over(cell.model.total, cell.total))
+        _ratios(grid[0, 1], cells, "veil, reference / model", lambda cell: _scaled(cell.veil, cell.model.veil))
         _shares(grid[1, 0], cells)
         _blur(grid[1, 1], cells)
         FigureCanvasAgg(figure).print_png(str(file))
@@ -67,8 +67,9 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
                 label=water if lamps == "leds" else None,
             )  # fmt: skip
     axes.axhline(1.0, color="#9aa8b0", linewidth=1)
-    axes.set(yscale="log", xlabel="height [m], pixels side by side", ylabel=label, title=label)
+    axes.set(yscale="log", xlabel="height [m] (one column of markers per pixel)", ylabel=label, title=label)
     axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("{x:g}")
     axes.legend(fontsize=7, title="circles: LED lamps\ntriangles: spots", title_fontsize=7, loc="center left",
                 bbox_to_anchor=(1.0, 0.5))  # fmt: skip
 
@@ -86,7 +87,7 @@ def _shares(axes: Axes, cells: Sequence[LightCell]) -> None:
                 fmt=MARKERS[cell.lamps], color=colour, markersize=4,
             )  # fmt: skip
     axes.plot([0, 1], [0, 1], color="#9aa8b0", linewidth=1)
-    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="truth", ylabel="model", title="share of light that arrives sharp")
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="reference", ylabel="model", title="share of unscattered light")
 
 
 def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
@@ -97,7 +98,7 @@ def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
             axes.plot(cell.blur_far.value, cell.model.blur_far, marker, color=colour, markersize=4, fillstyle="none")
     axes.plot([1e-3, 1], [1e-3, 1], color="#9aa8b0", linewidth=1)
     axes.set(
-        xscale="log", yscale="log", xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="truth", ylabel="model",
+        xscale="log", yscale="log", xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",
         title="blur: share within 2 px (full), beyond 40 px (open)",
     )  # fmt: skip
     axes.xaxis.set_major_formatter("{x:g}")

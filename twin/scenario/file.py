@@ -23,7 +23,8 @@ from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVE
 
 Model = TypeVar("Model", bound=BaseModel)
 _PATH_KEYS = (
-    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.texture_file", "water.spectrum_file",
+    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.orthophoto_file", "terrain.texture_file",
+    "water.spectrum_file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {
@@ -31,6 +32,8 @@ _RENAMED_KEYS = {
     "imaging.calibration": "imaging.error_model",
     "imaging.forward_scatter": "imaging.scattering",
 }
+#: File of an item of `[[objects]]`.
+_OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 _ABSENT = object()
 #: Largest number of errors of one file that are listed.
 _MAX_ERRORS = 20
@@ -94,7 +97,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
     for key, value in values.items():
         if new_key := _renamed(key):
             raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
-        is_path = key in _PATH_KEYS and isinstance(value, str)
+        is_path = _is_path_key(key) and isinstance(value, str)
         if is_path and not value:
             continue
         try:
@@ -144,7 +147,7 @@ def dump_toml(scenario: Scenario) -> str:
     """Returns the scenario as the text of a TOML file, which `load_scenario` reads as an equal scenario."""
     tree = scenario.model_dump(mode="json", exclude_none=True)
     require = tree.pop("require")
-    tables = {key: tree.pop(key) for key in ("lamps", "beacons")}
+    tables = {key: tree.pop(key) for key in ("lamps", "beacons", "objects")}
     return tomlkit.dumps(tree | {key: items for key, items in tables.items() if items} | {"require": require})
 
 
@@ -217,6 +220,15 @@ def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
         keys = tree.get(section)
         if isinstance(keys, dict) and isinstance(keys.get(key), str):
             keys[key] = str(_expand(keys[key], folder))
+    items = tree.get("objects")
+    for item in items if isinstance(items, list) else ():
+        if isinstance(item, dict) and isinstance(item.get("mesh_file"), str):
+            item["mesh_file"] = str(_expand(item["mesh_file"], folder))
+
+
+def _is_path_key(key: str) -> bool:
+    """Returns whether a dotted key of the scenario has a file path as its value."""
+    return key in _PATH_KEYS or _OBJECT_FILE.fullmatch(key) is not None
 
 
 def _expand(value: str, folder: Path) -> Path:
@@ -228,7 +240,7 @@ def _expand(value: str, folder: Path) -> Path:
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Returns two trees merged at all levels; where both give a value to a key, that in `top` takes precedence."""
+    """Returns the merge of two trees of keys and values at all levels; a value in `top` replaces that in `base`."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -247,7 +259,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     value = _override_value(key, text)
-    is_path = key in _PATH_KEYS and not isinstance(value, list)
+    is_path = _is_path_key(key) and not isinstance(value, list)
     _assign(tree, key, str(_expand(str(value), Path.cwd())) if is_path else value, f"--set {shown(override)}")
 
 

@@ -18,6 +18,7 @@ from twin.core.settings import EstimatorSettings
 from twin.errors import TwinError
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 
+FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of texels of the default size [m]
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
 Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
@@ -30,6 +31,7 @@ OffAxisDeg = Annotated[float, Field(ge=0, le=90)]
 WhiteGain = Annotated[float, Field(ge=1, le=16)]
 BlurPx = Annotated[float, Field(ge=0, le=2)]
 LateralColour = Annotated[float, Field(ge=-0.02, le=0.02)]
+Albedo = Annotated[float, Field(ge=0, le=1)]
 RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -90,11 +92,29 @@ class TerrainConfig(Section):
         description="direction in which the values of height_file increase: up for elevations, down for depths; "
         "default: determined from the file; an ambiguous file is an error",
     )
-    texture_file: FilePath | None = Field(
-        default=None, description="image that is tiled over the sea floor; default: a generated texture"
+    cover: Literal["sand", "rubble", "rock", "reef", "seagrass", "mud"] | None = Field(
+        default=None,
+        description="materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; "
+        "default: that of the kind of floor",
     )
-    texture_px_m: float = Field(
-        default=0.005, gt=0.0005, le=1, description="size of a texture pixel on the sea floor [m]"
+    texture_file: FilePath | None = Field(
+        default=None, description="photo of a piece of sea floor, which becomes the texture; default: a generated one"
+    )
+    texture_tiling: Literal["stochastic", "repeat"] = Field(
+        default="stochastic",
+        description="stochastic: the texture is made of pieces of the photo, evenly lit, without visible repetition; "
+        "repeat: the photo is repeated unchanged",
+    )
+    orthophoto_file: FilePath | None = Field(
+        default=None,
+        description="colour GeoTIFF in any CRS that is laid over the texture of a height file with coordinates",
+    )
+    texture_px_m: float | None = Field(
+        default=None,
+        gt=0.0005,
+        le=1,
+        description="size of a texture pixel, and of a pixel of the photo, on the sea floor [m]; default: 0.005, or "
+        "the ground sample distance of the images at plan.altitude_m if that is finer and there is no photo",
     )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",
@@ -178,7 +198,9 @@ class ImagingConfig(Section):
         description="shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; "
         "unused with [sensor]",
     )  # fmt: skip
-    shadows: bool = Field(default=False, description="the sea floor casts shadows in the light of lamps and sun")
+    shadows: bool = Field(
+        default=False, description="the sea floor and objects cast shadows in the light of lamps and sun"
+    )
     scattering: ScatteringModel = Field(
         default="full",
         description="full: multiple scattering, which softens the beams, blurs the image and brightens the "
@@ -384,7 +406,7 @@ class WaterConfig(Section):
 
     @property
     def _type_label(self) -> str:
-        """Name of the Jerlov type with its source, or clear."""
+        """Name of the Jerlov type with its source, or "clear"."""
         return f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
 
     @property
@@ -395,7 +417,7 @@ class WaterConfig(Section):
     @field_validator("jerlov")
     @classmethod
     def _require_type_of_source(cls, jerlov: str, info: ValidationInfo) -> str:
-        """Rejects a type that the source does not have."""
+        """Rejects a Jerlov type that the table `source` does not contain."""
         source = info.data.get("source")
         if source is None or jerlov in (allowed := ("clear", *WATER_SOURCES[source].types)):
             return jerlov
@@ -607,6 +629,72 @@ class PlanConfig(Section):
         return value
 
 
+class ObjectConfig(Section):
+    """Object on the sea floor, or many of one kind: one at `position_m`, or `per_m2` of them scattered at random."""
+
+    shape: Literal[
+        "mesh", "boulder", "brain_coral", "branching_coral", "table_coral", "sponge", "sea_star", "pipe", "crate",
+        "tyre", "bottle", "kelp",
+    ] = Field(description="built-in shape, or mesh for the triangles of mesh_file")  # fmt: skip
+    mesh_file: FilePath | None = Field(
+        default=None,
+        description="PLY, OBJ or GLB file with vertex colours or a texture; needs shape = mesh; ${TWIN_DATA} is "
+        "expanded",
+    )
+    mesh_up: Literal["z", "y"] | None = Field(
+        default=None, description="axis of mesh_file that points up; default: y for GLB, z for other files"
+    )
+    size_m: float | None = Field(
+        default=None, gt=0, le=20,
+        description="largest extent of an object, the median of a size distribution; default: that of mesh_file in "
+        "metres, or 0.4 [m]",
+    )  # fmt: skip
+    size_spread: float = Field(
+        default=0.0, ge=0, le=1,
+        description="size distribution: standard deviation of the logarithm of the size (log-normal, cut at 2 sigma); "
+        "0: all are of size_m",
+    )  # fmt: skip
+    width_m: float | None = Field(
+        default=None, gt=0, le=20, description="outer diameter of a pipe; default: an eighth of its length [m]"
+    )
+    colour: tuple[Albedo, Albedo, Albedo] | None = Field(
+        default=None,
+        description="albedo for R, G, B; default: that of the shape; a mesh with colours or a texture keeps them",
+    )
+    position_m: Vector2 | None = Field(default=None, description="position of one object: x, y in the scene [m]")
+    height_m: float | None = Field(
+        default=None, ge=-100, le=100,
+        description="height of the base of the object at position_m above the reference plane z = 0; default: on the "
+        "sea floor [m]",
+    )  # fmt: skip
+    heading_deg: float | None = Field(
+        default=None, ge=-360, le=360,
+        description="rotation about the vertical, counter-clockwise from x (east); default: random [deg]",
+    )  # fmt: skip
+    upright: bool = Field(
+        default=True, description="whether the objects stand upright; false: perpendicular to the sea floor"
+    )
+    sunk: float = Field(
+        default=0.1, ge=-5, le=0.95,
+        description="share of the height of an object that is in the sea floor; negative: above the sea floor",
+    )  # fmt: skip
+    per_m2: float | None = Field(
+        default=None, gt=0, le=1000, description="scattered objects per square metre of the ground given by `on` [1/m2]"
+    )
+    on: Literal["anywhere", "sand", "slopes"] = Field(
+        default="anywhere",
+        description="ground of scattered objects. sand: less steep than 15 deg; slopes: at least that steep",
+    )
+    area_m: tuple[Metres, Metres] | None = Field(
+        default=None, description="extent along x and y of the area of scattered objects; default: the terrain [m]"
+    )
+    centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of area_m: x, y in the scene [m]")
+    spacing_m: float = Field(
+        default=0.0, ge=0, le=1000,
+        description="least distance between the centres of scattered objects (Poisson disc), which never overlap [m]",
+    )  # fmt: skip
+
+
 class ControlConfig(Section):
     """Trajectory following and station keeping."""
 
@@ -657,9 +745,19 @@ class EstimateConfig(Section):
 
 
 class MapConfig(Section):
-    """Elevation map from Kalman depth filters."""
+    """Elevation map from Kalman depth filters, and orthomosaic."""
 
     cell_m: float = Field(default=0.02, gt=0.001, le=1, description="cell size of the elevation map [m]")
+    orthomosaic: bool = Field(
+        default=True,
+        description="make an orthomosaic of the keyframe images at their ground sample distance; false: a mosaic with "
+        "the cells of the elevation map",
+    )
+    restore: bool = Field(
+        default=False,
+        description="remove lamp pattern and water from the colours of the orthomosaic, by the lamps and the water of "
+        "this scenario; false: colours as seen",
+    )
 
 
 class Source(BaseModel):
@@ -728,6 +826,7 @@ class Scenario(Section):
     beacons: tuple[BeaconConfig, ...] = Field(
         default=(), max_length=1000, description="small lights at surveyed positions"
     )
+    objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000, description="objects on the sea floor")
     require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
@@ -742,6 +841,16 @@ class Scenario(Section):
         """Returns whether images are proportional to the radiance: linear tone curve, white balance for white light."""
         sensor = self.sensor
         return sensor is None or (sensor.tone_curve == "linear" and sensor.white_balance == "white_light")
+
+    @property
+    def texel_m(self) -> float:
+        """Returns the size of a texture pixel [m]: as given, or that of an image pixel on the floor, within limits."""
+        if self.terrain.texture_px_m is not None:
+            return self.terrain.texture_px_m
+        if self.terrain.texture_file is not None:
+            return COARSEST_TEXEL_M
+        width_m = 2.0 * self.plan.altitude_m * np.tan(np.deg2rad(self.rig.hfov_deg) / 2)
+        return float(np.clip(width_m / self.rig.image_width_px, FINEST_TEXEL_M, COARSEST_TEXEL_M))
 
     def believed_rig(self) -> StereoRig:
         """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""

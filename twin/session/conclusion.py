@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
@@ -15,13 +16,16 @@ from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
-from twin.report.run_writer import RunFolder, SurveyRecord
+from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
 from twin.scenario.idealisations import idealisations
 from twin.session.monitor import SurveyMonitor
+from twin.session.orthomosaic import is_wanted, make_orthomosaic
 from twin.session.survey_check import calibration_notes, survey_findings
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
 from twin.world.world import World
+
+T = TypeVar("T")
 
 
 class RunResult(NamedTuple):
@@ -67,8 +71,14 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
             "map",
             lambda: navigator.build_map(result, mission.grid, lambda share: monitor.report_stage("map", share)),
         )
-    wall_s = monitor.wall_s
     truth, scenario = world.truth(), mission.scenario
+    orthomosaic = None
+    if elevation is not None and is_wanted(mission, folder):
+        tools = stopwatch, partial(monitor.report_stage, "orthomosaic")
+        make = partial(make_orthomosaic, mission, navigator, result, elevation, truth, folder, tools)
+        orthomosaic = guard.attempt("orthomosaic", lambda: _without_file_errors(guard, make))
+        elevation = elevation if orthomosaic is None else orthomosaic.elevation
+    wall_s = monitor.wall_s
     along, across = planned_overlap(mission)
     plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
     plan |= {"along_median": along, "across_median": across}
@@ -81,7 +91,7 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     survey = EvaluationInput(
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
         [*world.warnings, *calibration_notes(result, mission.rig), *filter(None, [actions.sentence])],
-        idealisations(scenario), actions,
+        idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
     )  # fmt: skip
     metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
     monitor.report_stage("report", 0.0)
@@ -90,13 +100,12 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
         SurveyRecord(
             result,
             elevation,
-            truth,
-            mission.grid,
-            mission.start,
+            PlannedTruth(truth, mission.grid, mission.start),
             n_frames_per_keyframe,
             stopwatch,
             metrics,
             mission.terrain.georeference,
+            orthomosaic is not None,
         ),
         guard,
     )
@@ -112,6 +121,15 @@ def _align(navigator: Navigator, guard: StageGuard) -> SurveyResult:
         guard.cause = guard.cause or str(error)
     navigator.abandon_alignment()
     return navigator.finish()
+
+
+def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:
+    """Returns the result of a function; None if a file cannot be read or written; the guard records the cause."""
+    try:
+        return function()
+    except OSError as error:
+        guard.cause = guard.cause or str(error)
+        return None
 
 
 def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:

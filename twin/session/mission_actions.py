@@ -65,7 +65,7 @@ class MissionActions:
         return self._pace_towards(target)
 
     def add_measured_frames(self, n: int) -> None:
-        """Counts n frames with measured motion for which this object was not called."""
+        """Counts n frames with measured motion from the compiled loop, which does not report them one by one."""
         if n:
             self._n_blind, self._n_recovered = 0, self._n_recovered + n
             self._lost.extend([False] * min(n, len(self._lost)))

@@ -1,4 +1,4 @@
-"""Agreement of surrogate surveys with rendered surveys of the same scenarios and seeds, and its limits.
+"""Agreement of surrogate surveys with rendered surveys of the same scenarios and seeds, compared with limits.
 
 Each rendered survey is paired with the surrogate survey that has the same seed and the same values of all other keys.
 """

@@ -161,7 +161,7 @@ def _decided_runs(
 
 
 def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], required: float) -> bool:
-    """Returns whether a range of consecutive bins, given by its first and last bin, has a verdict that they support.
+    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins.
 
     The verdict must be decided, the observed fractions of the first and the last bin must agree with it, and no range
     of bins within this one may have the opposite verdict.

@@ -1,7 +1,7 @@
 """Candidate plans of a search: their surveys, objectives, pass probability, and the Pareto front.
 
-All candidates are flown with the same samples and seeds. Finalists are flown again with new samples and seeds, and then
-as rendered surveys with samples and seeds of their own.
+All candidates are flown with the same samples and seeds. Finalists, the plans to be confirmed, are flown again
+with new samples and seeds, and then as rendered surveys with samples and seeds of their own.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class CandidateSurveys:
             self.add(row)
 
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the surveys that confirm a finalist: `tune.confirm` times as many, with new samples and seeds.
+        """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new samples.
 
         Args:
             rows: rows of the surveys flown so far.
@@ -120,7 +120,7 @@ class CandidateSurveys:
         return CandidateSurveys(study, self.config, self.folder, rows)
 
     def rendered(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the rendered surveys of a finalist: `tune.verify` samples, each with a new seed of its own.
+        """Returns the rendered surveys that verify a plan: `tune.verify` samples, each with a new seed of its own.
 
         A study that varies only grids has `tune.verify` seeds for each cell of the grids instead.
 
@@ -193,7 +193,7 @@ class CandidateSurveys:
                     self.add(survey)
 
     def scores(self, number: int, values: dict[str, Any]) -> list[SurveyScore]:
-        """Returns the results of a candidate's surveys that have been flown or refused, without failed ones."""
+        """Returns the results of a candidate's surveys that were flown or refused; surveys that failed are left out."""
         flown = [self._scores[key] for key in self.keys(number, values) if key in self._scores]
         return [score for score in flown if score.status != "failed"]
 
@@ -249,7 +249,10 @@ class CandidateSurveys:
         return score.status == "complete" and all(met)
 
     def _objective(self, name: str, scores: list[SurveyScore], correction: PlanCorrection) -> float:
-        """Returns the corrected median of a metric, or a penalty without one; for "risk" (without surveys), 1."""
+        """Returns the corrected median of a metric over the surveys, or a penalty if it is missing or not finite.
+
+        For "risk", which has no value per survey, it returns 1.
+        """
         if name == "risk":
             return 1.0
         value = correction.apply(name, median_of(scores, name))
@@ -308,7 +311,7 @@ def pareto_front(candidates: list[Candidate], config: TuningConfig) -> list[Cand
 
 
 def non_dominated(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
-    """Returns the candidates than which no other one is better in some objective and worse in none."""
+    """Returns the candidates that no other candidate dominates, i.e. is better in some objective and worse in none."""
     signs = objective_signs(config)
     return [one for one in candidates if not any(_dominates(other, one, signs) for other in candidates)]
 

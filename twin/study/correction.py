@@ -59,10 +59,10 @@ def correction_at(
 ) -> PlanCorrection:
     """Returns the correction of a plan, by kernel regression over the plans that were verified by rendered surveys.
 
-    The logarithm of each ratio is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of the logarithms of the flown
-    plans and of a prior of 0, so that the ratio tends to 1 far from all flown plans. The pass factor is the same
-    mean of the completed fractions, with a prior of 1. The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d
-    and the kernel width w.
+    For each metric, the logarithm of the correction factor is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of
+    the logarithms of the flown plans' ratios and of a prior value of 0, so that the factor tends to 1 far from all
+    flown plans. The pass factor is the same mean of the fractions of completed surveys, with a prior value of 1.
+    The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and the kernel width w.
 
     Args:
         search: distribution of each searched key.

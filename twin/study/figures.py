@@ -72,7 +72,10 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
-    """Shades the ranges that reach the required pass probability (green) or miss it (orange); draws it as a line."""
+    """Shades the ranges of a key that reach the required pass probability (green) or miss it (orange).
+
+    The required pass probability is drawn as a horizontal line.
+    """
     answers = analysis.answers.get(key, [])
     if answers:
         axes.axhline(analysis.required_probability or 0.0, color=LIMIT, linestyle=":", linewidth=1)

@@ -80,10 +80,10 @@ class TuningFlights(NamedTuple):
     log: ResultsLog
 
     def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
-        """Flies the surveys of some plans that have no result yet.
+        """Flies those surveys of the given plans that have no result yet.
 
         Args:
-            surveys: the surveys of all plans; the new results are added to it.
+            surveys: the surveys of all plans; the new results are added to them.
             plans: values of the searched keys, by number of the plan.
 
         Raises:
@@ -138,7 +138,7 @@ def tune(
 
 
 class Tuning:
-    """State of a search: evaluated plans, finalists, and verifications with the corrections derived from them."""
+    """State of a search: evaluated plans, finalists (plans evaluated again with new seeds), and verifications."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
         self.study, self.config, self.folder, self.flights = study, config, folder, flights
@@ -209,10 +209,10 @@ class Tuning:
         self.plans |= dict(search.finished())
 
     def _verify_front(self, search_round: int) -> None:
-        """Verifies the cheapest confirmed plan by rendered surveys and corrects all plans by their results; repeats.
+        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
 
-        Ends when the cheapest confirmed plan has already passed verification, when no plan is confirmed, or after
-        `config.plans` plans.
+        Repeats this until the cheapest confirmed plan has already passed verification, until no plan is confirmed, or
+        `config.plans` times.
         """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
@@ -234,10 +234,11 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the cheaper plan than the recommended one that is most likely to pass; None if there is none.
+        """Returns the plan most likely to pass among the unverified plans that are cheaper than the recommended one.
 
-        It is one of the plans that no other cheaper plan dominates: the one with the smallest shortfall of the pass
-        probability, and the most expensive one of several with the same shortfall.
+        None if no plan is recommended, or if no such plan is left. It is one of the plans that no other cheaper plan
+        dominates: the one with the smallest shortfall of the pass probability, and the most expensive one of several
+        with the same shortfall.
         """
         if self.recommended is None:
             return None

@@ -57,7 +57,7 @@ def verification_of(
 
     Args:
         rendered: rendered surveys of the candidates.
-        confirmation: surrogate surveys of the finalists, with new seeds.
+        confirmation: surrogate surveys with new seeds, which confirm plans.
         surrogate: the plan, evaluated by `confirmation`.
         search_round: round of the search, from 0.
     """

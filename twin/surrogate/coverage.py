@@ -6,8 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
-import numpy as np
-
 from twin.surrogate.matchability import Matchability
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
@@ -53,12 +51,11 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
         mission: the survey.
         matchability: matchability of its floor.
     """
-    bound_px = matchability.bound_at(float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1])))
     overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
     overlaps = {f"overlap_{name}": (value, value) for name, value in overlap.items() if value is not None}
     unevenness_px = matchability.unevenness_px
     return {
-        "bound_px": (bound_px, bound_px),
+        "bound_px": (matchability.medium_bound_px, matchability.medium_bound_px),
         "unevenness_px": (float(unevenness_px.min()), float(unevenness_px.max())),
         "lamp_share": (matchability.lamp_share, matchability.lamp_share),
         **overlaps,
@@ -80,12 +77,12 @@ class QuantityOutsideFit(NamedTuple):
 
     @property
     def value_text(self) -> str:
-        """Returns the quantity and its values in the survey."""
+        """Returns the quantity and its range of values in the survey as text."""
         return f"{self.quantity.label} of {_text(self.values)}{self.quantity.unit}"
 
     @property
     def allowed_text(self) -> str:
-        """Returns the allowed range."""
+        """Returns the allowed range of the quantity as text."""
         if self.quantity.limits == "both":
             return f"{_text(self.allowed)}{self.quantity.unit}"
         side = "at most" if self.quantity.limits == "upper" else "at least"

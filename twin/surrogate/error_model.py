@@ -94,11 +94,43 @@ class DepthLaw(NamedTuple):
         return self.common + (1 - self.common) / (1 + gain * (np.asarray(n_views) - 1))
 
 
+class ScatterLaw(NamedTuple):
+    """Standard deviation of a logarithm as a function of the Cramér-Rao bound c [px]: limit c / (c + half_px).
+
+    Args:
+        limit: standard deviation for large bounds.
+        half_px: bound at which it is half the limit [px].
+    """
+
+    limit: float
+    half_px: float
+
+    def __call__(self, bound_px: Array | float) -> Array:
+        """Returns the standard deviation at a Cramér-Rao bound [px]."""
+        bound = np.asarray(bound_px)
+        return self.limit * bound / np.maximum(bound + self.half_px, 1e-12)
+
+
+class BinningFactors(NamedTuple):
+    """Factor on a standard deviation, or value of a scatter, where the estimators bin the images.
+
+    Args:
+        by_2, by_4: factor or value for images that are binned by 2 and by 4.
+    """
+
+    by_2: float
+    by_4: float
+
+    def __call__(self, binning: int) -> float:
+        """Returns the factor or value for a binning; 1 without binning."""
+        return {1: 1.0, 2: self.by_2, 4: self.by_4}[binning]
+
+
 class BorderLaw(NamedTuple):
     """Fraction of cells without a height near the border of the images: share exp(-b sqrt(n) / width).
 
     b is the largest distance of a cell from the border over the n consecutive keyframes that observed it. Matching
-    windows at the border lack a part, so their disparities are more often too uncertain for the map.
+    windows at the border extend beyond the image, so their disparities are more often too uncertain for the map.
 
     Args:
         share: fraction at the border.
@@ -119,7 +151,7 @@ class BorderLaw(NamedTuple):
 
 
 class ErrorModel(NamedTuple):
-    """Parameters of the measurement errors.
+    """Parameters of the measurement errors of the surrogate.
 
     The standard deviation (sigma) that an estimator reports may differ from that of its errors. Fields named
     `..._sigma_px` model the reported standard deviation, and fields named `..._error_ratio` the ratio of the true to
@@ -164,10 +196,19 @@ class ErrorModel(NamedTuple):
             deviation of one flow vector if the registration were estimated from as many flow vectors as F2F, times the
             fraction of the field of view that the mosaic covers.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_error: true standard deviation of a pixel's depth from the Kalman depth filter.
-        depth_error_scatter: standard deviation, over surveys, of the logarithm of the true standard deviation of depth
-            about `depth_error`: what distinguishes floors and images beyond the conditions that the model knows.
-        depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter.
+        depth_error: true standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
+        depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
+        depth_cell_scatter: standard deviation, over the cells of a map with equal conditions, of the logarithm of the
+            standard deviation of depth. The true and the reported one vary by the same factor, because the depth filter
+            measures how well each pixel is matched. The errors of a map are therefore a scale mixture: normal with the
+            standard deviation of their cell, but with heavy tails over the whole map.
+        depth_binned_error: factor on the true standard deviation of depth [px of the binned images] due to binning.
+        depth_binned_sigma: factor on the reported standard deviation of depth [px of the binned images] due to binning.
+        depth_binned_scatter: value of `depth_cell_scatter` for binned images; it hardly depends on the bound.
+        depth_survey_scatter: standard deviation, over surveys, of the logarithm of the true and the reported standard
+            deviation of depth about their laws, due to properties of floor and images that the model does not contain.
+        depth_ratio_scatter: standard deviation, over surveys, of the logarithm of the ratio of the true to the reported
+            standard deviation of depth about its law.
         lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
         map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
             Kalman depth filter provides a depth.
@@ -176,8 +217,8 @@ class ErrorModel(NamedTuple):
             The roughness is the RMS deviation of the floor from a plane within the window of dense matching. The error
             is common to all views of the cell.
         relief_error_limit_px: limit of this standard deviation for large roughness [px of disparity].
-        edge_error_gain: the same at edges, where the matching window shows two surfaces, per unresolved roughness; see
-            `map_model.EDGE_PX` for the unresolved part.
+        edge_error_gain: true standard deviation of the height error at edges, where the matching window shows two
+            surfaces, per unresolved roughness r^3 / (r^2 + `map_model.EDGE_PX`^2) for the roughness r.
         edge_sigma_gain: reported standard deviation of the height due to roughness, per unresolved roughness.
         edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
@@ -200,8 +241,13 @@ class ErrorModel(NamedTuple):
     mosaic_sigma_px: SigmaLaw = SigmaLaw(0.2, 1.0)
     mosaic_error_ratio: float = 2.0
     depth_error: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 4.0, 1.5)
-    depth_error_scatter: float = 0.0
     depth_sigma: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 3.0, 1.0)
+    depth_cell_scatter: ScatterLaw = ScatterLaw(0.0, 1.0)
+    depth_binned_error: BinningFactors = BinningFactors(1.0, 1.0)
+    depth_binned_sigma: BinningFactors = BinningFactors(1.0, 1.0)
+    depth_binned_scatter: BinningFactors = BinningFactors(0.0, 0.0)
+    depth_survey_scatter: float = 0.0
+    depth_ratio_scatter: float = 0.0
     lateral_sigma_px: float = 0.2
     map_completeness: FractionLaw = FractionLaw(0.999, 2.0, 4.0)
     border_holes: BorderLaw = BorderLaw(0.5, 1.0, 80.0, 1.3)

@@ -11,10 +11,18 @@ from twin.core.paths import is_file
 from twin.errors import TwinError
 from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
 from twin.surrogate.coverage import QUANTITIES, QuantityOutsideFit, Range, quantities_outside_fit
-from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate.error_model import (
+    BinningFactors,
+    BorderLaw,
+    DepthLaw,
+    ErrorModel,
+    FractionLaw,
+    ScatterLaw,
+    SigmaLaw,
+)
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_LAWS = (SigmaLaw, FractionLaw, DepthLaw, BorderLaw)
+_LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinningFactors, BorderLaw)
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
@@ -38,6 +46,7 @@ _RENAMED = {
     "depth_sigma_px": "depth_sigma",
     "depth_excess": "depth_error",
     "depth_error_ratio": "depth_error",
+    "depth_error_scatter": "depth_ratio_scatter",
     "lateral_px": "lateral_sigma_px",
     "complete": "map_completeness",
     "floor": "floor_px",

@@ -1,10 +1,10 @@
 """Model of the elevation map: samples the grid cells that a keyframe sees and the heights that it contributes.
 
 The heights stand for those from the Kalman depth filter, with one sample per grid cell for all pixels that show the
-cell. A cell is visible if its centre projects into both images and no relief hides it from either camera (ray casting).
-Where the floor is not a plane within the matching window, e.g. at the edge of a wall, heights have an additional error
-that grows with the RMS deviation from the plane (the roughness of the cell), and cells without a height are more
-frequent.
+cell. Their errors are correlated over the matching window, as those of dense matching are. A cell is visible if its
+centre projects into both images and no relief hides it from either camera (ray casting). Where the floor is not a plane
+within the matching window, e.g. at the edge of a wall, heights have an additional error that grows with the RMS
+deviation from the plane (the roughness of the cell), and cells without a height are more frequent.
 """
 
 from __future__ import annotations
@@ -44,11 +44,14 @@ class CellErrors(NamedTuple):
         lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
         edge_noise: (rows, cols) standard normal samples of the error due to roughness, shared by all views of a cell;
             see `window_noise`.
+        cell_noise: (rows, cols) standard normal samples of the precision of depth, shared by all views of a cell and
+            correlated over a window; see `cell_scatter`.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next three fields are tabulated [m].
+        depths_m: (m,) ascending depths at which the next four fields are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
+        cell_scatter: (m,) standard deviation over cells of the logarithm of both standard deviations.
         completeness: (m,) fraction of the level cells in view for which the filter provides a depth.
         error_law: decrease of the true variance with the number of keyframes.
         sigma_law: decrease of the reported variance with the number of keyframes.
@@ -63,11 +66,13 @@ class CellErrors(NamedTuple):
 
     lateral_noise: Map
     edge_noise: Map
+    cell_noise: Map
     dropout: Map
     lateral_sigma_px: float
     depths_m: Array
     depth_error_px: Array
     depth_sigma_px: Array
+    cell_scatter: Array
     completeness: Array
     error_law: DepthLaw = ONE_KEYFRAME
     sigma_law: DepthLaw = ONE_KEYFRAME
@@ -213,7 +218,7 @@ class MapModel:
             self._runs, (self.views, self.step_baselines, self.border_px), observed[:4], next_cells,
             step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
             estimated @ geometry.inverse(true), estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
-            rng.standard_normal(shape, np.float32), errors,
+            window_noise(shape, self.window_cells, rng), errors,
         )  # fmt: skip
         lateral = surface.LATERAL_SIGMA_PX * depth_m / self._rig.focal_px
         return HeightPatch(
@@ -221,7 +226,10 @@ class MapModel:
         )
 
     def _poses_of(self, true: Array) -> Array:
-        """Returns (3, 4, 4): the inverse of a pose (4, 4) of the left camera, the pose, and that of the right one."""
+        """Returns three matrices (3, 4, 4) for a pose (4, 4) of the left camera.
+
+        They are camera_from_world and world_from_camera of the left camera, and world_from_camera of the right camera.
+        """
         right_from_left = geometry.pose(np.eye(3), np.array([self._rig.baseline_m, 0.0, 0.0]))
         return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
@@ -258,7 +266,7 @@ def _window(pose, camera, geotransform, lowest, size):
 
 
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
-    """Returns standard normal numbers (rows, cols) that are correlated over a matching window, as its errors are.
+    """Returns standard normal numbers (rows, cols) that are correlated over a matching window, as matching errors are.
 
     Args:
         shape: number of rows and columns.
@@ -279,7 +287,7 @@ def _border_of(camera, x, y, disparity):
 
 @njit(cache=True, nogil=True)
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
-    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre less the error of its mapping.
+    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
 
     Pose errors are much smaller than a cell, so only calibration errors matter here.
     """
@@ -475,7 +483,8 @@ def _sample_patch(
                 px, py, pz = _transformed(estimated_from_true, x, y, z)
             value = pz - sx * (px - x) - sy * (py - y)
             steep = np.sqrt(sx * sx + sy * sy)
-            error_px = np.sqrt(error_share) * _interpolate(errors.depth_error_px, k, fraction)
+            scale = np.exp(_interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j])
+            error_px = scale * np.sqrt(error_share) * _interpolate(errors.depth_error_px, k, fraction)
             value += per_px * error_px * depth_noise[i - row, j - col]
             rough_error_px = roughness_error_px(
                 rough_px, errors.relief_error_gain, errors.relief_error_limit_px, errors.edge_error_gain
@@ -483,7 +492,7 @@ def _sample_patch(
             value += per_px * rough_error_px * errors.edge_noise[i, j]
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
-            sigma_px = _interpolate(errors.depth_sigma_px, k, fraction)
+            sigma_px = scale * _interpolate(errors.depth_sigma_px, k, fraction)
             variance[i - row, j - col] = sigma_share * (per_px * sigma_px) ** 2
             systematic[i - row, j - col] = surface.pose_variance(
                 x - position[0], y - position[1], z - position[2], sx, sy, cov

@@ -1,8 +1,13 @@
 """Matchability of the floor: the Cramér-Rao bound of image matching, and the unevenness of the floor under a patch.
 
 The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. Let g be
-the gradient of the grey image along a row, and s the standard deviation of the image noise. The standard deviation of
-the measured shift between two patches of p x p pixels is at least c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound).
+the gradient along a row of the part of the grey image that the texture causes, and s the standard deviation of the
+image noise. The standard deviation of the measured shift between two patches of p x p pixels is at least
+c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of the light do not move with the floor, so
+their gradients do not count: the image of a floor with the same mean albedo, but without texture, is subtracted.
+
+In turbid water most corners of the full image are noise. The estimators then bin the images (`image_scale`), and the
+bound is that of the binned images, in their pixels.
 
 Matching models the floor under a patch as a plane. Relief above or below that plane causes parallax and thus a matching
 error. The unevenness is the RMS of this parallax in a typical patch, in pixels per unit of baseline / depth. Patches
@@ -15,11 +20,12 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 import terrains
 from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, StereoRig
+from twin.estimate.vision import matching
+from twin.estimate.vision.image_scale import BINNINGS
 from twin.imaging.camera import Depth
 from twin.imaging.illumination import Illumination
 from twin.imaging.image_formation import ImageFormation, StampedPose
@@ -27,6 +33,9 @@ from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
 
+#: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
+#: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.
+_CORNERS_BOUND_PX = 0.11
 _DEPTHS = 6  # number of tabulated depths
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
 _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
@@ -43,8 +52,10 @@ class Matchability:
 
     Attributes:
         depths_m: (m,) ascending depths of the floor along the optical axis [m].
-        bounds_px: (m,) Cramér-Rao bound c at these depths [px].
-        unevenness_px: (m,) unevenness of the floor under a patch at these depths [px per unit of baseline / depth].
+        binning: number of pixels that the estimators average along each side of the images.
+        bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images].
+        unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
+            baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
         clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
     """
@@ -61,9 +72,37 @@ class Matchability:
         if scenario.plan.height == "floor":
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
-        self.bounds_px, self.clear_share = precision(scenario, illumination, terrain, self.depths_m)
-        self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate)
+        self._set_image_scale(scenario, illumination, terrain)
+        self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
         self.lamp_share = lamp_share(scenario, illumination)
+
+    @property
+    def medium_bound_px(self) -> float:
+        """Returns the Cramér-Rao bound of a patch's position at the geometric mean of the depths [px]."""
+        return self.bound_at(self._medium_depth_m)
+
+    @property
+    def _medium_depth_m(self) -> float:
+        """Returns the geometric mean of the smallest and the largest depth [m]."""
+        return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
+
+    def _set_image_scale(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> None:
+        """Sets `binning`, `bounds_px` and `clear_share`.
+
+        As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, or else
+        the best one. Which corners are matched depends on the bound.
+        """
+        rig, best_px = scenario.believed_rig(), np.inf
+        for binning in BINNINGS:
+            if rig.width_px % binning or rig.height_px % binning:
+                break
+            bounds_px, clear_share = precision(scenario, illumination, terrain, self.depths_m, binning)
+            medium_px = float(np.interp(self._medium_depth_m, self.depths_m, bounds_px))
+            if medium_px < best_px:
+                best_px = medium_px
+                self.binning, self.bounds_px, self.clear_share = binning, bounds_px, clear_share
+            if medium_px < _CORNERS_BOUND_PX:
+                break
 
     def bound_at(self, depth_m: float) -> float:
         """Returns the Cramér-Rao bound of a patch's position [px] at a depth [m]."""
@@ -84,9 +123,17 @@ def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.
 
 
 def precision(
-    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array
+    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array, binning: int = 1
 ) -> tuple[Array, Array]:
-    """Returns the Cramér-Rao bound (n,) [px] and the fraction (n,) of matches that remain in snow, at depths (n,)."""
+    """Returns the Cramér-Rao bound (n,) [px] and the fraction (n,) of matches that remain in snow, at depths (n,).
+
+    Args:
+        scenario: description of the survey.
+        illumination: optical properties of the water, and daylight in the water.
+        terrain: true floor.
+        depths_m: depths of the floor along the optical axis.
+        binning: number of pixels that are averaged along each side of the images; the bound is in binned pixels.
+    """
     scenario = _with_linear_images(scenario)
     clear = _without_unmodelled_effects(scenario)
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
@@ -94,16 +141,26 @@ def precision(
     texture, texel_m = _texture(scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
     albedos = [_albedo(texture, texel_m, rig, z) for z in depths_m]
     if not scenario.snow.density_per_m3:
-        bounds = [_bound_px(clear, rig, formation, albedo, z, rng) for albedo, z in zip(albedos, depths_m, strict=True)]
+        bounds = [
+            _bound_px(clear, rig, formation, albedo, z, rng, binning)
+            for albedo, z in zip(albedos, depths_m, strict=True)
+        ]
         return np.array(bounds), np.ones(len(depths_m))
     with_snow = scenario.model_copy(update={"imaging": clear.imaging})
     formations = formation, ImageFormation(with_snow, illumination, None, rng)
-    both = [_in_snow(scenario, rig, formations, albedo, z) for albedo, z in zip(albedos, depths_m, strict=True)]
+    both = [
+        _in_snow(scenario, rig, formations, albedo, z, binning) for albedo, z in zip(albedos, depths_m, strict=True)
+    ]
     return np.array([bound for bound, _ in both]), np.array([share for _, share in both])
 
 
 def _in_snow(
-    scenario: Scenario, rig: StereoRig, formations: tuple[ImageFormation, ImageFormation], albedo: Image, depth_m: float
+    scenario: Scenario,
+    rig: StereoRig,
+    formations: tuple[ImageFormation, ImageFormation],
+    albedo: Image,
+    depth_m: float,
+    binning: int,
 ) -> tuple[float, float]:
     """Returns the Cramér-Rao bound [px] and the fraction of matches that remain in marine snow, at one depth.
 
@@ -113,6 +170,7 @@ def _in_snow(
         formations: image formation without and with snow.
         albedo: albedo image of the floor.
         depth_m: depth of the floor.
+        binning: see `precision`.
     """
     depth, camera_pose = _level_floor(scenario, depth_m)
     clean, snowy = (
@@ -120,9 +178,9 @@ def _in_snow(
     )
     sensor, rng = sensor_of(scenario, rig), np.random.default_rng(0)
     setting = sensor.meter(snowy[0])
-    first, second = (_gray(sensor.image(clean[0], setting, rng).astype(np.float32)) for _ in range(2))
+    first, second = (matching.gray(sensor.image(clean[0], setting, rng).astype(np.float32), binning) for _ in range(2))
     clean_signals, snowy_signals = (
-        [_gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32)) for light in lights]
+        [matching.gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32), binning) for light in lights]
         for lights in (clean, snowy)
     )
     noise = float((first - second).std()) / np.sqrt(2)
@@ -183,6 +241,7 @@ def unevenness_px(
     terrain: terrains.Terrain,
     depths_m: Array,
     locate: Callable[[Array], Array] | None = None,
+    binning: int = 1,
 ) -> Array:
     """Returns the unevenness (n,) of the floor under a patch at depths (n,) [m], the median over the planned area.
 
@@ -196,8 +255,9 @@ def unevenness_px(
         depths_m: depths of the floor along the optical axis.
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
+        binning: see `precision`.
     """
-    focal_px, patch_px = scenario.believed_rig().focal_px, scenario.estimate.patch_px
+    focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimate.patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
     x, y = (part.ravel() for part in np.meshgrid(side, side))
     plane = np.column_stack([np.ones_like(x), x, y])
@@ -221,22 +281,27 @@ def _bound_px(
     albedo: Image,
     depth_m: float,
     rng: np.random.Generator,
+    binning: int,
 ) -> float:
     """Returns the Cramér-Rao bound [px] for a level floor at the given depth, with the given albedo image."""
     depth, camera_pose = _level_floor(scenario, depth_m)
-    radiance = formation.radiance(albedo, depth, 0, camera_pose)
+    radiance, smooth = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
     sensor = sensor_of(scenario, rig)
     setting = sensor.meter(radiance)
-    signal = _gray(np.minimum(255 * setting.gain * radiance, 255).astype(np.float32))
-    first, second = (_gray(sensor.image(radiance, setting, rng).astype(np.float32)) for _ in range(2))
+    lit, untextured = (
+        matching.gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32), binning)
+        for light in (radiance, smooth)
+    )
+    signal = lit - untextured
+    first, second = (matching.gray(sensor.image(radiance, setting, rng).astype(np.float32), binning) for _ in range(2))
     noise = float((first - second).std()) / np.sqrt(2)
     gradient = float(np.sqrt(np.mean(np.diff(signal, axis=1) ** 2)))
     return np.sqrt(2) * noise / (scenario.estimate.patch_px * max(gradient, 1e-6))
 
 
-def _gray(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the grey image, smoothed as in the estimators."""
-    return np.asarray(cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0.5), np.float32)
+def _untextured(albedo: Image) -> Image:
+    """Returns an albedo image of constant colour, the mean of the given image (height_px, width_px, 3)."""
+    return np.broadcast_to(albedo.mean(axis=(0, 1)).round().astype(np.uint8), albedo.shape).copy()
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
@@ -251,9 +316,8 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
     if t.kind == "file":
         return terrain.texture, terrain.texture_px_m
     extent_m = float(min(max(extent_m, 4 * t.grid_m), *t.size_m))
-    generated = terrains.generate(
-        t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, t.texture_px_m, scenario.seed
-    )
+    source = terrains.TextureSource(scenario.texel_m, cover=t.cover, coarsen=True)
+    generated = terrains.generate(t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, source, scenario.seed)
     return generated.texture, generated.texture_px_m
 
 

@@ -86,13 +86,13 @@ class MeasuredView(NamedTuple):
         return true
 
     def motion_gain(self, points: Array, baseline_m: float) -> Array:
-        """Returns the (6, 6) matrix from the true small motion to the one estimated from image motion and stereo depth.
+        """Returns the (6, 6) matrix that maps the twist of a small true motion to the twist estimated from images.
 
-        The motion of the left camera is estimated by least squares from the measured points; see
+        The motion of the left camera is estimated by least squares from the measured flow and depth of points; see
         `sampling.unit_motion_cov`. Empty if all points are measured at their true positions.
 
         Args:
-            points: (n, 3) true points.
+            points: (n, 3) true points, normalised (x, y, disparity).
             baseline_m: believed baseline [m].
         """
         if self.is_ideal:

@@ -1,4 +1,4 @@
-"""Model of the mosaic: for each floor cell, the first keyframe that shows it, as later ones do not replace it."""
+"""Model of the mosaic: for each floor cell, the first keyframe that shows it; later ones do not overwrite the cell."""
 
 from __future__ import annotations
 

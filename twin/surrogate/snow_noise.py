@@ -52,7 +52,7 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
 
     Args:
         clean: noise-free images of the same floor without snow, one for each view [grey levels].
-        snowy: the same with snow.
+        snowy: the same images with snow.
         noise: standard deviation of the image noise [grey levels].
         patch_px: side of the matched patches.
     """

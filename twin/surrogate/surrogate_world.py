@@ -65,6 +65,8 @@ class SurrogateWorld(World):
         true_pose = partial(left_camera, vehicle, rig)
         self.vision = surrogate_vision(mission, fitted.model, true_pose, stopwatch)
         self.warnings = _extrapolations(mission, fitted, self.vision.scene.matchability)
+        if mission.objects:
+            self.warnings += ("The surrogate surveys the bare sea floor: it does not simulate [[objects]].",)
 
     def close(self) -> None:
         """Does nothing, as there are no resources to release."""
@@ -123,7 +125,8 @@ def surrogate_vision(
     view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
     floor, heights = FloorRayCaster(terrain), true_heights(mission.grid, terrain.height_at)
     depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))
-    map_model = MapModel(mission.grid, heights, mission.rig, floor.field, depth_m, view.table)
+    rig = mission.rig.binned(matchability.binning)
+    map_model = MapModel(mission.grid, heights, rig, floor.field, depth_m, view.table)
     scene = TrueScene(true_pose, floor, matchability, map_model, view)
     rng = streams(scenario.seed)["surrogate"]
-    return SurrogateVision(mission.rig, scenario.estimator_settings(), model, scene, rng, stopwatch)
+    return SurrogateVision(rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

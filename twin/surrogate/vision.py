@@ -21,13 +21,13 @@ from twin.core import geometry
 from twin.core.braking import braking_factor
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
-from twin.core.records import ElevationMap, Frame, MapGrid, StereoObservation, StereoRig, SurveyResult
+from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.estimate.mapping import elevation
 from twin.estimate.vision import stereo
 from twin.estimate.vision.f2f import MAX_POINTS as F2F_POINTS
-from twin.estimate.vision.f2f import constant_velocity_motion
+from twin.estimate.vision.f2f import MIN_MATCHED, constant_velocity_motion
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
@@ -43,6 +43,7 @@ from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
+_CORNER_AREA_PX2 = 75.0  # area of an image per corner that is detected at most, in rendered surveys
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
 #: Largest relative increase of a link's squared median residual due to relief: matches shifted more are outliers.
@@ -122,7 +123,7 @@ class SurrogateVision:
     """Implementation of `Vision` that samples measurements from an error model.
 
     Args:
-        rig: calibration that the estimators use.
+        rig: calibration that the estimators use, for the images that they match, which may be binned.
         settings: settings of the estimators.
         model: error model of the measurements.
         scene: true scene.
@@ -132,6 +133,7 @@ class SurrogateVision:
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
         last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after each keyframe.
+        n_corners: number of points that can be matched in a keyframe without noise.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
@@ -152,6 +154,7 @@ class SurrogateVision:
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m,
             scene.view.table,
         )  # fmt: skip
+        self.n_corners = corner_count(rig, settings)
         self._pixels = _raster(rig, margin_px)
         middle = rig.baseline_m / float(np.median(scene.matchability.depths_m))
         self._rays = scene.view.true_directions(rig.normalised(self._pixels), middle)  # of the true points
@@ -159,6 +162,7 @@ class SurrogateVision:
         self._rows = None if scene.view.is_ideal else MeasuredRows(scene.view, rig, settings.patch_px, rng)
         self.last_pose: Array | None = None
         self.last_normals = np.zeros(6)
+        self._tracking_cov: Array | None = None
         self._poses: dict[int, Array] = {}  # true poses of all keyframes
         self._keyframes: dict[int, _KeyframeTruth] = {}  # keyframes that may still be linked
         self._latest: _KeyframeTruth | None = None
@@ -183,6 +187,11 @@ class SurrogateVision:
         return float(bounds_px.min()), float(bounds_px.max())
 
     @property
+    def binning(self) -> int:
+        """Returns the number of pixels that are averaged along each side of the images."""
+        return self.scene.matchability.binning
+
+    @property
     def lamp_share(self) -> float:
         """Returns the fraction of the reflected light that comes from the lamps."""
         return self.scene.matchability.lamp_share
@@ -195,7 +204,10 @@ class SurrogateVision:
 
     @property
     def raster_fraction(self) -> float:
-        """Returns the number of raster points divided by the number of matched points, for the last keyframe."""
+        """Returns the number of raster points in view of the last keyframe, divided by its number of matched points.
+
+        The raster points sample the left image; each represents several matched points.
+        """
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
@@ -219,6 +231,7 @@ class SurrogateVision:
         if previous is None:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         if self._f2f is None:
+            self._tracking_cov = None
             interval_s = 1 / self.rig.frame_rate_hz
             factor, self._blind_s = braking_factor(self._blind_s, interval_s), self._blind_s + interval_s
             if factor < 1:
@@ -247,7 +260,7 @@ class SurrogateVision:
                 return None
             mean_m = float(depth_m[hits].mean())
             bound_px = scene.matchability.bound_at(mean_m)
-            n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.settings.points
+            n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.n_corners
             clear_share = scene.matchability.clear_share_at(mean_m)
             n_points *= self._matchable(hits, depth_m) * clear_share
             hits = hits[self._in_both_images(hits, depth_m)]
@@ -259,7 +272,8 @@ class SurrogateVision:
             n = len(points)
             sigma_px = model.match_sigma_px(bound_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
-            unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, float(F2F_POINTS))
+            n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, self.rig, self.settings.patch_px)
+            unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, n_tracked)
             cells = floor_cells(pose, points, self.rig.baseline_m)
             unevenness_px = scene.matchability.unevenness_at(mean_m)
             observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
@@ -279,17 +293,27 @@ class SurrogateVision:
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
-        """Returns the true (x, y, disparity) (n, 3) of raster points, given the depth of every raster point [m]."""
+        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image.
+
+        Args:
+            indices: (n,) indices of the points in the raster.
+            depth_m: depth of every point of the raster [m].
+        """
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
-        """Returns the fraction of the raster points with these indices that satisfy the epipolar constraint."""
+        """Returns the fraction of these points of the raster whose measured positions satisfy the epipolar constraint.
+
+        Args:
+            indices: (n,) indices of the points in the raster.
+            depth_m: depth of every point of the raster [m].
+        """
         if self._rows is None:
             return 1.0
         return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the raster points that lie inside both images and satisfy the epipolar constraint.
+        """Returns the raster points (mask (n,)) that lie inside both images and satisfy the epipolar constraint.
 
         Args:
             indices: (n,) indices of the points in the raster.
@@ -303,14 +327,19 @@ class SurrogateVision:
         matched = True if self._rows is None else self._rows.are_matched(points)
         return in_left & in_right & matched
 
+    def tracking_cov(self) -> Array | None:
+        return self._tracking_cov
+
     def restart_tracking(self) -> None:
         assert self._latest is not None
         model = self.model
+        if model.match_fraction(self._latest.bound_px) * self._latest.clear_share < MIN_MATCHED:
+            return  # vision is lost until the next keyframe
         root, cov = self._motion_errors(model.f2f_sigma_px(self._latest.bound_px))
         independent = model.f2f_error_ratio / np.sqrt(1 + model.f2f_anticorrelation**2)
         gain = self.scene.view.motion_gain(self._latest.points, self.rig.baseline_m)
         self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
-        self.last_normals = np.zeros(6)
+        self.last_normals, self._tracking_cov = np.zeros(6), cov
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
         """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow.
@@ -390,7 +419,9 @@ class SurrogateVision:
         bound_px = max(later.bound_px, earlier.bound_px)
         n = len(later.points)
         match_fraction = self._match_fraction(later, earlier, model)
-        noise_scale = np.sqrt(n / (later.n_points * match_fraction))
+        n_matches = later.n_points * match_fraction
+        inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
+        noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
         sigma_px = model.match_sigma_px(bound_px) * noise_scale
         error_ratio = model.match_error_ratio * np.hypot(1, model.lamp_error_growth * self.lamp_share)
         normals = self._link_normals(number, other, n + 1)
@@ -400,7 +431,7 @@ class SurrogateVision:
             self._unit_root * (sigma_px * error_ratio), model.match_bias_fraction,
             model.relief_gain * later.unevenness_px / self.rig.focal_px * noise_scale,
             model.common_bias_px / self.rig.focal_px, model.distance_growth,
-            COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation, noise_scale**2,
+            COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation, single,
         )  # fmt: skip
         n_matched = int(in_view / n * later.n_points * match_fraction)
         if in_view < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
@@ -432,6 +463,10 @@ class SurrogateVision:
             self._link_rng.bit_generator.state = state
             return self._link_rng.standard_normal((n, 3))
 
+    def left_image(self, row: int) -> Image | None:
+        """Returns None: there are no images."""
+        return None
+
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
@@ -450,15 +485,21 @@ class SurrogateVision:
         return mapper.result()
 
     def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
-        """Returns the errors of the filtered depth of a map with (rows, cols) cells."""
+        """Samples the errors of the heights that the Kalman depth filter gives, for a map with (rows, cols) cells."""
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
-        edge_noise = window_noise(shape, self.scene.map_model.window_cells, self._rng)
-        scatter = float(np.exp(model.depth_error_scatter * self._rng.standard_normal()))
+        window_cells = self.scene.map_model.window_cells
+        edge_noise, cell_noise = (window_noise(shape, window_cells, self._rng) for _ in range(2))
+        level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
+        error_factor = float(np.exp(level + ratio)) * model.depth_binned_error(self.binning)
+        sigma_factor = float(np.exp(level)) * model.depth_binned_sigma(self.binning)
         depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
+        binned_scatter = np.full(len(bounds_px), model.depth_binned_scatter(self.binning))
+        cell_scatter = model.depth_cell_scatter(bounds_px) if self.binning == 1 else binned_scatter
         return CellErrors(
-            lateral_noise, edge_noise, dropout, model.lateral_sigma_px, depths_m,
-            model.depth_error.sigma_px(bounds_px, self.lamp_share) * scatter,
-            model.depth_sigma.sigma_px(bounds_px, self.lamp_share),
+            lateral_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px, depths_m,
+            model.depth_error.sigma_px(bounds_px, self.lamp_share) * error_factor,
+            model.depth_sigma.sigma_px(bounds_px, self.lamp_share) * sigma_factor,
+            cell_scatter,
             np.array([model.map_completeness(b) for b in bounds_px]),
             model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
             model.edge_error_gain, model.edge_sigma_gain, model.edge_half_px, model.border_holes.share,
@@ -472,6 +513,29 @@ class SurrogateVision:
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
         self._n_used += n
         return self._normals[self._n_used - n : self._n_used]
+
+
+def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:
+    """Returns the number of points of an image that the estimators try to match; see `matching.corners`.
+
+    A small image has fewer corners than requested. If it has fewer than half as many, a grid of points is matched.
+    """
+    corners = rig.width_px * rig.height_px / _CORNER_AREA_PX2
+    return float(settings.points if corners < settings.points / 2 else min(corners, settings.points))
+
+
+def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
+    """Returns the variance of a mean over n patches, relative to that of patches without common pixels.
+
+    It is the expected value of `matching.variance_inflation` for patches spread over the image at random, which share a
+    fraction patch_px^2 / (width height) of their pixels on average.
+
+    Args:
+        n_points: number of patches.
+        rig: calibration, for the image size.
+        patch_px: side of the patches.
+    """
+    return 1 + n_points * patch_px**2 / (rig.width_px * rig.height_px)
 
 
 def _parallax_px(keyframe: _KeyframeTruth, earlier_pose: Array, baseline_m: float) -> float:

@@ -18,13 +18,13 @@ from scipy.ndimage import maximum_filter
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
-from twin.core.records import ElevationMap, Frame, MapGrid, SurveyResult
+from twin.core.records import ElevationMap, Frame, Image, MapGrid, SurveyResult
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.surrogate.error_model import DepthLaw, ErrorModel
+from twin.surrogate.error_model import BinningFactors, DepthLaw, ErrorModel, ScatterLaw
 from twin.surrogate.map_model import EDGE_PX
 from twin.surrogate.vision import SurrogateVision
 
@@ -37,7 +37,8 @@ _RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.0
 _WALL_SLOPE = 1.0  # rise over run: cells near steeper ones belong to no class but edges
 _ROUGHNESS_BINS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
 _BORDER_BINS_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 20.0)  # see `MapModel.border_px`
-_P90 = 1.645  # 90th percentile of the absolute value of a standard normal variable
+_GROSS = 5.0  # error / sigma beyond which an error counts as a gross error
+_NORMAL_P90 = 1.2816  # 90th percentile of a standard normal variable
 _NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
 UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
 #: Quantities of a class of map cells, in the order of the statistic `map_<error or sigma>_<class>`: variances of the
@@ -88,18 +89,22 @@ class ComparisonVision:
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         points, sampled = self.images.observe_stereo(frame, row), self.surrogate.observe_stereo(frame, row)
+        self.statistics["binning"] = [float(self.images.binning), float(self.surrogate.binning)]
         if len(self._frames) > 1:
             error, cov = (np.sum(x, axis=0) for x in zip(*self._frames, strict=True))
             self.statistics["f2f_interval_nees"].append(_chi2(error, cov) / 6)
             self.statistics["f2f_interval_frames"].append(float(len(self._frames)))
         self._frames = []
         if points is not None and sampled is not None:
-            self.statistics["point_fraction"].append(len(points.xyz) / self.images.settings.points)
+            self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
             traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
             sigma_ratio = np.sqrt(traces[0] / traces[1] * self.surrogate.raster_fraction)
             self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
             self.statistics["bound_px"].append(self.surrogate.bound_px)
         return points
+
+    def tracking_cov(self) -> Array | None:
+        return self.images.tracking_cov()
 
     def restart_tracking(self) -> None:
         self.images.restart_tracking()
@@ -126,6 +131,9 @@ class ComparisonVision:
 
     def epipolar_error(self) -> EpipolarError | None:
         return self.images.epipolar_error()
+
+    def left_image(self, row: int) -> Image | None:
+        return self.images.left_image(row)
 
     def discard(self, numbers: range) -> None:
         self.images.discard(numbers)
@@ -192,7 +200,9 @@ class ComparisonVision:
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         none = model._replace(
             depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0, edge_error_gain=0.0,
-            edge_sigma_gain=0.0, depth_error_scatter=0.0,
+            edge_sigma_gain=0.0, depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0,
+            depth_ratio_scatter=0.0, depth_binned_error=BinningFactors(1.0, 1.0),
+            depth_binned_sigma=BinningFactors(1.0, 1.0), depth_binned_scatter=BinningFactors(0.0, 0.0),
         )  # fmt: skip
         unit = _NONE._replace(floor_px=UNIT_PX)
         models = {
@@ -211,10 +221,15 @@ class ComparisonVision:
         return elevation
 
     def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
-        """Adds the statistics `MAP_STATISTICS` of a class of cells: of height errors, and of reported variances.
+        """Adds three statistics of a class of cells: errors and reported variances (`MAP_STATISTICS`), and a scatter.
 
-        The variance of errors is the robust one: that of a normal distribution with the same 90th percentile of the
-        absolute error. The reported one is the mean without the largest 5 %.
+        The reported standard deviation varies from cell to cell, and the errors of a cell are normal with a standard
+        deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
+        variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The variance of
+        errors is that of a cell with the median sigma.
+        The third statistic is the scatter of ln(sigma) in the class, relative to a sampled map in which depth has the
+        same precision in all cells. The upper half of its distribution determines the largest errors, so it is taken
+        from the median and the 90th percentile.
 
         Args:
             name: name of the class.
@@ -226,16 +241,22 @@ class ComparisonVision:
         known = cells & map_model.seen & np.isfinite(heights).all(axis=0)
         if known.sum() < _MIN_CELLS:
             return
-        errors = (heights - map_model.height_m)[:, known]
-        sizes = np.abs(errors - np.median(errors, axis=1, keepdims=True))
-        variances = np.square(np.percentile(sizes, 90, axis=1) / _P90)
-        reported = [_trimmed_mean(elevation.sigma_m[known] ** 2) for elevation in maps.values()]
+        errors = (heights - map_model.height_m)[:, known].astype(np.float64)
+        sigmas = np.array([elevation.sigma_m[known] for elevation in maps.values()], np.float64)
+        typical = np.median(sigmas, axis=1)
+        normalised = np.abs(errors - np.median(errors, axis=1, keepdims=True)) / np.maximum(sigmas, 1e-12)
+        variances = np.mean(np.square(np.minimum(normalised, _GROSS)), axis=1) * typical**2
+        reported = np.square(typical)
+        names = list(maps)
+        log_ratio = np.log(sigmas[names.index("images")] / sigmas[names.index("depth")])
+        scatter = np.diff(np.percentile(log_ratio, (50, 90))) / _NORMAL_P90
         conditions = [
             float(np.mean(map_model.views[known])), float(np.median(map_model.step_baselines[known])),
             float(np.sqrt(np.mean(self._roughness_px()[known] ** 2))),
         ]  # fmt: skip
         self.statistics[f"map_error_{name}"] = [*variances.tolist(), *conditions]
-        self.statistics[f"map_sigma_{name}"] = [*reported, *conditions]
+        self.statistics[f"map_sigma_{name}"] = [*reported.tolist(), *conditions]
+        self.statistics[f"map_scatter_{name}"] = scatter.tolist()
 
     def _cell_classes(self) -> dict[str, np.ndarray]:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
@@ -291,11 +312,6 @@ def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
         ),
         "relief": model._replace(match_error_ratio=0.0, relief_gain=RELIEF_GAIN, common_bias_px=0.0),
     }
-
-
-def _trimmed_mean(values: np.ndarray) -> float:
-    """Returns the mean of values (n,) without the largest 5 %."""
-    return float(np.sort(values)[: len(values) - len(values) // 20].mean(dtype=np.float64))
 
 
 def _chi2(error: Array, cov: Array) -> float:

@@ -14,7 +14,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, FractionLaw, SigmaLaw
+from twin.surrogate.error_model import (
+    BinningFactors,
+    BorderLaw,
+    DepthLaw,
+    ErrorModel,
+    FractionLaw,
+    ScatterLaw,
+    SigmaLaw,
+)
 from twin.surrogate.map_model import roughness_error_px
 from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, UNIT_PX
 
@@ -22,6 +30,7 @@ _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by 
 _PRIOR = 0.01  # weight of the departure of a parameter from the compared model's, relative to it or to a typical value
 _HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a bin of cells has less weight
 _OUTLIER = 0.3  # residual of a log variance beyond which a class of cells has less weight
+_LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # statistics of cells without edges
 _SOURCES = ("images", "patches", "relief")
 _RELATIVE_SIGMA = 0.1  # assumed relative standard error of the mean squared error over a third of a survey's links
 
@@ -54,8 +63,10 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         patch_ratios / median("match_sigma_ratio"), median("lamp_share")
     )
     errors, reported = (_fit_map_variances(surveys, quantity, compared) for quantity in ("error", "sigma"))
+    cell_scatter, binned_scatter = _fit_cell_scatter(surveys, compared.depth_cell_scatter)
     known_fractions = np.array([s["hole_known"][0] for s in surveys])
-    match_fractions = [compared.match_fraction(b) for b in bounds]
+    compared_fractions = np.array([compared.match_fraction(b) * compared.point_fraction(b) for b in bounds])
+    match_fractions = _matched_without_relief(surveys) * compared_fractions / median("point_fraction")
     mosaic_chi2 = median("mosaic_difference_nees") - compared.mosaic_error_ratio**2
     return compared._replace(
         bound_range_px=(float(bounds.min()), float(bounds.max())),
@@ -63,7 +74,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         match_sigma_px=match_sigma_px,
         match_error_ratio=match_error_ratio,
         lamp_error_growth=lamp_error_growth,
-        match_fraction=_fit_fraction_law(bounds, np.minimum(_matched_without_relief(surveys) * match_fractions, 1.0)),
+        match_fraction=_fit_fraction_law(bounds, np.minimum(match_fractions, 1.0)),
         match_parallax_px=compared.match_parallax_px,
         match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
         match_bias_fraction=bias_fraction,
@@ -74,8 +85,13 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         f2f_anticorrelation=float(np.median([_fit_anticorrelation(s) for s in surveys])),
         mosaic_sigma_px=mosaic_sigma_px,
         depth_error=errors.depth,
-        depth_error_scatter=errors.scatter,
         depth_sigma=reported.depth,
+        depth_cell_scatter=cell_scatter,
+        depth_binned_scatter=binned_scatter,
+        depth_binned_error=errors.binned,
+        depth_binned_sigma=reported.binned,
+        depth_survey_scatter=_robust_scatter(reported.departures),
+        depth_ratio_scatter=_robust_scatter(errors.departures - reported.departures),
         lateral_sigma_px=errors.lateral_sigma_px,
         map_completeness=_fit_fraction_law(bounds, known_fractions, _HOLE_OUTLIER / 10),
         border_holes=_fit_border_holes(surveys),
@@ -184,7 +200,9 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
     relief = max(float(effect @ np.concatenate(observed) / (effect @ effect)), 0.0)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
     products = np.array([[np.mean(s[f"consecutive_product_{name}"]) for name in _SOURCES] for s in surveys])
-    bias = BIAS_FRACTION * np.sum((products[:, 0] - relief * products[:, 2]) / patches) / np.sum(products[:, 1])
+    n_products = np.array([len(s["consecutive_product_images"]) for s in surveys])
+    measured = n_products @ ((products[:, 0] - relief * products[:, 2]) / patches)
+    bias = BIAS_FRACTION * measured / (n_products @ products[:, 1])
     return np.sqrt(patches), RELIEF_GAIN * float(np.sqrt(relief)), float(np.clip(bias, 0.0, 0.98))
 
 
@@ -301,12 +319,14 @@ class _MapErrors(NamedTuple):
     """Parameters of the errors of a map, or of its reported variances.
 
     Args:
-        depth: law of the depth.
+        depth: law of the standard deviation of depth.
         lateral_sigma_px: standard deviation of the lateral shift [px].
         relief_gain: standard deviation per roughness of a cell.
         relief_limit_px: limit of this standard deviation for large roughness [px].
         edge_gain: standard deviation per unresolved roughness.
-        scatter: standard deviation over surveys of the logarithm of measured / modelled standard deviation.
+        departures: (n,) logarithm of measured / modelled standard deviation of each survey, the mean over its classes.
+        binned: factors due to binning, the medians of measured / modelled values over the surveys with binned images;
+            the laws are fitted to the other surveys.
     """
 
     depth: DepthLaw
@@ -314,28 +334,30 @@ class _MapErrors(NamedTuple):
     relief_gain: float
     relief_limit_px: float
     edge_gain: float
-    scatter: float
+    departures: np.ndarray
+    binned: BinningFactors
 
 
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
-    """Fits the variances of maps from images, over all classes of cells, by those of the sampled maps.
+    """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
 
-    The variance of a class is that of the map with pose errors alone, plus that of the depth by `DepthLaw`, of a
-    lateral shift, of the relief in a window and of edges, each the effect of a unit error times a square to be found.
-    Residuals are those of the logarithms; every survey has the same weight. The reported variances contain the effects
-    of a lateral shift and of relief already in the map with pose errors alone.
+    The model variance of a class is that of the map with pose errors alone, plus a term each for depth (`DepthLaw`),
+    lateral shift, relief within the matching window, and edges. A term is the variance that a unit error adds to a
+    sampled map, times a fitted factor. Residuals are differences of logarithms; every survey has the same weight. The
+    reported variances of the map with pose errors alone already contain the effects of a lateral shift and of relief.
 
     Args:
         surveys: statistics of n surveys.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-        compared: error model with the values towards which parameters are drawn that the surveys do not determine.
+        compared: error model whose values are the start of the fit, and a weak prior of the fitted parameters.
     """
     rows, conditions, weights, numbers = [], [], [], []
+    binning = np.array([s["binning"][0] for s in surveys])
     for number, s in enumerate(surveys):
         classes = [name for name in s if name.startswith(f"map_{quantity}_")]
         rows += [s[name] for name in classes]
         conditions += [(float(np.median(s["bound_px"])), float(np.median(s["lamp_share"])))] * len(classes)
-        weights += [1 / np.sqrt(max(len(classes), 1))] * len(classes)
+        weights += [float(binning[number] == 1) / np.sqrt(max(len(classes), 1))] * len(classes)
         numbers += [number] * len(classes)
     images, pose, depth, lateral, edge, views, step, rough = np.array(rows).T
     (bounds, lamps), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
@@ -365,6 +387,39 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     limits = lowest, highest
     found = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER)
     ratios = np.log(images / variance(found.x)) / 2
-    means = [float(np.mean(ratios[np.array(numbers) == number])) for number in sorted(set(numbers))]
+    flown = sorted(set(numbers))
+    means, by = np.array([np.mean(ratios[np.array(numbers) == number]) for number in flown]), binning[flown]
+    factors = [float(np.median(means[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
+    means -= np.select([by == 2, by == 4], factors, 0.0)
     x = found.x.tolist()
-    return _MapErrors(DepthLaw(*x[:6]), *x[6:], scatter=float(_NORMAL_MAD * np.median(np.abs(means))))
+    return _MapErrors(DepthLaw(*x[:6]), *x[6:], departures=means, binned=BinningFactors(*np.exp(factors).tolist()))
+
+
+def _robust_scatter(departures: np.ndarray) -> float:
+    """Returns the standard deviation of departures (n,) from zero, from the median of their absolute values."""
+    return float(_NORMAL_MAD * np.median(np.abs(departures)))
+
+
+def _fit_cell_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> tuple[ScatterLaw, BinningFactors]:
+    """Fits the `ScatterLaw` of the depth over the cells of a map, and returns it with the scatter of binned images.
+
+    The scatter of a survey is the median over its classes of cells without edges. The law is fitted to the surveys
+    without binning; it is the law of the compared model if there are none.
+    """
+    rows = [
+        (np.median(s["bound_px"]), s["binning"][0], np.median([s[name][0] for name in s if name.startswith(_LEVEL)]))
+        for s in surveys
+        if any(name.startswith(_LEVEL) for name in s)
+    ]
+    bounds, binning, scatters = np.array(rows).reshape(-1, 3).T
+    fine = binning == 1
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return ScatterLaw(*x)(bounds[fine]) - scatters[fine]
+
+    law = compared
+    if fine.any():
+        x = least_squares(residuals, [0.8, 0.04], bounds=([0.0, 1e-3], [2.0, 1.0]), loss="soft_l1", f_scale=0.1).x
+        law = ScatterLaw(*x.tolist())
+    binned = (float(np.median(scatters[binning == k])) if (binning == k).any() else 0.0 for k in (2, 4))
+    return law, BinningFactors(*binned)

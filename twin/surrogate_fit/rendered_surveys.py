@@ -28,9 +28,11 @@ from twin.world.rendered_world import RenderedWorld
 
 _FILE = "surrogate_comparison.json"
 _MIN_SURVEYS = 2
-_MAX_LOST = 0.2  # largest fraction of lost frames of a survey to which the model is fitted
-#: Cramer-Rao bound [px] above which no survey is flown: at 0.26 px, three quarters of the frames were lost.
-_MAX_BOUND_PX = 0.2
+_MAX_LOST = 0.2  # largest fraction of lost frames, and of failed links, of a survey to which the model is fitted
+#: Cramer-Rao bound [px] above which no survey is flown: at 0.17 px, 86 % of the frames were lost.
+_MAX_BOUND_PX = 0.5
+_NEVER_PX = 1e3  # Cramer-Rao bound that no survey has
+_BOUND = "bound_px"
 _CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
 
 
@@ -38,7 +40,8 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     """Returns the error model fitted to rendered surveys.
 
     Args:
-        surveys: statistics of each survey; surveys without link or map statistics, e.g. aborted ones, are ignored.
+        surveys: statistics of each survey. Surveys without link or map statistics, e.g. aborted ones, only show which
+            surveys are lost.
         compared: error model of the surrogate with which the surveys were compared.
 
     Raises:
@@ -48,22 +51,55 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     if len(complete) < _MIN_SURVEYS:
         raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
     fitted = fit_error_model(complete, compared)
-    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted), _fitted_range(complete))
+    ranges = _fitted_range(complete, [s for s in surveys if _is_lost(s)])
+    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted), ranges)
 
 
-def _fitted_range(surveys: Sequence[SurveyStatistics]) -> dict[str, Range]:
-    """Returns the smallest and the largest value of each condition of the surveys, by name of `QUANTITIES`."""
-    values = {name: [x for s in surveys for x in s.get(_CONDITION + name, ())] for name in QUANTITIES}
-    return {name: (min(found), max(found)) for name, found in values.items() if found}
+def comparison_model(model: ErrorModel) -> ErrorModel:
+    """Returns an error model in which all points are matched, so that every image measurement has a sampled one."""
+    points, matches = (law._replace(half_px=_NEVER_PX) for law in (model.point_fraction, model.match_fraction))
+    return model._replace(point_fraction=points, match_fraction=matches)
+
+
+def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
+    """Returns the smallest and the largest value of each condition, by name of `QUANTITIES`.
+
+    If the survey with the largest Cramer-Rao bound was lost, the bound has no upper limit: all surveys with larger
+    bounds are lost as well.
+
+    Args:
+        complete: surveys to which the model is fitted.
+        lost: surveys that are lost (`_is_lost`).
+    """
+    values = {name: [x for s in complete for x in s.get(_CONDITION + name, ())] for name in QUANTITIES}
+    ranges = {name: (min(found), max(found)) for name, found in values.items() if found}
+    lost_px = [x for s in lost for x in s.get(_CONDITION + _BOUND, ())]
+    if _BOUND in ranges and max(lost_px, default=0.0) > ranges[_BOUND][1]:
+        ranges[_BOUND] = (ranges[_BOUND][0], np.inf)
+    return ranges
 
 
 def _is_complete(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey has links and a map, and lost few frames.
+    """Returns whether a survey has links and a map, is not lost, and has the binning of the surrogate.
 
     A map of rough ground may have no level cells, and thus no statistics of height errors.
     """
     has_both = "consecutive_product_images" in statistics and "hole_known" in statistics
-    return has_both and float(np.mean(statistics["frame_lost"])) <= _MAX_LOST
+    return has_both and _binned_alike(statistics) and not _is_lost(statistics)
+
+
+def _is_lost(statistics: SurveyStatistics) -> bool:
+    """Returns whether a survey lost too many frames or links; its remaining links are mostly gross errors.
+
+    The status of such a survey is "degraded" or "aborted" (`self_check.MAX_LINKS_FAILED`).
+    """
+    return any(float(np.mean(statistics.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed_images"))
+
+
+def _binned_alike(statistics: SurveyStatistics) -> bool:
+    """Returns whether images and surrogate have the same binning; their statistics are in pixels of binned images."""
+    images, surrogate = statistics["binning"]
+    return images == surrogate
 
 
 def all_statistics(
@@ -114,7 +150,7 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
     mission, stopwatch = prepare(scenario), Stopwatch()
     matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
     conditions = survey_conditions(mission, matchability)
-    if conditions["bound_px"][1] > _MAX_BOUND_PX:
+    if conditions[_BOUND][1] > _MAX_BOUND_PX:
         return {}
     folder.mkdir(parents=True, exist_ok=True)
     with RenderedWorld(mission, stopwatch) as world:

@@ -22,18 +22,20 @@ class Coverage:
     """Observed cells of a grid.
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
-    left image, and both cameras see these points.
+    left image, and both cameras see these points. With objects, the quad must also reach the surface seen from above:
+    floor that the cameras see below an overhang is not observed, as the map has the height of the overhang there.
 
     Args:
         grid: grid of the map.
         rig: calibration of the cameras of the depth images.
+        top_m: (rows, cols) true height of the surface seen from above; None: a floor without objects.
 
     Attributes:
         seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
     """
 
-    def __init__(self, grid: MapGrid, rig: StereoRig) -> None:
-        self.grid, self.rig = grid, rig
+    def __init__(self, grid: MapGrid, rig: StereoRig, top_m: NDArray[np.float32] | None = None) -> None:
+        self.grid, self.rig, self._top_m = grid, rig, top_m
         self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
 
     def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
@@ -48,7 +50,7 @@ class Coverage:
         raster = (grid.west_m, grid.north_m, grid.cell_m)
         pose = np.ascontiguousarray(world_from_left, dtype=np.float64)
         left, right = np.ascontiguousarray(depth_left, np.float32), np.ascontiguousarray(depth_right, np.float32)
-        _mark_seen(self.seen, raster, pose, camera, left, right)
+        _mark_seen(self.seen, raster, pose, camera, left, right, self._top_m)
 
 
 def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> NDArray[np.float32]:
@@ -66,14 +68,16 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> N
 
 
 @njit(cache=True, nogil=True)
-def _mark_seen(seen, raster, pose, camera, left, right):
+def _mark_seen(seen, raster, pose, camera, left, right, top):
     """Compiled kernel of `Coverage.add`.
 
     Projects the floor points of two neighbouring image rows at a time onto the grid. Marks the cells whose centres lie
-    in the quad between four neighbouring pixels, if both cameras see their floor points and no edge lies between them.
+    in the quad between four neighbouring pixels, if both cameras see their floor points and there is no depth edge
+    between them. With the height `top` of the surface seen from above, the quad must not lie more than the side of a
+    cell below that height. The compiler removes the code of this test if `top` is None.
     """
     height, width = left.shape
-    col, row = np.zeros((2, width)), np.zeros((2, width))
+    col, row, up = np.zeros((2, width)), np.zeros((2, width)), np.zeros((2, width))
     visible = np.zeros((2, width), dtype=np.bool_)
     for v in range(height):
         new, old = v % 2, 1 - v % 2
@@ -81,11 +85,19 @@ def _mark_seen(seen, raster, pose, camera, left, right):
             visible[new, u] = _in_both(u, v, left, right, camera)
             if visible[new, u]:
                 col[new, u], row[new, u] = _floor_cell(u, v, left[v, u], pose, camera, raster)
+                if top is not None:
+                    up[new, u] = _height(u, v, left[v, u], pose, camera)
         if v == 0:
             continue
         for u in range(width - 1):
             whole = visible[0, u] and visible[0, u + 1] and visible[1, u] and visible[1, u + 1]
-            if whole and _is_surface(left, u, v - 1):
+            if whole and _is_surface(left, u, v - 1) and top is not None:
+                for a, b in ((old, u), (new, u + 1)):
+                    _mark_top_triangle(
+                        seen, top, raster[2], (col[a, b], row[a, b], up[a, b]),
+                        (col[old, u + 1], row[old, u + 1], up[old, u + 1]), (col[new, u], row[new, u], up[new, u]),
+                    )  # fmt: skip
+            elif whole and _is_surface(left, u, v - 1):
                 _mark_triangle(
                     seen, col[old, u], row[old, u], col[old, u + 1], row[old, u + 1], col[new, u], row[new, u]
                 )
@@ -118,6 +130,32 @@ def _floor_cell(u, v, z, pose, camera, raster):
     x = pose[0, 0] * xc + pose[0, 1] * yc + pose[0, 2] * z + pose[0, 3]
     y = pose[1, 0] * xc + pose[1, 1] * yc + pose[1, 2] * z + pose[1, 3]
     return (x - raster[0]) / raster[2] - 0.5, (raster[1] - y) / raster[2] - 0.5
+
+
+@njit(cache=True, nogil=True)
+def _height(u, v, z, pose, camera):
+    """Returns the height in the world [m] of the point at pixel (u, v) with depth z [m]."""
+    xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
+    return pose[2, 0] * xc + pose[2, 1] * yc + pose[2, 2] * z + pose[2, 3]
+
+
+@njit(cache=True, nogil=True)
+def _mark_top_triangle(seen, top, slack, a, b, c):
+    """Marks the cells inside a triangle a, b, c (column, row, height) where it lies at most `slack` [m] below `top`."""
+    ca, ra, za = a
+    cb, rb, zb = b
+    cc, rc, zc = c
+    row0, row1 = max(0, int(np.ceil(min(ra, rb, rc)))), min(seen.shape[0] - 1, int(np.floor(max(ra, rb, rc))))
+    col0, col1 = max(0, int(np.ceil(min(ca, cb, cc)))), min(seen.shape[1] - 1, int(np.floor(max(ca, cb, cc))))
+    for r in range(row0, row1 + 1):
+        for k in range(col0, col1 + 1):
+            if not seen[r, k]:
+                p = (cb - ca) * (r - ra) - (rb - ra) * (k - ca)
+                q = (cc - cb) * (r - rb) - (rc - rb) * (k - cb)
+                s = (ca - cc) * (r - rc) - (ra - rc) * (k - cc)
+                inside = (p >= 0 and q >= 0 and s >= 0) or (p <= 0 and q <= 0 and s <= 0)
+                if inside and p + q + s != 0:
+                    seen[r, k] = (p * zc + q * za + s * zb) / (p + q + s) >= top[r, k] - slack
 
 
 @njit(cache=True, nogil=True)

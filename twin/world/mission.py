@@ -12,6 +12,7 @@ import terrains
 from controllers import segments
 from controllers.survey_plan import SurveyPlan
 from controllers.tracking import rotate_lever_arm
+from terrains.objects.model import PlacedObject
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
@@ -25,6 +26,7 @@ from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig
 from twin.simulate.autopilot import top_speed_mps
 from twin.world.clearance import planned_clearance
 from twin.world.limits import check_map_size
+from twin.world.objects import check_path, load_objects
 from twin.world.pace import SAME_TIME_S, Pace
 from twin.world.planning import plan_survey
 from twin.world.thrust_authority import check_thrust
@@ -90,6 +92,7 @@ class Mission:
         grid: cells of the map.
         true_cameras: true parameters of the cameras.
         illumination: optical properties of the water, and daylight.
+        objects: objects on the sea floor.
     """
 
     scenario: Scenario
@@ -99,6 +102,7 @@ class Mission:
     grid: MapGrid
     true_cameras: TrueCameras
     illumination: Illumination
+    objects: tuple[PlacedObject, ...] = ()
 
     @property
     def start(self) -> Array:
@@ -162,7 +166,7 @@ class Mission:
 
 
 def prepare(scenario: Scenario) -> Mission:
-    """Loads the floor, plans the survey and checks both.
+    """Loads the floor of a scenario, plans the survey, and checks the scenario and the plan.
 
     Raises:
         ScenarioError: the survey cannot be flown; the error lists every reason with file and line.
@@ -184,11 +188,14 @@ def prepare(scenario: Scenario) -> Mission:
     illumination = _attempt(lambda: _illumination(scenario), source, errors)
     _attempt(lambda: check_require(scenario.require), source, errors)
     _attempt(lambda: _check_beacons_listed(scenario), source, errors)
+    objects: tuple[PlacedObject, ...] = ()
     if terrain is not None:
+        objects = load_objects(scenario, terrain, lambda build: _attempt(build, source, errors))
         for k, beacon in enumerate(scenario.beacons):
             _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, errors)
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_clearance(scenario, terrain, plan), source, errors)
+        _attempt(lambda: check_path(objects, plan, scenario.plan.clearance_m), source, errors)
         _attempt(lambda: check_thrust(scenario, plan), source, errors)
         for k in range(len(scenario.lamps)):
             _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, errors)
@@ -197,7 +204,7 @@ def prepare(scenario: Scenario) -> Mission:
         grid = _attempt(lambda: _grid(scenario, plan, terrain), source, errors)
     if errors or terrain is None or plan is None or grid is None or true_cameras is None or illumination is None:
         raise ScenarioError(errors)
-    return Mission(scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination)
+    return Mission(scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects)
 
 
 def _attempt(build, source: Source, errors: list[str]):
@@ -217,7 +224,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     """
     t = scenario.terrain
     if t.kind != "file":
-        given = [key for key in ("height_file", "texture_file", "z") if getattr(t, key)]
+        given = [key for key in ("height_file", "texture_file", "orthophoto_file", "z") if getattr(t, key)]
         if given:
             key = given[0]
             raise TwinError(
@@ -225,13 +232,16 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
                 f"has no effect on a generated floor (terrain.kind = {t.kind!r})",
                 'terrain.kind = "file"',
             )
-        texel_m = t.texture_px_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # unused without images
-        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texel_m, scenario.seed)
+        texel_m = scenario.texel_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # unused without images
+        texture = terrains.TextureSource(texel_m, cover=t.cover, coarsen=t.texture_px_m is None)
+        return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed)
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
-    return terrains.load(
-        t.height_file, t.texture_file, t.texture_px_m, t.height_spacing_m, t.height_range_m, scenario.seed, t.z
+    tiling = t.texture_tiling if scenario.imaging.fidelity == "rendered" else "repeat"  # unused without images
+    texture = terrains.TextureSource(
+        scenario.texel_m, t.texture_file, tiling, t.orthophoto_file, t.cover, coarsen=t.texture_px_m is None
     )
+    return terrains.load(t.height_file, texture, t.height_spacing_m, t.height_range_m, scenario.seed, t.z)
 
 
 def _check_speed(scenario: Scenario) -> None:

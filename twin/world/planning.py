@@ -153,7 +153,7 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
 
 
 def _n_whole(request: SurveyRequest, pattern: str) -> float:
-    """Returns a rough estimate of the number of tracks that fill the area: its longer side over the swath spacing."""
+    """Returns the approximate number of tracks that fill the area: its longer side divided by the swath spacing."""
     swath_m = _PATTERNS[pattern](request._replace(tracks=1)).swath_spacing_m
     return max(request.area_m) / swath_m
 

@@ -11,6 +11,7 @@ import scenes.builder
 from twin.core.timing import StageTimer
 from twin.imaging.camera import StereoCamera
 from twin.imaging.image_formation import ImageFormation
+from twin.imaging.object_view import Objects
 from twin.imaging.renderer import Renderer
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
@@ -18,7 +19,8 @@ from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import Coverage
 from twin.world.mission import Mission, Step
-from twin.world.world import CameraImages, World, streams
+from twin.world.top_surface import top_surface
+from twin.world.world import CameraImages, TrueSurface, World, streams
 
 
 class RenderedWorld(World):
@@ -46,10 +48,16 @@ class RenderedWorld(World):
             mission, stopwatch, vehicle, NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project)
         )
         self.renderer = Renderer(scene, rig.width_px, rig.height_px, vfov_deg)
-        image_formation = ImageFormation(scenario, mission.illumination, mission.terrain, rng["snow"], rig)
+        objects = Objects(mission.objects, np.array(scenario.current.velocity_mps)) if mission.objects else None
+        image_formation = ImageFormation(scenario, mission.illumination, mission.terrain, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, image_formation, scenario, *noise_rngs, stopwatch, cameras)
-        self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m))
+        self._surface = None
+        if mission.objects:
+            floor_m = super().true_surface().height_m
+            self._surface = TrueSurface(*top_surface(mission.grid, floor_m, mission.objects))
+        top_m = None if self._surface is None else self._surface.height_m
+        self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
 
     def close(self) -> None:
         self.renderer.close()
@@ -58,7 +66,10 @@ class RenderedWorld(World):
         images = self.camera.capture(self.world_from_camera, step.keyframe, self.vehicle.twist_body)
         if images.depth_right is not None:
             self.coverage.add(self.world_from_camera, images.depth_left, images.depth_right)
-        return CameraImages(images.left, images.right, lambda: images.depth_left)
+        return CameraImages(images.left, images.right, lambda: images.depth_left, images.exposure)
+
+    def true_surface(self) -> TrueSurface:
+        return super().true_surface() if self._surface is None else self._surface
 
     def seen(self) -> NDArray[np.bool_]:
         return self.coverage.seen

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.growing_array import GrowingArray
-from twin.core.records import Frame, Image, StereoRig, Trajectory, Truth
+from twin.core.records import Exposure, Frame, Image, MapGrid, StereoRig, Trajectory, Truth
 from twin.core.timing import StageTimer
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.kinematic_vehicle import KinematicVehicle
@@ -20,6 +20,7 @@ from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import true_heights
 from twin.world.mission import FrameSequence, Mission, Step
 from twin.world.pilot import PilotOfEstimates
+from twin.world.true_albedo import true_albedo, without_objects
 
 if TYPE_CHECKING:
     from twin.simulate.mujoco_vehicle import MujocoVehicle
@@ -41,11 +42,21 @@ class CameraImages(NamedTuple):
     Args:
         left, right: (H, W, 3) uint8 RGB images; the right one is None between keyframes.
         depth_m: function that returns the true depth (H, W) of the left image [m].
+        exposure: exposure that the cameras report, see `Frame.exposure`; None without images.
     """
 
     left: Image
     right: Image | None
     depth_m: Callable[[], NDArray[np.float32]]
+    exposure: Exposure | None = None
+
+
+class TrueSurface(NamedTuple):
+    """True surface of the map as seen from above; for its members, see those of `Truth` with the same names."""
+
+    height_m: NDArray[np.float32]
+    objects: NDArray[np.uint16] | None = None
+    overhung: NDArray[np.bool_] | None = None
 
 
 class World(ABC):
@@ -111,7 +122,7 @@ class World(ABC):
         time_s = index / self.mission.rig.frame_rate_hz
         depth_m = images.depth_m if step.keyframe else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
-        return Frame(index, time_s, images.left, images.right, readings, keyframe=step.keyframe)
+        return Frame(index, time_s, images.left, images.right, readings, step.keyframe, images.exposure)
 
     def act(self, command: Array) -> None:
         """Simulates the physics of one frame interval under a pilot's command."""
@@ -139,7 +150,11 @@ class World(ABC):
 
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far."""
-        n, sequences = len(self), self._sequences
+        n, sequences, surface = len(self), self._sequences, self.true_surface()
+
+        def albedo(grid: MapGrid) -> NDArray[np.float32]:
+            return without_objects(true_albedo(self.mission.terrain, grid), grid, surface.objects, self.mission.grid)
+
         lengths = np.array([len(sequence) for sequence, _ in sequences], np.int64)
         positions = [np.empty((0, 3)), *(sequence.reference.position for sequence, _ in sequences)]
         yaws = [np.empty(0), *(np.asarray(sequence.reference.yaw) for sequence, _ in sequences)]
@@ -148,11 +163,19 @@ class World(ABC):
             reference=np.concatenate(positions)[:n],
             holding=np.repeat(np.array([sequence.holding for sequence, _ in sequences], np.bool_), lengths)[:n],
             track=np.repeat(np.array([track for _, track in sequences], np.int64), lengths)[:n],
-            height_m=true_heights(self.mission.grid, self.mission.terrain.height_at),
+            height_m=surface.height_m,
             seen=self.seen(),
             asked=self.mission.plan.inside_area(*np.meshgrid(*self.mission.grid.centres())),
             reference_yaw=np.concatenate(yaws)[:n],
+            albedo=albedo,
+            in_area=self.mission.plan.inside_area,
+            objects=surface.objects,
+            overhung=surface.overhung,
         )
+
+    def true_surface(self) -> TrueSurface:
+        """Returns the true surface of the map; in this base class, that of the floor without objects."""
+        return TrueSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
 
 
 def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:

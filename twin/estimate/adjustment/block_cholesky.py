@@ -73,7 +73,7 @@ class CholeskyFactor(NamedTuple):
         return blocks[s.permutation]
 
     def _panel(self, panel: int) -> tuple[Array, Array]:
-        """Returns L1^-1 and L2 of a panel."""
+        """Returns views of the two parts of a panel: L1^-1, and L2 below it; see the docstring of the module."""
         matrix = _panel_matrix(self.symbolic, self.panels, panel)
         own = matrix.shape[1]
         return matrix[:own], matrix[own:]
@@ -183,7 +183,7 @@ def _invert_root(matrix, original, inverse):
 
     Args:
         matrix: (n, n), only the lower triangle is read.
-        original: (n,) diagonal before elimination; a pivot that is tiny relative to its entry is only rounding error.
+        original: (n,) diagonal before elimination; a pivot that is tiny relative to its diagonal entry counts as zero.
         inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
     root = np.zeros_like(matrix)

@@ -45,7 +45,7 @@ class SymbolicFactor(NamedTuple):
     transposed: NDArray[np.bool_]
 
     def rows_below(self, panel: int) -> Indices:
-        """Returns the positions below a panel, ascending."""
+        """Returns the positions of the nonzero block rows below a panel, ascending."""
         return self.rows[self.row_start[panel] : self.row_start[panel + 1]]
 
     def parent(self, panel: int) -> int | None:

@@ -281,7 +281,7 @@ def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, ca
 
 @njit(cache=True, nogil=True, inline="always")
 def _quadratic(row, cov):
-    """Returns the quadratic form a cov a' of a row vector a (6,)."""
+    """Returns the quadratic form row cov row' of a row vector (6,) and a covariance (6, 6)."""
     total = 0.0
     for i in range(6):
         for j in range(6):

@@ -126,7 +126,7 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest second difference of height across each cell (rows, cols), of four directions [m]."""
+    """Returns the largest second difference of height across each cell (rows, cols), over four directions [m]."""
     step = np.zeros_like(height)
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
     for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):

@@ -7,6 +7,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig, SurveyResult
 
+_MOST_CELLS = 4e7  # cells of a larger map are enlarged, to bound its memory
 _CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that several disparities support each height
 
 
@@ -23,6 +24,8 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = 
     rays = np.column_stack([rig.normalised(corners - 0.5), np.ones(4)])
     poses = result.final.world_from_camera[result.keyframe_rows]
     seen = np.concatenate([geometry.transform(p, rays * d)[:, :2] for p, d in zip(poses, depth_m, strict=True)])
+    size_m = np.ptp(seen, axis=0) + 2 * cell
+    cell = max(cell, float(np.sqrt(size_m[0] * size_m[1] / _MOST_CELLS)))
     west, south = np.floor(seen.min(axis=0) / cell) * cell
     east, north = np.ceil(seen.max(axis=0) / cell) * cell
     return MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))

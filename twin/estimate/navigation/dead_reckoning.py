@@ -45,7 +45,7 @@ class FrameAiding(NamedTuple):
 
 
 def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
-    """Returns height [m], attitude (3,) [rad] and velocity (3,) [m/s] of readings; NaN where there is no reading."""
+    """Returns height z [m], roll, pitch, yaw (3,) [rad] and body velocity (3,) [m/s]; NaN where there is no reading."""
     height, angles, velocity = readings.pressure_z_m, readings.ahrs_rpy_rad, readings.dvl_mps
     missing = np.full(3, np.nan)
     return (

@@ -189,7 +189,13 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
 @njit(cache=True, nogil=True)
 def _gain(prior, jacobian, cov):
-    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination."""
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination.
+
+    Args:
+        prior: (6, 6) covariance P of the pose.
+        jacobian: (k, 6) derivative J of the predicted observation.
+        cov: (k, k) covariance R of the observation.
+    """
     size = len(cov)
     gain, innovation_cov = np.zeros((6, size)), cov.copy()
     for m in range(size):

@@ -189,7 +189,7 @@ def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
 
 
 def _mean(image: Map) -> Map:
-    """Returns the local mean (H, W) of an image over the balance window."""
+    """Returns the local mean (H, W) of an image over the window in which brightness and contrast are matched."""
     return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 

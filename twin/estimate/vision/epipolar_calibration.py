@@ -10,12 +10,18 @@ image by
 (the linearised rotation of a pinhole camera; Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed
 from the right image. Yaw is estimated, but not removed: a lens distortion error causes nearly the same pattern, and a
 wrong yaw would shift all disparities.
+
+Row differences that none of these four explains are either matching noise, which averages out in each region of the
+image, or errors of the calibration (distortion, a port), which do not. `RegionMeans` separates the two.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -33,6 +39,46 @@ NOTICEABLE_PX = 0.02  # ... and by more than this
 _HUBER = 1.5
 _ITERATIONS = 5
 _MAD_TO_SIGMA = 1.4826
+_REGIONS = (4, 3)  # regions of the image along columns and rows
+
+
+class RegionMeans(NamedTuple):
+    """Sums over the row differences in each of m regions of the image.
+
+    Args:
+        weight: (m,) sum of the weights, the inverse variance of the mean.
+        rows: (m,) weighted sum of the normalised row differences.
+        jacobian: (m, 4) weighted sum of their derivatives (`row_jacobian`).
+    """
+
+    weight: Array
+    rows: Array
+    jacobian: Array
+
+    def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
+        """Returns the sums with n more row differences `rows` (n,), which lie in the regions `region` (n,)."""
+        terms = np.column_stack([weight, weight * rows, weight[:, None] * jacobian])
+        sums = np.zeros((len(self.weight), terms.shape[1]))
+        np.add.at(sums, region, terms)
+        return RegionMeans(self.weight + sums[:, 0], self.rows + sums[:, 1], self.jacobian + sums[:, 2:])
+
+    def pattern(self, estimate: Array) -> float:
+        """Returns the RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
+
+        The expected contribution of matching noise is subtracted: the weighted sum of squares of the means has the
+        expectation m - 4, for m regions and four estimated parameters. In focal lengths; 0 without observations.
+        """
+        seen = self.weight > 0
+        weight = self.weight[seen]
+        mean = (self.rows[seen] - self.jacobian[seen] @ estimate) / weight
+        excess = float(np.sum(weight * mean**2)) - max(len(weight) - len(estimate), 0)
+        return float(np.sqrt(max(excess, 0.0) / np.sum(weight))) if len(weight) else 0.0
+
+
+def _no_regions() -> RegionMeans:
+    """Returns the sums before the first observation."""
+    n = _REGIONS[0] * _REGIONS[1]
+    return RegionMeans(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
 
 
 class EpipolarCalibration:
@@ -45,6 +91,7 @@ class EpipolarCalibration:
     def __init__(self) -> None:
         self._information = np.diag(_PRIOR_SIGMA**-2)
         self._vector = np.zeros(4)
+        self._regions = _no_regions()
         self.removed = np.zeros(4)
 
     def add(self, points: StereoPoints, rig: StereoRig, patch_px: int) -> None:
@@ -68,6 +115,7 @@ class EpipolarCalibration:
             estimate = np.linalg.solve(information, self._vector + jacobian.T @ (weight * rows))
         self._information = self._information + jacobian.T @ (weight[:, None] * jacobian)
         self._vector = self._vector + jacobian.T @ (weight * rows)
+        self._regions = self._regions.plus(_region(points.pixels, rig), weight, rows, jacobian)
 
     @property
     def estimate(self) -> Array:
@@ -92,6 +140,7 @@ class EpipolarCalibration:
         if not np.any((size > _SIGNIFICANT * shift_sigma) & (size * rig.focal_px > NOTICEABLE_PX)):
             return False
         self.removed = self.removed + change
+        self._regions = _no_regions()  # before, matches with large row differences were rejected
         return True
 
     def rectify(self, right: Image, rig: StereoRig) -> Image:
@@ -114,9 +163,9 @@ class EpipolarCalibration:
         return np.asarray(warped, np.uint8)
 
     def report(self) -> EpipolarError:
-        """Returns the estimated errors, their standard deviations, and the part that `rectify` removes."""
+        """Returns the estimated errors with standard deviations, the part that `rectify` removes, and the pattern."""
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
-        return EpipolarError(self.estimate, sigma, self.removed.copy())
+        return EpipolarError(self.estimate, sigma, self.removed.copy(), self._regions.pattern(self.estimate))
 
 
 def row_jacobian(x: Array, y: Array) -> Array:
@@ -124,6 +173,13 @@ def row_jacobian(x: Array, y: Array) -> Array:
 
     They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset."""
     return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
+
+
+def _region(pixels: NDArray[np.floating], rig: StereoRig) -> NDArray[np.int64]:
+    """Returns the number of the region of the image (n,) that contains each of the pixels (n, 2)."""
+    columns, rows = _REGIONS
+    column = np.clip(pixels[:, 0] * columns / rig.width_px, 0, columns - 1).astype(np.int64)
+    return column + columns * np.clip(pixels[:, 1] * rows / rig.height_px, 0, rows - 1).astype(np.int64)
 
 
 def row_sigma(points: StereoPoints) -> Array:

@@ -16,7 +16,7 @@ from twin.estimate.vision.stereo import StereoPoints
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
-_MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; in pure noise, about a tenth are
+MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; in pure noise, about a tenth are
 _MIN_INLIERS = 0.5  # smallest fraction of the tracked points that must agree with a motion
 _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
@@ -88,11 +88,14 @@ class FrameToFrame:
         self.reference: _Reference | None = None
         self.started = False
         self.filter = MotionFilter()
+        self._reference_cov = np.zeros((6, 6))  # of the pose of the reference in the last keyframe
+        self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
         """Makes a new keyframe the reference, with the strongest of its points; `points` are sorted by strength."""
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
+        self._reference_cov = np.zeros((6, 6))
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
     def step(self, image: matching.Image, interval_s: float | None = None) -> tuple[two_view_motion.Motion, str]:
@@ -115,25 +118,41 @@ class FrameToFrame:
         located = None if self.reference is None else self._locate(image, self.reference, self.filter.pose)
         status = self._fuse(located)
         motion = last_from_reference @ self.filter.pose
+        if status != "ok":
+            self._common_cov = _transported(self._common_cov, motion)
         if located is None or status != "ok":
             return constant_velocity_motion(motion, status)
         cov = self.filter.cov.copy()
         if located.tracked_share < _MIN_TRACKED:
+            self._reference_cov = self.cov_since_keyframe
             self._set_reference(located.as_reference)
         return located.motion._replace(a_from_b=motion, cov=cov), status
 
     def _fuse(self, located: _Located | None) -> str:
         """Fuses a measured pose with the prediction; returns "ok", or the reason why it was not used."""
-        if located is None or located.tracked_share < _MIN_MATCHED:
+        if located is None or located.tracked_share < MIN_MATCHED:
             return "too few points matched"
         if located.inlier_share < _MIN_INLIERS:
             return "too few points agree"
         used = self.filter.correct(located.motion.a_from_b, located.motion.cov)
+        if used:
+            self._common_cov = located.motion.cov - self.filter.cov
         return "ok" if used else "motion contradicts the prediction"
+
+    @property
+    def cov_since_keyframe(self) -> Array:
+        """Returns the covariance (6, 6) of the last frame's pose relative to the last keyframe, in the frame's axes.
+
+        All frames are matched with the same points of a reference image, whose errors are therefore common to all
+        measured poses. The filter assumes that the errors of successive poses are independent, so its covariance is too
+        small. It is replaced by the covariance of the last measured pose, plus the growth of the filter's covariance
+        since that measurement, plus the covariance of the pose of the reference image.
+        """
+        return _transported(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
     def _set_reference(self, reference: _Reference) -> None:
         """Makes the current frame, with these points, the reference."""
-        self.reference = reference
+        self.reference, self._common_cov = reference, np.zeros((6, 6))
         self.filter.restart()
 
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> _Located | None:
@@ -185,10 +204,19 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     return measured, cov
 
 
+def _transported(cov: Array, a_from_b: Array) -> Array:
+    """Returns the covariance (6, 6) of the pose of b, rigidly attached to a, from the covariance of the pose of a."""
+    adjoint = geometry.adjoint(geometry.inverse(a_from_b))
+    return adjoint @ cov @ adjoint.T
+
+
 def constant_velocity_motion(
     motion: Array, status: str = "too few points matched"
 ) -> tuple[two_view_motion.Motion, str]:
-    """Returns a motion (4, 4) that was predicted at constant velocity, with a large covariance, and a status."""
+    """Returns a motion (4, 4), predicted at constant velocity, as a `Motion` with large covariance, and `status`.
+
+    The status is the reason why the motion was not measured.
+    """
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
     return two_view_motion.Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status

@@ -13,7 +13,7 @@ from twin.core.records import Image, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import disparity, matching, stereo
 
-_BINNINGS = (1, 2, 4)
+BINNINGS = (1, 2, 4)  #: numbers of pixels that may be averaged along each side
 _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
@@ -29,7 +29,7 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
         Number of pixels that are averaged along each side.
     """
     best, best_fraction = 1, 0.0
-    for binning in _BINNINGS:
+    for binning in BINNINGS:
         if rig.width_px % binning or rig.height_px % binning:
             break
         fraction = _matched_fraction(left, right, binning, rig.binned(binning), settings)

@@ -71,6 +71,11 @@ class ImageSpool:
         self.flush()
         return self._read(row, "left"), self._read(row, "right")
 
+    def left(self, row: int) -> Image:
+        """Returns the left image (height, width, 3) of the keyframe at frame index `row`."""
+        self.flush()
+        return self._read(row, "left")
+
     def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
         """Returns the binned grey levels of the left and the right image of a keyframe (`matching.gray`)."""
         with self._lock:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.records import Displacement, Readings
+from twin.core.records import Displacement, Exposure, Readings
 from twin.estimate.vision.stereo import StereoPoints
 
 
@@ -30,6 +30,7 @@ class Keyframe:
             with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference
             between the values of two keyframes is the covariance of the motion between them.
         depth_m: median depth of the matched points [m].
+        exposure: exposure of its images; None if it was not reported.
     """
 
     number: int
@@ -41,3 +42,4 @@ class Keyframe:
     dvl_displacement: Displacement | None = None
     accumulated_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
     depth_m: float = np.nan
+    exposure: Exposure | None = None

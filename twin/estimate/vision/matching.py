@@ -27,7 +27,7 @@ _FLAT_GRAY = 2.0  # standard deviation of sensor noise [grey levels]; keeps unif
 _FORWARD_BACKWARD_PX = 0.5
 
 
-def gray(rgb: Image, binning: int = 1) -> Gray:
+def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
     """Returns the slightly smoothed grey levels (height / binning, width / binning) in which patches are matched.
 
     Noise limits the matching of binned images, so their grey levels are the mean of the colour bands. Over the coarse
@@ -91,7 +91,7 @@ def binned(image: Pixels, by: int) -> Pixels:
 
 
 def scaled_rows(image: Image, scale: float) -> Image:
-    """Returns an image (H, W, ...) resampled to int(H scale) rows; row v of the input is row (v + 0.5) scale - 0.5."""
+    """Returns an image (H, W, ...) resampled to int(H scale) rows; input row v becomes row (v + 0.5) scale - 0.5."""
     rows, columns = int(image.shape[0] * scale), image.shape[1]
     matrix = np.array([[1, 0, 0], [0, scale, 0.5 * scale - 0.5]])
     return np.asarray(cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE), np.uint8)

@@ -108,7 +108,8 @@ class Mosaic:
             rig: calibration at the scale of the image.
 
         Returns:
-            The pose correction with its covariance, or None if too few cells are textured or have small residuals.
+            The pose correction with its covariance, or None if too few cells are textured, or too few of these have
+            small residuals.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], half_window_m)
         if cells is None:

@@ -221,9 +221,13 @@ def _extract(source, centres, half):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
-    """Writes the nuisance basis and the projected gradient of a patch to `rows` (8, m); returns the patch's energy.
+    """Prepares a patch of m pixels for matching: writes its nuisance basis and projected gradient to `rows` (8, m).
 
-    Gram-Schmidt orthogonalisation: rows 0 to 5 become orthonormal, rows 6 and 7 (the gradient) orthogonal to them.
+    Gram-Schmidt orthogonalisation makes rows 0 to 5, the basis of the nuisance parameters (`PatchTemplates`),
+    orthonormal, and rows 6 and 7, the gradient in column and row, orthogonal to them.
+
+    Returns:
+        The sum of squared deviations from the mean of the patch.
     """
     side = 2 * half + 1
     mean = 0.0

@@ -36,7 +36,7 @@ def repetition(image: Image, patch_px: int) -> float:
 
 @lru_cache(maxsize=4)
 def _taper(height: int, width: int) -> tuple[Array, Array]:
-    """Returns the taper (height, width) of images of one size, and its autocorrelation."""
+    """Returns the taper (height, width) for images of this size, and its autocorrelation."""
     taper = np.outer(np.hanning(height), np.hanning(width))
     return taper, _autocorrelation(taper)
 

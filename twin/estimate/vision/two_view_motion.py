@@ -12,6 +12,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.quality import DisparityOffset
 from twin.estimate.vision import pixel_locking
 from twin.estimate.vision.observation_equations import (
     LinearisedObservations,
@@ -43,6 +44,8 @@ class Motion(NamedTuple):
             expected value (`pair_motion`) or in grey levels (`mosaic`); infinite for a predicted motion.
         closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
             None if it started from another motion.
+        disparity_offset: offset of all disparities that the points of two stereo pairs imply (`pair_motion`); None if
+            it is not estimated.
     """
 
     a_from_b: Array
@@ -50,6 +53,7 @@ class Motion(NamedTuple):
     n_points: int
     residual: float
     closed_form: Array | None = None
+    disparity_offset: DisparityOffset | None = None
 
 
 class PairMotionSettings(NamedTuple):
@@ -193,7 +197,10 @@ def pair_motion(
         return pair_motion(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
-    return Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
+    return Motion(
+        a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale,
+        disparity_offset=_disparity_offset(normals, settings),
+    )  # fmt: skip
 
 
 class _WeightedNormals(NamedTuple):
@@ -257,6 +264,28 @@ def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
         noise_cov = np.linalg.inv(normals.normal) * max(normals.scale, _MIN_SCALE) ** 2
     cov = noise_cov * settings.variance_inflation + bias_root @ bias_root.T
     return np.asarray(cov[:6, :6], np.float64)
+
+
+def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -> DisparityOffset | None:
+    """Returns the offset of all disparities, estimated together with the motion by one more Gauss-Newton step.
+
+    The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
+    unit vector along the disparity. None if disparity is not measured in both pairs, or if it cannot be estimated.
+    """
+    if settings.n_measured < 3:
+        return None
+    observations, weight = normals.observations, normals.weight
+    by_offset = np.array([0.0, 0.0, 1.0]) - observations.jacobian_point[:, :, 2]
+    weighted = weight[:, None] * np.einsum("nrc,nr->nc", observations.information, by_offset)
+    coupling = np.einsum("nc,ncp->p", weighted, observations.jacobian_motion)
+    information = float(np.sum(weighted * by_offset))
+    score = float(np.sum(weighted * observations.residual))
+    by_unknowns = np.linalg.solve(normals.normal, coupling)
+    remaining = information - float(coupling @ by_unknowns)  # after elimination of the other unknowns
+    if remaining <= 1e-9 * information:
+        return None
+    variance = max(normals.scale, _MIN_SCALE) ** 2 * settings.variance_inflation / remaining
+    return DisparityOffset((score - float(by_unknowns @ normals.right)) / remaining, variance**0.5)
 
 
 def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:

@@ -31,7 +31,8 @@ def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
 def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
     """Same as `floor_distance`, for a rising ray.
 
-    A cast of the reversed ray decides whether the floor blocks the ray; steps and bisection then locate the point.
+    A ray cast in the reverse direction decides whether the floor blocks the ray; steps and bisection then locate the
+    point of intersection.
     """
     top = min((field.highest_m - oz) / dz, field.spacing_m * (field.height_m.shape[0] + field.height_m.shape[1]))
     if top <= 0:

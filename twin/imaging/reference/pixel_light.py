@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +93,7 @@ class ReferenceScene:
 
 
 class PixelRay(NamedTuple):
-    """A pixel of a camera: world_from_camera (4, 4), the camera, and (column, row) [px]."""
+    """A pixel of a camera: pose world_from_camera (4, 4), calibration of the camera, and (column, row) [px]."""
 
     world_from_camera: Array
     rig: StereoRig
@@ -106,7 +108,7 @@ class Effort:
         walks: number of pairs of random walks, rounded down to a multiple of `batches`; one walk of each pair starts on
             the floor, the other in the water.
         batches: number of batches; the standard errors are computed from the scatter of their means.
-        seed: seed of the random numbers; equal seeds give equal results.
+        seed: seed of the random numbers, one number or several; equal seeds give equal results.
         plain: use the textbook estimator, which connects every vertex directly to the lamps and samples directions
             only from the phase function (in the water) or Lambert's cosine (on the floor). It has the same mean and a
             much larger variance; it serves to check the default estimator.
@@ -114,7 +116,7 @@ class Effort:
 
     walks: int = 100_000
     batches: int = 32
-    seed: int = 1
+    seed: int | tuple[int, ...] = 1
     plain: bool = False
 
 
@@ -150,7 +152,7 @@ class PixelLight:
 
     @property
     def lamp_scattered(self) -> BatchMean:
-        """Light of the floor, not scattered between floor and camera, that was scattered or reflected before."""
+        """Light of the floor that was scattered or reflected before it met the floor, and not scattered after it."""
         return _estimate(self.sums[:, LAMP_SCATTERED])
 
     @property
@@ -180,7 +182,7 @@ class PixelLight:
 
     @property
     def sharp_share(self) -> BatchMean:
-        """Share of `sharp` in `total`."""
+        """Fraction of the total light that comes from the floor and was not scattered between floor and camera."""
         return ratio(self._sharp, self.sums.sum(1))
 
     @property
@@ -219,7 +221,7 @@ class PlaneLight:
 
     @property
     def total(self) -> BatchMean:
-        """All light."""
+        """Total illuminance by sun, sky and scattered light."""
         return _estimate(self.sums.sum(1))
 
     @property
@@ -272,7 +274,7 @@ def pixel_light(
     """
     n_walks, rngs = _batches(effort)
     kernel, view, edges = _kernel_scene(scene, effort.plain), _view(ray), np.array(bin_edges_px, np.float64)
-    return PixelLight(np.array([trace_pixel(kernel, view, edges, n_walks, rng) for rng in rngs]), edges)
+    return PixelLight(_in_threads(lambda rng: trace_pixel(kernel, view, edges, n_walks, rng), rngs), edges)
 
 
 def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Effort) -> PlaneLight:
@@ -288,7 +290,35 @@ def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Ef
     """
     n_walks, rngs = _batches(effort)
     kernel, point, facing = _kernel_scene(scene, effort.plain), tuple(map(float, point_m)), tuple(map(float, normal))
-    return PlaneLight(np.array([trace_plane(kernel, point, facing, n_walks, rng) for rng in rngs]))
+    return PlaneLight(_in_threads(lambda rng: trace_plane(kernel, point, facing, n_walks, rng), rngs))
+
+
+Light = TypeVar("Light", PixelLight, PlaneLight)
+
+
+def refined(
+    light_of: Callable[[Effort], Light], enough: Callable[[Light], bool], effort: Effort, most_walks: int
+) -> Light:
+    """Repeats a computation until its standard errors are small enough, and returns the light from all rounds.
+
+    Args:
+        light_of: computes the light of one round, e.g. with `pixel_light` or `plane_light`.
+        enough: whether the standard errors of the light of all rounds so far are small enough.
+        effort: size of each round; the rounds differ by their seeds.
+        most_walks: largest number of walks of all rounds; the first round is always computed.
+    """
+    light, rounds = light_of(effort), 1
+    while (rounds + 1) * effort.walks <= most_walks and not enough(light):
+        seed = effort.seed if isinstance(effort.seed, tuple) else (effort.seed,)
+        more = light_of(replace(effort, seed=(*seed, rounds)))
+        light, rounds = replace(light, sums=np.concatenate([light.sums, more.sums])), rounds + 1
+    return light
+
+
+def _in_threads(trace: Callable[[np.random.Generator], Array], rngs: Sequence[np.random.Generator]) -> Array:
+    """Returns the results of a compiled kernel for each random stream, computed in parallel threads."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return np.array(list(pool.map(trace, rngs)))
 
 
 def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:

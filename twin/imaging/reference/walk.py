@@ -81,7 +81,7 @@ def towards(lamp, point):
 
 @njit(cache=True, nogil=True)
 def straight(scene, kind, point, normal, direction, before, density, step_m):
-    """Returns the light of all lamps that reaches a vertex without scattering, times its response.
+    """Returns the light of all lamps that reaches a vertex without scattering, times the response of the vertex.
 
     Args:
         before: the previous vertex of the walk.
@@ -109,9 +109,10 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
 
 @njit(cache=True, nogil=True)
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
-    """Returns an estimate of the light of all lamps that reaches a vertex after one scattering, times its response.
+    """Estimates the light of all lamps that reaches a vertex after one scattering, times the response of the vertex.
 
-    It is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around the lamps.
+    The estimate is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around the
+    lamps.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -149,9 +150,9 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
 
 @njit(cache=True, nogil=True)
 def sunlight(scene, kind, point, normal, direction, guided, rng):
-    """Returns the sunlight that reaches a vertex without scattering, times its response.
+    """Returns the sunlight that reaches a vertex without scattering, times the response of the vertex.
 
-    In water, a sun with a disc is sampled at a point of the disc, weighted by the complement of `share_of_escape`.
+    In water, a sun with a disc is sampled at a random point of the disc, weighted by 1 - `share_of_escape`.
     """
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
@@ -174,11 +175,13 @@ def sunlight(scene, kind, point, normal, direction, guided, rng):
 
 @njit(cache=True, nogil=True)
 def share_of_escape(scene, density, path_m):
-    """Returns the share of the walk's estimate of the sun's disc (the balance heuristic, as in `share_of_walk`).
+    """Returns the weight of the walk's estimate of the light of the sun's disc.
+
+    It follows from the balance heuristic, as in `share_of_walk`.
 
     Args:
-        density: density of the walk's direction [1/sr].
-        path_m: distance to the surface along it.
+        density: density with which the walk samples the direction [1/sr].
+        path_m: distance to the surface in this direction.
     """
     by_walk = density * np.exp(-scene.scattering * path_m)
     by_connection = 1 / (2 * np.pi * (1 - scene.sun_cosine))
@@ -187,13 +190,13 @@ def share_of_escape(scene, density, path_m):
 
 @njit(cache=True, nogil=True)
 def light_above(scene, from_water, density, path_m, x, y, z):
-    """Returns the radiance just below the surface from a direction: sky, and the sun's disc for walks in water.
+    """Returns the radiance just below the surface from a direction: sky, and the sun's disc for walks in water [cd/m2].
 
     Args:
-        from_water: whether the last vertex is a scattering.
-        density: density of the direction there [1/sr].
-        path_m: distance to the surface.
-        x, y, z: unit direction.
+        from_water: whether the last vertex of the walk is a scattering in the water.
+        density: density with which the direction was sampled at this vertex [1/sr].
+        path_m: distance from the vertex to the surface.
+        x, y, z: unit direction towards the light, in world axes.
     """
     last = scene.sky.shape[0] - 1
     light = 0.0
@@ -219,7 +222,7 @@ def axis_of(scene, k, point):
 
 @njit(cache=True, nogil=True, inline="always")
 def upward_share(scene, kind, direction, guided):
-    """Returns the share of the directions that are sampled upwards among those that are not sampled around a light."""
+    """Returns the share of upward samples among the directions that are not sampled around a lamp or the sun."""
     sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
     return UPWARDS if sunny and kind == 1 and guided > 0 and direction[2] < 0 else 0.0
 

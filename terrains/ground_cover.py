@@ -1,0 +1,197 @@
+"""Materials of generated floors: sand, rubble, reef rock, algae, coral, seagrass and mud, with their structure.
+
+A material is a ramp of colours from dark to bright, and a structure that moves each texel along this ramp: stones with
+dark gaps, cracks, polyps, blades, burrows or shells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from terrains.lattice_noise import Table, cells, fractal_noise, lattice_table, value_noise
+
+GRAINS, STONES, CRACKS, POLYPS, BLADES, BURROWS, SHELLS = range(7)
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Material of a floor.
+
+    Args:
+        dark, medium, bright: albedo as 8-bit RGB at the ends and in the middle of the ramp.
+        structure: one of GRAINS to SHELLS.
+        size_m: distance between the elements of the structure.
+        strength: change along the ramp due to the structure, as a fraction of the ramp.
+        noise: change along the ramp due to noise of all scales, as a fraction of the full range of the noise.
+    """
+
+    dark: Colour
+    medium: Colour
+    bright: Colour
+    structure: int
+    size_m: float
+    strength: float
+    noise: float
+
+
+SAND = Cover((112, 99, 76), (178, 163, 132), (232, 222, 200), SHELLS, 0.11, 0.45, 1.05)
+RUBBLE = Cover((40, 36, 30), (132, 122, 104), (208, 200, 182), STONES, 0.055, 0.75, 0.75)
+ROCK = Cover((44, 38, 34), (122, 106, 92), (196, 180, 158), CRACKS, 0.17, 0.6, 1.0)
+ALGAE = Cover((30, 38, 24), (94, 98, 64), (164, 162, 116), GRAINS, 0.03, 0.3, 1.0)
+CORAL = Cover((92, 58, 48), (168, 118, 90), (236, 204, 172), POLYPS, 0.022, 0.6, 0.8)
+SEAGRASS = Cover((22, 34, 18), (66, 86, 46), (142, 154, 98), BLADES, 0.012, 0.8, 0.7)
+MUD = Cover((58, 52, 44), (112, 102, 88), (164, 154, 138), BURROWS, 0.13, 0.7, 1.15)
+
+#: Four materials of each cover, ordered from low and level to high and steep ground.
+COVERS = {
+    "sand": (SAND, SAND, SAND, SAND),
+    "rubble": (SAND, RUBBLE, RUBBLE, RUBBLE),
+    "rock": (SAND, ROCK, ROCK, ALGAE),
+    "reef": (SAND, RUBBLE, ROCK, CORAL),
+    "seagrass": (SAND, SEAGRASS, SEAGRASS, SEAGRASS),
+    "mud": (MUD, MUD, MUD, RUBBLE),
+}
+#: Cover of each kind of floor if the scenario does not choose one.
+DEFAULT_COVERS = {
+    "flat": "sand",
+    "ripples": "sand",
+    "fractal": "rock",
+    "reef": "reef",
+    "cliffs": "reef",
+    "file": "reef",
+}
+_TONES = 256
+EDGE_M = 0.12  #: size of the largest lobes of the border between two materials
+
+
+def paint(
+    material: NDArray[np.uint8], tone: NDArray[np.uint8], texel_m: float, cover: str, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Returns the colours (rows, cols, 3) uint8 of a floor.
+
+    Args:
+        material: (rows, cols) level that selects the material: its quarters belong to the four materials of the cover,
+            with gradual transitions between them.
+        tone: (rows, cols) noise of all scales with mean 128.
+        texel_m: side of a texel.
+        cover: a key of COVERS.
+        rng: random generator of the structures.
+    """
+    covers = COVERS[cover]
+    ramps = np.stack([_ramp(c) for c in covers])
+    structure = np.array([c.structure for c in covers], np.int64)
+    numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
+    return _paint(material, tone, texel_m, ramps, structure, numbers, lattice_table(rng))
+
+
+def _ramp(cover: Cover) -> NDArray[np.float32]:
+    """Returns the colours (256, 3) of a material from dark to bright."""
+    tones = np.linspace(0.0, 1.0, _TONES)
+    bands = zip(cover.dark, cover.medium, cover.bright, strict=True)
+    return np.stack([np.interp(tones, (0.0, 0.5, 1.0), band) for band in bands], axis=1).astype(np.float32)
+
+
+@njit(cache=True)
+def _paint(
+    material: NDArray[np.uint8],
+    tone: NDArray[np.uint8],
+    texel_m: float,
+    ramps: NDArray[np.float32],
+    structure: NDArray[np.int64],
+    numbers: NDArray[np.float64],
+    table: Table,
+) -> NDArray[np.uint8]:  # pragma: no cover (compiled)
+    """Returns the colours (rows, cols, 3); for the arguments see `paint` and `Cover`."""
+    rows, cols = material.shape
+    alike = [bool(np.all(ramps[k] == ramps[k + 1])) for k in range(3)]
+    colour = np.empty((rows, cols, 3), np.uint8)
+    for r in range(rows):
+        for c in range(cols):
+            noise = (tone[r, c] - 128.0) / 256.0
+            x, y = c * texel_m, r * texel_m
+            level = material[r, c] / 64.0 - 0.5  # 0, 1, 2, 3: nothing but one of the materials
+            k = int(min(max(np.floor(level), 0.0), 2.0))
+            if not alike[k]:
+                level += 0.22 * fractal_noise(x / EDGE_M, y / EDGE_M, 3, table, 9)
+                level = min(max(level, float(k)), k + 1.0)
+            share = min(max((level - k - 0.35) / 0.3, 0.0), 1.0)
+            share = 0.0 if alike[k] else share * share * (3.0 - 2.0 * share)
+            first = 0.5 + numbers[k, 2] * noise
+            second = 0.5 + numbers[k + 1, 2] * noise
+            if share < 1.0:
+                first += numbers[k, 1] * _structure(structure[k], x, y, numbers[k, 0], table)
+            if share > 0.0:
+                second += numbers[k + 1, 1] * _structure(structure[k + 1], x, y, numbers[k + 1, 0], table)
+            one = ramps[k, int(min(max(first, 0.0), 1.0) * 255.0)]
+            two = ramps[k + 1, int(min(max(second, 0.0), 1.0) * 255.0)]
+            for band in range(3):
+                colour[r, c, band] = np.uint8((1.0 - share) * one[band] + share * two[band] + 0.5)
+    return colour
+
+
+@njit(cache=True)
+def _structure(kind: int, x: float, y: float, size: float, table: Table) -> float:  # pragma: no cover (compiled)
+    """Returns the change along the ramp, about -1 to 1, due to a structure at the point (x, y) [m].
+
+    Args:
+        kind: one of GRAINS to SHELLS.
+        x, y: position [m].
+        size: distance between the elements of the structure [m].
+        table: random numbers of the noise, see `lattice_table`.
+    """
+    if kind == GRAINS:
+        return fractal_noise(x / size, y / size, 3, table, 0)
+    if kind == BLADES:
+        return _blades(x / size, y / size, table)
+    if kind == CRACKS:
+        ridge = abs(fractal_noise(x / size, y / size, 4, table, 0))
+        pits = max(fractal_noise(6.0 * x / size, 6.0 * y / size, 2, table, 3) - 0.35, 0.0)
+        crust = fractal_noise(0.4 * x / size, 0.4 * y / size, 3, table, 4)
+        return 0.55 * crust - 0.6 * (1.0 - min(ridge / 0.1, 1.0)) - 0.9 * pits
+    u, v = x / size, y / size
+    if kind in (STONES, POLYPS):  # irregular outlines
+        u += 0.3 * fractal_noise(2.0 * x / size, 2.0 * y / size, 1, table, 5)
+        v += 0.3 * fractal_noise(2.0 * x / size, 2.0 * y / size, 1, table, 6)
+    nearest, second, own = cells(u, v, table, 0)
+    if kind == STONES:
+        gap = min((second - nearest) / 0.25, 1.0)
+        buried = fractal_noise(0.35 * x / size, 0.35 * y / size, 2, table, 7)
+        return (
+            0.9 * (own - 0.5) + 0.3 * (0.4 - nearest) - 0.8 * (1.0 - gap) ** 2 * min(max(1.0 + 1.5 * buried, 0.3), 1.3)
+        )
+    if kind == POLYPS:
+        colony = cells(u / 12.0, v / 12.0, table, 2)
+        edge = 1.0 - min((colony[1] - colony[0]) / 0.08, 1.0)
+        return 0.9 * (colony[2] - 0.5) + 0.9 * (0.35 - nearest) - 0.9 * edge
+    radius = 0.04 + 0.08 * own * own  # burrows and shells, in units of the distance between them
+    if kind == BURROWS:
+        return -1.0 * _soft(radius - nearest, 0.03) + 0.35 * _soft(2.4 * radius - nearest, 0.08) if own < 0.7 else 0.0
+    return (0.9 if own < 0.3 else -0.5) * _soft(0.5 * radius - nearest, 0.02) if own < 0.5 else 0.0
+
+
+@njit(cache=True)
+def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (compiled)
+    """Returns the change along the ramp at (x, y) due to crossing blades of seagrass in three layers, dark in between.
+
+    x and y are in units of the width of a blade."""
+    x += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 0)
+    y += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 1)
+    tone = -1.0
+    for layer in range(3):
+        angle = 0.4 + (layer - 1) * 0.75
+        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+        stroke = value_noise(along / 14.0 + 0.37 * np.floor(across), across, table, 11 + layer)
+        density = 0.25 * fractal_noise(x / 60.0, y / 60.0, 2, table, 21)
+        tone = max(tone, 2.0 * (stroke - 0.66 + density) - 0.12 * layer)
+    return min(tone, 0.6)
+
+
+@njit(cache=True)
+def _soft(inside: float, width: float) -> float:  # pragma: no cover (compiled)
+    """Returns 0 outside and 1 inside a spot, given the distance inwards from its edge and the width of the edge."""
+    return min(max(inside / width + 0.5, 0.0), 1.0)

@@ -1,0 +1,1 @@
+"""Objects on the sea floor: their meshes, levels of detail and positions."""

@@ -1,0 +1,83 @@
+"""Levels of detail of a mesh, by clustering of vertices (Rossignac & Borrel 1993).
+
+The vertices of each cell of a cubic grid become one vertex, their mean; triangles with two corners in one cell vanish.
+No point of the surface moves by more than the diagonal of a cell, so the cell bounds the error of a level. Colours are
+averaged over a cell too, which filters them as a mip-map filters a texture.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.mesh import Mesh
+
+FEWEST_FACES = 64  #: a level with fewer triangles is the last one
+
+
+class Level(NamedTuple):
+    """One level of detail.
+
+    Args:
+        mesh: the mesh.
+        cell_m: side of the cells in which vertices were merged; 0 for the full mesh.
+    """
+
+    mesh: Mesh
+    cell_m: float
+
+
+def levels_of(mesh: Mesh) -> tuple[Level, ...]:
+    """Returns the levels of detail, finest first; from level to level, the cells grow by a factor of sqrt(2).
+
+    The first level is the full mesh; the side of the cells of the second is the median edge length of the full mesh.
+    """
+    corners = mesh.vertices_m[mesh.faces]
+    cell_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    levels = [Level(mesh, 0.0)]
+    while len(levels[-1].mesh.faces) > FEWEST_FACES:
+        coarser = clustered(mesh, cell_m)
+        if len(coarser.faces) == 0:
+            break
+        if len(coarser.faces) < len(levels[-1].mesh.faces):
+            levels.append(Level(coarser, cell_m))
+        cell_m *= np.sqrt(2)
+    return tuple(levels)
+
+
+def clustered(mesh: Mesh, cell_m: float) -> Mesh:
+    """Returns the mesh with the vertices of each cubic cell of side `cell_m` merged to their mean."""
+    cells = np.floor((mesh.vertices_m - mesh.vertices_m.min(axis=0)) / cell_m).astype(np.int64)
+    _, vertex_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
+    faces = vertex_of[mesh.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    _, kept = np.unique(_numbers(_smallest_first(faces)), return_index=True)
+    faces = faces[np.sort(kept)]
+    positions = _means(mesh.vertices_m, vertex_of, count)
+    colours = _means(mesh.colours, vertex_of, count)
+    return Mesh(positions.astype(np.float32), faces.astype(np.int32), np.rint(colours).astype(np.uint8))
+
+
+def _smallest_first(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns the faces (m, 3) with their smallest vertex number first, in the same cyclic order."""
+    return np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+
+
+def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns a number (n,) for each triple (n, 3) of integers >= 0, the same for equal triples only."""
+    size = triples.max(axis=0, initial=0) + 1
+    return (triples[:, 0] * size[1] + triples[:, 1]) * size[2] + triples[:, 2]
+
+
+def _means(values: NDArray[np.floating | np.integer], group: NDArray[np.int64], count: NDArray[np.int64]):
+    """Returns the mean (k, 3) of the values (n, 3) of each group.
+
+    Args:
+        values: (n, 3) values.
+        group: (n,) number of the group of each value, from 0.
+        count: (k,) number of values in each group.
+    """
+    return np.stack([np.bincount(group, column, len(count)) / count for column in values.T.astype(np.float64)], axis=1)

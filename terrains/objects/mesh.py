@@ -1,0 +1,82 @@
+"""Triangle meshes with one colour per vertex: the form of all objects, whether built in or read from a file."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class Mesh(NamedTuple):
+    """Triangles with one colour per vertex, counter-clockwise as seen from outside.
+
+    Args:
+        vertices_m: (n, 3) float32 positions in the axes of the object, z up.
+        faces: (m, 3) int32 vertex numbers.
+        colours: (n, 3) uint8 albedo, 255 = white.
+    """
+
+    vertices_m: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colours: NDArray[np.uint8]
+
+
+def mesh_of(vertices_m: ArrayLike, faces: ArrayLike, albedo: ArrayLike) -> Mesh:
+    """Returns a mesh, with its albedo as 8-bit colours.
+
+    Args:
+        vertices_m: (n, 3) positions.
+        faces: (m, 3) vertex numbers.
+        albedo: (3,) or (n, 3) albedo from 0 to 1, limited to this range.
+    """
+    vertices = np.asarray(vertices_m, np.float64)
+    colours = np.broadcast_to(np.clip(np.asarray(albedo, np.float64), 0, 1) * 255, vertices.shape)
+    return Mesh(
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        np.ascontiguousarray(np.rint(colours), np.uint8),
+    )
+
+
+def joined(meshes: list[Mesh]) -> Mesh:
+    """Returns one mesh of all triangles of several meshes."""
+    first = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(k) for mesh, k in zip(meshes, first, strict=False)]
+    return Mesh(
+        np.concatenate([mesh.vertices_m for mesh in meshes]),
+        np.concatenate(faces).astype(np.int32),
+        np.concatenate([mesh.colours for mesh in meshes]),
+    )
+
+
+def standing(mesh: Mesh) -> Mesh:
+    """Returns the mesh moved so that its lowest point has z = 0, and the centre of its extent in x and y is 0."""
+    low, high = extent(mesh)
+    origin = np.append((low + high)[:2] / 2, low[2])
+    return mesh._replace(vertices_m=(mesh.vertices_m - origin).astype(np.float32))
+
+
+def welded_faces(mesh: Mesh) -> NDArray[np.int64]:
+    """Returns the faces (k, 3) with equal positions as one vertex, without faces in which two corners coincide."""
+    _, corner = np.unique(mesh.vertices_m, axis=0, return_inverse=True)
+    faces = corner.ravel()[mesh.faces].astype(np.int64)
+    a, b, c = faces.T
+    return faces[(a != b) & (b != c) & (c != a)]
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Returns whether a mesh encloses a volume and all its triangles face outwards, so that back faces are hidden."""
+    faces, n = welded_faces(mesh), len(mesh.vertices_m)
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    there, back = np.sort(start * n + end), np.sort(end * n + start)
+    a, b, c = np.moveaxis(mesh.vertices_m[mesh.faces].astype(np.float64), 1, 0)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c))
+    return bool((there[1:] != there[:-1]).all() and np.array_equal(there, back) and volume > 0)
+
+
+def extent(mesh: Mesh) -> tuple[Array, Array]:
+    """Returns the minimum and maximum corner (3,) of the bounding box [m]."""
+    return mesh.vertices_m.min(axis=0).astype(np.float64), mesh.vertices_m.max(axis=0).astype(np.float64)

@@ -1,0 +1,163 @@
+"""Meshes from files: PLY, OBJ and GLB, with the colours of their vertices or their texture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.mesh import Mesh, joined, welded_faces
+from terrains.objects.mesh_header import FORMATS, face_count
+from twin.core.paths import is_file
+from twin.errors import TwinError
+
+MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
+MAX_BYTES = 500_000_000  #: largest file that is read
+TEXTURED_FACES = 200_000  #: triangles into which a textured mesh is divided, so that vertices sample its texture
+LARGEST_M = 1000.0
+
+Array = NDArray[np.float64]
+
+
+def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
+    """Returns the mesh of a file, in the unit of the file.
+
+    A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles. A texture is
+    sampled at the vertices, after the triangles have been divided.
+
+    Args:
+        file: path of a PLY, OBJ or GLB file.
+        field: scenario key of the file, for error messages.
+        albedo: albedo of a mesh without colours, 0 to 1.
+        y_up: whether y of the file points up, instead of z.
+    Raises:
+        TwinError: the file is missing, unreadable, empty, too large or not a manifold mesh.
+    """
+    if not is_file(file):
+        raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
+    _check_size(file, field)
+    try:
+        parts = [_coloured(part, albedo) for part in _parts(_loaded(file))]
+    except MemoryError:
+        raise
+    except Exception as error:  # trimesh raises any of many types for a damaged file
+        reason = " ".join(str(error).split())[:200]
+        raise TwinError(field, f"{file.name!r} cannot be read: {type(error).__name__}: {reason}", FORMATS) from error
+    mesh = _joined([part for part in parts if len(part.faces)])
+    _check(mesh, file, field)
+    return mesh._replace(vertices_m=mesh.vertices_m @ _Z_FROM_Y_UP.T) if y_up else mesh
+
+
+_Z_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
+
+
+def _check_size(file: Path, field: str) -> None:
+    """Raises TwinError if the file or the number of triangles that it declares is too large."""
+    try:
+        n_bytes = file.stat().st_size
+        n_faces = 0 if n_bytes > MAX_BYTES else face_count(file)
+    except (OSError, ValueError) as error:
+        raise TwinError(field, f"{file.name!r} {error}", FORMATS) from error
+    if n_bytes > MAX_BYTES:
+        raise TwinError(field, f"{file.name!r} has {n_bytes} bytes", f"at most {MAX_BYTES} bytes")
+    if n_faces > MAX_FACES:
+        raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
+
+
+def _loaded(file: Path) -> Any:
+    """Returns the trimesh scene or mesh of a file."""
+    import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
+
+    return trimesh.load(file, process=False)
+
+
+def _parts(loaded: Any) -> list[Any]:
+    """Returns the triangle meshes of a trimesh scene or mesh, in the axes of the file."""
+    import trimesh
+
+    if isinstance(loaded, trimesh.Scene):
+        loaded = loaded.dump()
+    parts = loaded if isinstance(loaded, list | tuple) else [loaded]
+    return [part for part in parts if isinstance(part, trimesh.Trimesh)]
+
+
+def _coloured(part: Any, albedo: tuple[float, float, float]) -> Mesh:
+    """Returns a mesh with the texture or vertex colours of a trimesh mesh; with `albedo` if it has neither."""
+    from trimesh.visual import TextureVisuals
+
+    colours = np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3))
+    if isinstance(part.visual, TextureVisuals):
+        textured = _textured(part)
+        if textured is not None:
+            return textured
+    elif part.visual.defined:
+        colours = np.asarray(part.visual.vertex_colors)[:, :3]
+    return _mesh(part.vertices, part.faces, colours)
+
+
+def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
+    return Mesh(
+        np.ascontiguousarray(vertices, np.float32),
+        np.ascontiguousarray(faces, np.int32),
+        np.ascontiguousarray(colours, np.uint8),
+    )
+
+
+def _textured(part: Any) -> Mesh | None:
+    """Returns a trimesh mesh with the colours of its texture at its vertices.
+
+    All triangles are divided into four as long as there are at most TEXTURED_FACES. Returns None if the mesh has no
+    texture image or no texture coordinates.
+    """
+    import trimesh
+
+    material, uv = part.visual.material, part.visual.uv
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is None or uv is None or len(uv) != len(part.vertices):
+        return None
+    divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
+    while 0 < len(divided[1]) * 4 <= TEXTURED_FACES:
+        divided = trimesh.remesh.subdivide(*divided[:2], vertex_attributes=divided[2])
+    vertices, faces, attributes = divided
+    return _mesh(vertices, faces, _sampled(np.asarray(image.convert("RGB")), attributes["uv"]))
+
+
+def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
+    """Returns the colours (n, 3) of an image (h, w, 3) at texture coordinates (n, 2), repeated beyond 0 to 1."""
+    height, width = image.shape[:2]
+    col = np.floor((uv[:, 0] % 1.0) * width).astype(np.int64) % width
+    row = np.floor(((1 - uv[:, 1]) % 1.0) * height).astype(np.int64) % height
+    return image[row, col]
+
+
+def _joined(parts: list[Mesh]) -> Mesh:
+    return joined(parts) if parts else _mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def _check(mesh: Mesh, file: Path, field: str) -> None:
+    """Raises TwinError if a mesh is empty, too large, invalid, without extent or not manifold."""
+    if len(mesh.faces) == 0:
+        raise TwinError(field, f"{file.name!r} has no triangles", FORMATS)
+    if len(mesh.faces) > MAX_FACES:
+        raise TwinError(field, f"{file.name!r} has {len(mesh.faces)} triangles", f"at most {MAX_FACES} triangles")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices_m):
+        raise TwinError(field, f"{file.name!r} has triangles with corners that do not exist", FORMATS)
+    if not np.isfinite(mesh.vertices_m).all():
+        raise TwinError(field, f"{file.name!r} has corners that are not finite", "finite coordinates")
+    if np.ptp(mesh.vertices_m[mesh.faces.ravel()], axis=0).max() == 0:
+        raise TwinError(field, f"{file.name!r} has no extent", "a mesh with an extent")
+    if n_edges := crowded_edges(mesh):
+        raise TwinError(
+            field, f"{file.name!r} is not manifold: {n_edges} edges belong to more than two triangles",
+            "a mesh whose edges belong to one or two triangles each",
+        )  # fmt: skip
+
+
+def crowded_edges(mesh: Mesh) -> int:
+    """Returns the number of edges that belong to more than two triangles; equal positions count as one corner."""
+    faces = welded_faces(mesh)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    _, count = np.unique(edges[:, 0] * (len(mesh.vertices_m) + 1) + edges[:, 1], return_counts=True)
+    return int((count > 2).sum())

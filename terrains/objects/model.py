@@ -1,0 +1,81 @@
+"""Objects ready for rendering: models with levels of detail, and objects placed in the world."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.detail import Level, levels_of
+from terrains.objects.mesh import Mesh, extent, is_closed, standing
+
+Array = NDArray[np.float64]
+
+
+class ObjectModel(NamedTuple):
+    """Shape that several objects share; it stands on the plane z = 0, centred at x = y = 0.
+
+    Args:
+        levels: levels of detail, finest first.
+        low_m, high_m: (3,) corners of the bounding box.
+        centre_m, radius_m: bounding sphere.
+        sways: whether the object bends in the current.
+        closed: whether the mesh encloses a volume, so that only triangles that face the viewer are seen.
+    """
+
+    levels: tuple[Level, ...]
+    low_m: Array
+    high_m: Array
+    centre_m: Array
+    radius_m: float
+    sways: bool = False
+    closed: bool = False
+
+    @property
+    def size_m(self) -> float:
+        """Returns the largest extent along x, y or z [m]."""
+        return float((self.high_m - self.low_m).max())
+
+
+class PlacedObject(NamedTuple):
+    """One object in the world.
+
+    Args:
+        model: shape of the object.
+        world_from_object: (4, 4) pose times scale.
+        scale: size in the world divided by the size of the model.
+        group: number, from 0, of the object's entry in `[[objects]]`.
+        phase: phase of its sway [rad].
+    """
+
+    model: ObjectModel
+    world_from_object: Array
+    scale: float
+    group: int
+    phase: float = 0.0
+
+    @property
+    def centre_m(self) -> Array:
+        """Returns the centre (3,) of the bounding sphere in the world [m]."""
+        return self.world_from_object[:3, :3] @ self.model.centre_m + self.world_from_object[:3, 3]
+
+    @property
+    def radius_m(self) -> float:
+        """Returns the radius of the bounding sphere [m]."""
+        return self.scale * self.model.radius_m
+
+    def corners_m(self) -> Array:
+        """Returns the corners (8, 3) of the bounding box in the world [m]; the box has the axes of the object."""
+        pick = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], bool)
+        corners = np.where(pick, self.model.high_m, self.model.low_m)
+        return corners @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
+
+
+def model_of(mesh: Mesh, sways: bool = False) -> ObjectModel:
+    """Returns the model of a mesh, moved so that it stands at the origin."""
+    mesh = standing(mesh)
+    low, high = extent(mesh)
+    centre = (low + high) / 2
+    radius_m = float(np.linalg.norm(mesh.vertices_m - centre, axis=1).max())
+    return ObjectModel(levels_of(mesh), low, high, centre, radius_m, sways, is_closed(mesh))

@@ -1,0 +1,244 @@
+"""Positions of objects on a floor: one at a given position, or many scattered as a Poisson disc sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.model import ObjectModel, PlacedObject
+from terrains.terrain import Terrain
+from twin.errors import TwinError
+
+Array = NDArray[np.float64]
+
+STEEP_DEG = 15.0  #: sand lies flatter than this, about half its angle of repose
+MAX_SCATTERED = 5000  #: objects of one entry
+SIZE_CUT_SIGMA = 2.0  #: of the logarithm of the size
+TRIES = (8, 64, 512)  #: positions that are tried for one object, batch by batch
+
+
+class Group(Protocol):
+    """Entry of `[[objects]]`: positions and sizes of its objects; see `twin.scenario.model.ObjectConfig`."""
+
+    @property
+    def size_m(self) -> float | None: ...
+    @property
+    def size_spread(self) -> float: ...
+    @property
+    def position_m(self) -> tuple[float, float] | None: ...
+    @property
+    def height_m(self) -> float | None: ...
+    @property
+    def heading_deg(self) -> float | None: ...
+    @property
+    def upright(self) -> bool: ...
+    @property
+    def sunk(self) -> float: ...
+    @property
+    def per_m2(self) -> float | None: ...
+    @property
+    def on(self) -> str: ...
+    @property
+    def area_m(self) -> tuple[float, float] | None: ...
+    @property
+    def centre_m(self) -> tuple[float, float]: ...
+    @property
+    def spacing_m(self) -> float: ...
+
+
+class Disc(NamedTuple):
+    """Circle in the x-y plane that encloses an object [m]."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
+
+
+def place(
+    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject], seed: int
+) -> list[PlacedObject]:
+    """Returns the objects of an entry of `[[objects]]`.
+
+    Args:
+        number: number of the entry, from 0.
+        group: the entry.
+        models: shapes, of which each object has one.
+        terrain: the floor.
+        taken: objects of other entries, which scattered objects do not overlap.
+        seed: seed of the scenario.
+    Raises:
+        TwinError: an object is outside the terrain, or scattered objects are too many or do not fit.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([seed, number]))
+    if group.position_m is not None:
+        model = models[number % len(models)]
+        item = _at(number, group, model, float(_scales(group, [model], rng)[0]), group.position_m, terrain, rng)
+        _check_inside(item, terrain, f"objects.{number}.position_m")
+        return [item]
+    return _scattered(number, group, models, terrain, taken, rng)
+
+
+def disc_of(item: PlacedObject) -> Disc:
+    """Returns the circle in the x-y plane around the bounding box of an object."""
+    corners = item.corners_m()[:, :2]
+    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return Disc(float(centre[0]), float(centre[1]), float(np.linalg.norm(np.ptp(corners, axis=0)) / 2))
+
+
+def slope_deg(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array:
+    """Returns the slope of the floor (n,) [deg] at points, over `reach_m` on each side; NaN at the terrain's edge."""
+    east = terrain.height_at(x_m + reach_m, y_m) - terrain.height_at(x_m - reach_m, y_m)
+    north = terrain.height_at(x_m, y_m + reach_m) - terrain.height_at(x_m, y_m - reach_m)
+    return np.rad2deg(np.arctan(np.hypot(east, north) / (2 * reach_m)))
+
+
+def _scattered(
+    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
+    rng: np.random.Generator,
+) -> list[PlacedObject]:  # fmt: skip
+    """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
+    field = f"objects.{number}.per_m2"
+    low, high = _region(group, terrain)
+    n = _count(group, terrain, low, high, field)
+    chosen = [models[k] for k in rng.integers(0, len(models), n)]
+    scales = _scales(group, chosen, rng)
+    discs = np.array([disc_of(item) for item in taken]).reshape(-1, 3)
+    own = np.zeros((n, 3))
+    items: list[PlacedObject] = []
+    for k in np.argsort([-scale * model.radius_m for scale, model in zip(scales, chosen, strict=True)], kind="stable"):
+        radius_m = float(scales[k]) * float(np.hypot(*(chosen[k].high_m - chosen[k].low_m)[:2]) / 2)
+        around = np.concatenate([discs, own[: len(items)]])
+        position = _free_position(group, terrain, (low + radius_m, high - radius_m), radius_m, around, rng)
+        if position is None:
+            problem = f"only {len(items)} of {n} objects fit without overlap"
+            raise TwinError(field, problem, "fewer or smaller objects, or a larger area")
+        own[len(items)] = [*position, radius_m]
+        items.append(_at(number, group, chosen[k], float(scales[k]), position, terrain, rng))
+    return items
+
+
+def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
+    """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
+    low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
+    if group.area_m is None:
+        return low, high
+    half, centre = np.array(group.area_m) / 2, np.array(group.centre_m)
+    return np.maximum(low, centre - half), np.minimum(high, centre + half)
+
+
+def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) -> int:
+    """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
+
+    Raises TwinError if there are none or too many."""
+    assert group.per_m2 is not None
+    side = np.maximum(high - low, 0)
+    steps = [np.linspace(a, b, 201)[:-1] + (b - a) / 400 for a, b in zip(low, high, strict=True)]
+    x, y = np.meshgrid(*steps)
+    share = float(_on_ground(group, terrain, x, y, terrain.spacing_m).mean())
+    n = round(group.per_m2 * float(side.prod()) * share)
+    if n > MAX_SCATTERED:
+        raise TwinError(field, f"{group.per_m2:g}: {n} objects", f"at most {MAX_SCATTERED} objects")
+    if n == 0:
+        ground = {"anywhere": "of the area", "sand": "of sand", "slopes": "of slopes"}[group.on]
+        raise TwinError(field, f"no object on {side.prod() * share:.2f} m2 {ground}", "more, or another area or ground")
+    return n
+
+
+def _on_ground(group: Group, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
+    """Returns whether the slope of the floor at each point is one on which the objects of a group may stand."""
+    if group.on == "anywhere":
+        return np.isfinite(terrain.height_at(x_m, y_m))
+    slope = slope_deg(terrain, x_m, y_m, reach_m)
+    return slope < STEEP_DEG if group.on == "sand" else slope >= STEEP_DEG
+
+
+def _free_position(
+    group: Group, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
+    rng: np.random.Generator,
+) -> tuple[float, float] | None:  # fmt: skip
+    """Returns a random position (x, y) [m] where an object may stand; None if none is found.
+
+    The circle of the object does not overlap the circles `around` (n, 3): x, y, radius [m]."""
+    if (corners[0] >= corners[1]).any():
+        return None
+    apart = np.maximum(around[:, 2] + radius_m, group.spacing_m)
+    for n in TRIES:
+        points = rng.uniform(*corners, (n, 2))
+        free = (np.hypot(*(points[:, None] - around[:, :2]).T).T >= apart).all(axis=1)
+        free &= _on_ground(group, terrain, points[:, 0], points[:, 1], max(radius_m / 2, terrain.spacing_m))
+        if free.any():
+            x, y = points[free.argmax()]
+            return float(x), float(y)
+    return None
+
+
+def _scales(group: Group, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
+    """Returns the random scale (n,) of each object, its size divided by that of its model in `models` (n)."""
+    z = rng.standard_normal(len(models))
+    factor = np.exp(group.size_spread * np.clip(z, -SIZE_CUT_SIGMA, SIZE_CUT_SIGMA))
+    return np.array([1.0 if group.size_m is None else group.size_m / model.size_m for model in models]) * factor
+
+
+def _at(
+    number: int, group: Group, model: ObjectModel, scale: float, position_m: tuple[float, float], terrain: Terrain,
+    rng: np.random.Generator,
+) -> PlacedObject:  # fmt: skip
+    """Returns an object at a position (x, y) [m].
+
+    Its height, heading and tilt are those of its group; a heading that is not given is random."""
+    x, y = position_m
+    heading, phase = rng.uniform(0, 2 * np.pi, 2)
+    if group.heading_deg is not None:
+        heading = np.deg2rad(group.heading_deg)
+    reach_m = scale * float((model.high_m - model.low_m)[:2].max()) / 4
+    rotation = _rotation(heading)
+    if not group.upright:
+        rotation = _tilt(terrain, x, y, max(reach_m, terrain.spacing_m / 2)) @ rotation
+    if group.height_m is not None:
+        base = np.array([x, y, group.height_m])
+    else:
+        floor_m = _floor_under(terrain, x, y, 0.0 if not group.upright else reach_m)
+        base = np.array([x, y, floor_m]) - rotation[:, 2] * group.sunk * scale * model.high_m[2]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = scale * rotation, base
+    return PlacedObject(model, pose, float(scale), number, float(phase))
+
+
+def _floor_under(terrain: Terrain, x: float, y: float, reach_m: float) -> float:
+    """Returns the lowest height of the floor [m] at a point and at eight points at a distance `reach_m` around it."""
+    angle = np.arange(8) * np.pi / 4
+    heights = terrain.height_at(np.append(x, x + reach_m * np.cos(angle)), np.append(y, y + reach_m * np.sin(angle)))
+    return float(np.nanmin(heights)) if np.isfinite(heights).any() else np.nan
+
+
+def _rotation(heading: float) -> Array:
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _tilt(terrain: Terrain, x: float, y: float, reach_m: float) -> Array:
+    """Returns the rotation (3, 3), about a horizontal axis, that turns the vertical to the normal of the floor."""
+    near = np.array([[reach_m, 0], [-reach_m, 0], [0, reach_m], [0, -reach_m]])
+    east, west, north, south = terrain.height_at(x + near[:, 0], y + near[:, 1])
+    normal = np.nan_to_num(np.array([west - east, south - north, 2 * reach_m]), nan=0.0)
+    normal /= np.linalg.norm(normal)
+    axis = np.array([-normal[1], normal[0], 0.0])
+    skew = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + normal[2])
+
+
+def _check_inside(item: PlacedObject, terrain: Terrain, field: str) -> None:
+    """Raises TwinError if an object is outside the terrain or reaches over its edge."""
+    corners = item.corners_m()
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    inside = low[0] >= terrain.west_m and low[1] >= terrain.south_m
+    if inside and high[0] <= terrain.east_m and high[1] <= terrain.north_m:
+        return
+    extent = f"x {low[0]:.2f} to {high[0]:.2f}, y {low[1]:.2f} to {high[1]:.2f} m"
+    raise TwinError(
+        field, f"the object reaches beyond the terrain: {extent}",
+        f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
+    )  # fmt: skip

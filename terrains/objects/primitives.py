@@ -1,0 +1,133 @@
+"""Surfaces that built-in shapes are made of, and three-dimensional noise for their relief and colour."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+Surface = tuple[Array, Faces]
+
+SPHERE_DIVISIONS = 5  #: of the 20 faces of an icosahedron, each into four: 20,480 triangles
+
+
+def sphere() -> Surface:
+    """Returns vertices (n, 3) and faces (m, 3) of a unit sphere with nearly equal triangles."""
+    import trimesh  # imported here: it takes 0.3 s, and most scenarios have no objects
+
+    ball = trimesh.creation.icosphere(subdivisions=SPHERE_DIVISIONS, radius=1.0)
+    return np.asarray(ball.vertices, np.float64), np.asarray(ball.faces, np.int64)
+
+
+def tube(path: Array, radius: Array, n_sides: int) -> Surface:
+    """Returns a tube with closed ends along a path.
+
+    Args:
+        path: (k, 3) points of the axis, no two consecutive ones equal.
+        radius: (k,) radius at each point.
+        n_sides: number of sides.
+    """
+    tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    across = np.cross(tangent[0], np.eye(3)[np.abs(tangent[0]).argmin()])
+    rings = []
+    for point, along, r in zip(path, tangent, radius, strict=True):
+        across = across - along * (across @ along)  # carried along the path without twist
+        across /= np.linalg.norm(across)
+        angle = 2 * np.pi * np.arange(n_sides) / n_sides
+        rings.append(point + r * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(along, across)))
+    vertices = np.concatenate([*rings, path[:1], path[-1:]])
+    first, last = len(vertices) - 2, len(vertices) - 1
+    faces = ring_faces(len(path), n_sides)
+    side = np.arange(n_sides)
+    begin, end = side, (len(path) - 1) * n_sides + side
+    caps = [
+        np.stack([np.full(n_sides, first), np.roll(begin, -1), begin], axis=1),
+        np.stack([np.full(n_sides, last), end, np.roll(end, -1)], axis=1),
+    ]
+    return vertices, np.concatenate([faces, *caps])
+
+
+def ring_faces(n_rings: int, n_sides: int, closed: bool = False) -> Faces:
+    """Returns the triangles (m, 3) between consecutive rings of vertices, which are numbered ring by ring.
+
+    With `closed`, there are triangles between the last and the first ring too."""
+    ring = np.arange(n_rings * n_sides).reshape(n_rings, n_sides)
+    upper = np.roll(ring, -1, axis=0) if closed else ring[1:]
+    lower = ring if closed else ring[:-1]
+    right, upper_right = np.roll(lower, -1, axis=1), np.roll(upper, -1, axis=1)
+    return np.stack([lower, right, upper_right, lower, upper_right, upper], axis=-1).reshape(-1, 3)
+
+
+def turned(profile: Array, n_sides: int) -> Surface:
+    """Returns a surface of revolution about z.
+
+    Args:
+        profile: (k, 2) radius and height along a closed outline, counter-clockwise with the radius to the right, all
+            radii positive.
+        n_sides: number of sides.
+    """
+    angle = 2 * np.pi * np.arange(n_sides) / n_sides
+    radius, height = profile[:, :1], profile[:, 1:]
+    rings = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.repeat(height, n_sides, axis=1)], axis=-1)
+    return rings.reshape(-1, 3), ring_faces(len(profile), n_sides, closed=True)
+
+
+def resampled(outline: Array, n: int) -> Array:
+    """Returns n points (n, 2) at equal distances along a closed outline (k, 2)."""
+    closed = np.concatenate([outline, outline[:1]])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    at = np.arange(n) / n * along[-1]
+    return np.stack([np.interp(at, along, closed[:, k]) for k in range(2)], axis=1)
+
+
+def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
+    """Returns a box with its centre at the origin, each side divided into cells.
+
+    Args:
+        size: extents along x, y and z.
+        n: number of cells along x, y and z.
+    """
+    parts, faces, count = [], [], 0
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        a, b = np.meshgrid(np.linspace(-0.5, 0.5, n[i] + 1), np.linspace(-0.5, 0.5, n[j] + 1), indexing="ij")
+        for end in (-0.5, 0.5):
+            points = np.empty((*a.shape, 3))
+            points[..., i], points[..., j], points[..., axis] = a * size[i], b * size[j], end * size[axis]
+            node = count + np.arange(a.size).reshape(a.shape)
+            quads = [node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]]
+            p, q, r, s = quads if end > 0 else quads[::-1]
+            faces.append(np.stack([p, q, r, p, r, s], axis=-1).reshape(-1, 3))
+            parts.append(points.reshape(-1, 3))
+            count += a.size
+    return np.concatenate(parts), np.concatenate(faces)
+
+
+def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator, gain: float = 0.5) -> Array:
+    """Returns smooth random values (n,) at points (n, 3), with standard deviation 1.
+
+    Each octave is a sum of plane waves with random directions and phases; octave k has the wavelength coarsest / 2^k
+    and the amplitude gain^k.
+    """
+    total, power = np.zeros(len(points)), 0.0
+    for k in range(octaves):
+        waves = rng.standard_normal((WAVES, 3))
+        waves *= 2 * np.pi * 2.0**k / coarsest / np.linalg.norm(waves, axis=1, keepdims=True)
+        phase = rng.uniform(0, 2 * np.pi, WAVES)
+        angle = (points @ waves.T + phase).astype(np.float32)  # the cosine of single precision is three times faster
+        total += gain**k * np.sqrt(2 / WAVES) * np.cos(angle).sum(axis=1)
+        power += gain ** (2 * k)
+    return total / np.sqrt(power)
+
+
+WAVES = 20  #: plane waves per octave of noise
+
+
+def mottled(albedo: Array, points: Array, contrast: float, rng: np.random.Generator) -> Array:
+    """Returns a random albedo (n, 3) at points (n, 3).
+
+    Its mean is `albedo`, (3,) or (n, 3), and its relative standard deviation about `contrast`."""
+    values = 0.7 * noise(points, 0.25, 4, rng, gain=0.8) + 0.7 * rng.standard_normal(len(points))
+    return albedo * np.exp(contrast * values - contrast**2 / 2)[:, None]

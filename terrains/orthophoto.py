@@ -1,0 +1,139 @@
+"""Texture from an orthophoto: a GeoTIFF with its own coordinate reference system (CRS), resolution and extent."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.crs import CRS
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
+from rasterio.transform import Affine, array_bounds
+from rasterio.vrt import WarpedVRT
+from rasterio.warp import transform_bounds
+
+from terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count
+from twin.core.georeference import Georeference
+from twin.errors import TwinError
+
+_FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
+_MAX_SHARP = 16  #: an orthophoto may be this many times finer than the texels along each axis
+
+
+def lay_orthophoto(
+    texture: NDArray[np.uint8], file: Path, extent_m: tuple[float, float], georeference: Georeference | None
+) -> float:
+    """Replaces the texture of a floor by an orthophoto wherever the orthophoto has valid pixels.
+
+    The orthophoto is transformed to the CRS of the DEM. An orthophoto without a CRS has the coordinates of the DEM.
+    Coarse pixels are interpolated, fine ones averaged over a texel.
+
+    Args:
+        texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
+        file: the orthophoto.
+        extent_m: extent of the floor along x and y; its centre is the origin of the scene.
+        georeference: position of the scene in the CRS of the DEM.
+    Returns:
+        Share of the texels that the orthophoto covers.
+    Raises:
+        TwinError: the DEM has no coordinates, or the orthophoto is missing, invalid, too large or does not overlap
+            the DEM.
+    """
+    if georeference is None:
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be placed: the DEM has no coordinates",
+                        "terrain.texture_file, or a GeoTIFF with coordinates as terrain.height_file")  # fmt: skip
+    if not file.is_file():
+        raise TwinError(ORTHOPHOTO_FIELD, f"no such file {str(file)!r}", _FORMATS)
+    grid = _texel_grid(texture.shape[:2], extent_m, georeference)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", NotGeoreferencedWarning)
+            with rasterio.open(file) as source:
+                colour, covered = _read(source, file, grid, texture.shape[:2], georeference)
+    except NotGeoreferencedWarning as error:
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has no coordinates",
+                        "a GeoTIFF with coordinates; terrain.texture_file for a plain image") from error  # fmt: skip
+    except (RasterioError, OSError, CRSError) as error:
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be read: {error}", _FORMATS) from error
+    texture[covered] = colour[covered]
+    return float(covered.mean())
+
+
+def _texel_grid(shape: tuple[int, ...], extent_m: tuple[float, float], georeference: Georeference) -> Affine:
+    """Returns the affine transformation from (column, row) of the texture to easting and northing in the CRS."""
+    west, north = georeference.from_scene(-extent_m[0] / 2, extent_m[1] / 2)
+    unit_m = georeference.metres_per_unit
+    width, height = extent_m[0] / unit_m / shape[1], extent_m[1] / unit_m / shape[0]
+    return Affine(width, 0.0, float(west), 0.0, -height, float(north))
+
+
+def _read(
+    source: rasterio.DatasetReader,
+    file: Path,
+    grid: Affine,
+    shape: tuple[int, ...],
+    georeference: Georeference,
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Returns the colours (rows, cols, 3) of an orthophoto at texels, and whether each texel (rows, cols) is valid."""
+    bands = _colour_bands(source, file)
+    floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
+    if source.crs is not None and floor_crs is None:
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is in {_name(source.crs)}, but the DEM names no CRS",
+                        "a DEM with a CRS, or an orthophoto without one in the coordinates of the DEM")  # fmt: skip
+    target = floor_crs or CRS.from_epsg(3857)  # without any CRS both are in the same plane; its name has no effect
+    _check_overlap(source, file, target, array_bounds(shape[0], shape[1], grid))
+    _check_resolution(source, file, target, grid)
+    with WarpedVRT(
+        source, src_crs=source.crs or target, crs=target, transform=grid, width=shape[1], height=shape[0],
+        resampling=Resampling.average if _finer(source, target, grid) > 1.5 else Resampling.bilinear, add_alpha=True,
+    ) as warped:  # fmt: skip
+        values = warped.read(bands)
+        covered = warped.dataset_mask() > 0
+    if values.dtype == np.uint16:
+        values = np.rint(values / 257.0)
+    colour = np.moveaxis(values.astype(np.uint8), 0, 2)
+    return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered
+
+
+def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
+    """Returns the numbers of the grey band, or of the red, green and blue bands; checks count and type of the bands."""
+    kinds = {source.dtypes[k - 1] for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha}
+    colours = [k for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha]
+    if not kinds <= {"uint8", "uint16"} or len(kinds) != 1 or len(colours) not in (1, 3):
+        found = f"{source.count} band(s) of {', '.join(sorted(set(source.dtypes)))}"
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is not an orthophoto: {found}", _FORMATS)
+    return colours
+
+
+def _check_overlap(
+    source: rasterio.DatasetReader, file: Path, target: CRS, floor: tuple[float, float, float, float]
+) -> None:
+    """Raises TwinError if an orthophoto does not overlap the floor (west, south, east, north) in the target CRS."""
+    west, south, east, north = transform_bounds(source.crs or target, target, *source.bounds)
+    if west < floor[2] and east > floor[0] and south < floor[3] and north > floor[1]:
+        return
+    raise TwinError(
+        ORTHOPHOTO_FIELD,
+        f"{file.name!r} does not overlap the DEM: it covers E {west:.1f} to {east:.1f}, N {south:.1f} to {north:.1f}",
+        f"one that overlaps E {floor[0]:.1f} to {floor[2]:.1f}, N {floor[1]:.1f} to {floor[3]:.1f}",
+    )
+
+
+def _check_resolution(source: rasterio.DatasetReader, file: Path, target: CRS, grid: Affine) -> None:
+    """Raises TwinError if an orthophoto has too many pixels and is much finer than the texels."""
+    if _finer(source, target, grid) > _MAX_SHARP:
+        check_texel_count(source.width, source.height, file, ORTHOPHOTO_FIELD)
+
+
+def _finer(source: rasterio.DatasetReader, target: CRS, grid: Affine) -> float:
+    """Returns the number of pixels of an orthophoto along the side of one texel."""
+    west, _, east, _ = transform_bounds(source.crs or target, target, *source.bounds)
+    return grid.a / ((east - west) / source.width)
+
+
+def _name(crs: CRS) -> str:
+    """Returns the short name of a CRS, e.g. EPSG:32755."""
+    return crs.to_string() if crs.to_epsg() else "a CRS of its own"

@@ -1,0 +1,179 @@
+"""Textures without visible repetition from one photo: image quilting.
+
+The photo is cut into overlapping square blocks that are laid in rows. Each block is taken from a random place of the
+photo where the overlap agrees well with the blocks that are already laid, and is joined along the path of least
+difference through the overlap (Efros & Freeman 2001, Image quilting for texture synthesis and transfer, sec. 2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+BLOCK_FRACTION = 5  #: side of a block: this part of the shorter side of the photo
+OVERLAP_FRACTION = 4  #: overlap of neighbouring blocks: this part of the side of a block
+CANDIDATES = 60  #: random places of the photo that are compared for each block
+TOLERANCE = 1.2  #: places whose difference is at most this factor above the least one are equally likely
+MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
+
+
+def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Removes slow variations of brightness from a photo of a floor; its mean brightness remains.
+
+    The photo is divided by a polynomial of degree 2 in row and column, fitted to its brightness by least squares.
+
+    Args:
+        photo: (h, w, 3) uint8 RGB.
+    Returns:
+        (h, w, 3) uint8.
+    """
+    grey = photo.mean(axis=2, dtype=np.float32)
+    mean = float(grey.mean())
+    if mean == 0.0:
+        return photo
+    v, u = np.meshgrid(*(np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in grey.shape), indexing="ij")
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+    coefficients = np.linalg.lstsq(terms.reshape(-1, 6), grey.ravel(), rcond=None)[0]
+    gain = mean / np.maximum(terms @ coefficients, 0.05 * mean)
+    return np.clip(np.rint(photo * gain[..., None]), 0, 255).astype(np.uint8)
+
+
+def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Makes a texture of any size from blocks of a photo, with the scale of the photo.
+
+    A texture that is not larger than the photo is a part of it.
+
+    Args:
+        photo: (h, w, 3) uint8 RGB; h, w >= BLOCK_FRACTION * MIN_BLOCK_PX.
+        shape: (rows, cols) of the texture.
+        rng: random generator of the places in the photo that blocks are taken from.
+    Returns:
+        (rows, cols, 3) uint8 RGB.
+    """
+    rows, cols = shape
+    if rows <= photo.shape[0] and cols <= photo.shape[1]:
+        return np.ascontiguousarray(photo[:rows, :cols])
+    side = min(photo.shape[:2]) // BLOCK_FRACTION
+    overlap = side // OVERLAP_FRACTION
+    step = side - overlap
+    n_rows, n_cols = (-(-max(n - overlap, 1) // step) for n in shape)
+    texture = np.zeros((n_rows * step + overlap, n_cols * step + overlap, 3), np.uint8)
+    places = rng.integers(0, 2**31, (n_rows, n_cols, CANDIDATES, 2)).astype(np.int64)
+    places %= np.array([photo.shape[0] - side + 1, photo.shape[1] - side + 1])
+    _lay(texture, np.ascontiguousarray(photo), side, overlap, places, rng.random((n_rows, n_cols)))
+    return np.ascontiguousarray(texture[:rows, :cols])
+
+
+@njit(cache=True)
+def _lay(
+    texture: NDArray[np.uint8],
+    photo: NDArray[np.uint8],
+    side: int,
+    overlap: int,
+    places: NDArray[np.int64],
+    draws: NDArray[np.float64],
+) -> None:  # pragma: no cover (compiled)
+    """Fills a texture with blocks, in rows from the north-west corner.
+
+    Args:
+        texture: (n_rows * step + overlap, n_cols * step + overlap, 3) result, step = side - overlap.
+        photo: (h, w, 3) source.
+        side: rows and columns of a block.
+        overlap: rows or columns that neighbouring blocks share.
+        places: (n_rows, n_cols, k, 2) row and column of the upper left corner of the k candidates of each block.
+        draws: (n_rows, n_cols) uniform random numbers that choose among the acceptable candidates.
+    """
+    step = side - overlap
+    n_rows, n_cols, n_places = places.shape[:3]
+    difference = np.empty(n_places, np.float64)
+    for i in range(n_rows):
+        for j in range(n_cols):
+            target = texture[i * step : i * step + side, j * step : j * step + side]
+            for k in range(n_places):
+                r, c = places[i, j, k]
+                difference[k] = _difference(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
+            limit = difference.min() * TOLERANCE
+            wanted = int(draws[i, j] * (difference <= limit).sum())
+            chosen = 0
+            for k in range(n_places):
+                if difference[k] <= limit:
+                    if wanted == 0:
+                        chosen = k
+                        break
+                    wanted -= 1
+            r, c = places[i, j, chosen]
+            _join(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
+
+
+@njit(cache=True)
+def _difference(
+    target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
+) -> float:  # pragma: no cover (compiled)
+    """Returns the sum of squared differences of block and target over the overlaps with the blocks above and left.
+
+    Only every second pixel of every second row is used.
+    """
+    side, total = target.shape[0], 0.0
+    if above:
+        for r in range(0, overlap, 2):
+            for c in range(0, side, 2):
+                total += _squared(target[r, c], block[r, c])
+    if left:
+        for r in range(overlap if above else 0, side, 2):
+            for c in range(0, overlap, 2):
+                total += _squared(target[r, c], block[r, c])
+    return total
+
+
+@njit(cache=True)
+def _squared(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:  # pragma: no cover (compiled)
+    """Returns the squared distance of two colours."""
+    d0, d1, d2 = float(a[0]) - b[0], float(a[1]) - b[1], float(a[2]) - b[2]
+    return d0 * d0 + d1 * d1 + d2 * d2
+
+
+@njit(cache=True)
+def _join(
+    target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
+) -> None:  # pragma: no cover (compiled)
+    """Copies the part of a block (side, side, 3) beyond the cuts through its overlaps onto the target.
+
+    Block and target are blended over 3 px along the cuts.
+    """
+    side = target.shape[0]
+    upper, west = np.full(side, -2.0), np.full(side, -2.0)
+    cost = np.empty((side, overlap))
+    if above:
+        for c in range(side):
+            for r in range(overlap):
+                cost[c, r] = _squared(target[r, c], block[r, c])
+        upper = _cheapest_path(cost)
+    if left:
+        for r in range(side):
+            for c in range(overlap):
+                cost[r, c] = _squared(target[r, c], block[r, c])
+        west = _cheapest_path(cost)
+    for r in range(side):
+        for c in range(side):
+            weight = min(max((r - upper[c]) / 3.0 + 0.5, 0.0), 1.0) * min(max((c - west[r]) / 3.0 + 0.5, 0.0), 1.0)
+            for k in range(3):
+                target[r, c, k] = np.uint8(round(weight * block[r, c, k] + (1.0 - weight) * target[r, c, k]))
+
+
+@njit(cache=True)
+def _cheapest_path(cost: NDArray[np.float64]) -> NDArray[np.float64]:  # pragma: no cover (compiled)
+    """Returns the connected path through all rows of costs (n, m) with the least sum: its column (n,) in each row."""
+    n, m = cost.shape
+    total = cost.copy()
+    for i in range(1, n):
+        for j in range(m):
+            total[i, j] += total[i - 1, max(j - 1, 0) : min(j + 2, m)].min()
+    path = np.empty(n)
+    j = int(np.argmin(total[n - 1]))
+    path[n - 1] = j
+    for i in range(n - 2, -1, -1):
+        low = max(j - 1, 0)
+        j = low + int(np.argmin(total[i, low : min(j + 2, m)]))
+        path[i] = j
+    return path

@@ -1,0 +1,350 @@
+"""Recorded data sets: readers, calibration files, rectification, images, and input that is damaged or hostile."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import recorded_datasets as recorded
+from recorded_datasets import RIG
+
+from twin.core import geometry
+from twin.core.records import Frame
+from twin.datasets import readers
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
+from twin.datasets.calibration_files import read_calibration
+from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
+from twin.datasets.frames import RecordedFrames
+from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, read_rgb
+from twin.datasets.readers import read_dataset
+from twin.datasets.rectification import rectification
+from twin.datasets.truth_files import read_truth
+from twin.errors import TwinError
+from twin.exchange.euroc import EurocWriter
+
+RNG = np.random.default_rng(1)
+GRAY = cv2.GaussianBlur(RNG.integers(0, 255, (RIG.height_px, RIG.width_px), np.uint8), (0, 0), 1.5)
+
+
+def rgb(value):
+    return np.full((RIG.height_px, RIG.width_px, 3), value, np.uint8)
+
+
+def frames_of(n):
+    return [Frame(k, 0.2 * k, rgb(10 * k), rgb(10 * k + 5)) for k in range(n)]
+
+
+@pytest.fixture
+def euroc(tmp_path):
+    writer = EurocWriter(tmp_path / "set", RIG)
+    for frame in frames_of(4):
+        writer.add(frame)
+    writer.add_truth(recorded.trajectory(recorded.poses(4)))
+    return tmp_path / "set"
+
+
+def test_images_of_unequal_times_are_paired_with_the_nearest_one():
+    left = [ImageTime(t, Path(f"l{t}")) for t in (0.0, 0.1, 0.2, 0.3)]
+    right = [ImageTime(t, Path(f"r{t}")) for t in (0.305, 0.004, 0.15, 0.095)]
+    frames, n_right_only = pair_by_time(left, right)
+    assert [frame.right and frame.right.name for frame in frames] == ["r0.004", "r0.095", None, "r0.305"]
+    assert n_right_only == 1
+
+
+@pytest.mark.parametrize("write", [recorded.write_opencv, recorded.write_kalibr, recorded.write_colmap])
+def test_opencv_kalibr_and_colmap_files_give_the_same_calibration(tmp_path, write):
+    name = "cameras.txt" if write is recorded.write_colmap else "calibration.yaml"
+    found = read_calibration(write(tmp_path / name))
+    for camera in (found.left, found.right):
+        assert camera.size_px == (RIG.width_px, RIG.height_px)
+        np.testing.assert_allclose(camera.matrix, RIG.matrix, atol=1e-9)
+        assert not camera.distortion.any()
+    np.testing.assert_allclose(found.right_from_left, geometry.inverse(RIG.left_from_right), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("write", "changed", "message"),
+    [
+        ("opencv", {"T": np.array([0.15, 0, 0])}, "the baseline is negative .* are swapped"),
+        ("opencv", {"T": np.zeros(3)}, "has no baseline"),
+        ("opencv", {"T": None}, "has no baseline"),
+        ("opencv", {"T": np.array([-150.0, 0, 0])}, "the baseline is 150 m .* units are metres"),
+        ("opencv", {"T": np.array([0.0, -0.15, 0])}, "not side by side"),
+        ("opencv", {"M2": None}, "M2 is missing or not valid"),
+        ("opencv", {"M1": -RIG.matrix}, "focal length of the left camera"),
+        ("opencv", {"R": np.eye(3) * 2}, "not a rotation matrix"),
+        ("opencv", {"D1": np.zeros((1, 3))}, "3 coefficients of distortion"),
+        ("opencv", {"image_width": 3}, "image size"),
+        ("kalibr", {"T_cn_cnm1": None}, "T_cn_cnm1 is missing"),
+        ("kalibr", {"camera_model": "omni"}, "camera model 'omni' is not supported"),
+        ("kalibr", {"distortion_model": "fov"}, "distortion model 'fov' is not supported"),
+        ("kalibr", {"intrinsics": ["a", 1, 2, 3]}, "intrinsics is missing or not valid"),
+    ],
+)
+def test_an_impossible_calibration_is_one_line_with_its_file(tmp_path, write, changed, message):
+    file = getattr(recorded, f"write_{write}")(tmp_path / "calibration.yaml", **changed)
+    with pytest.raises(TwinError, match=message) as error:
+        read_calibration(file)
+    assert str(error.value).startswith(str(file)) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("!!python/object/apply:os.system ['touch {}']", "not valid YAML"),
+        ("a: [", "not valid YAML"),
+        ("- 1", "not a YAML table"),
+        ("M1: !!opencv-matrix {rows: 100000, cols: 100000, dt: d, data: []}", "not valid YAML"),
+        ("x" * 2**21, "too large"),
+    ],
+)
+def test_a_hostile_yaml_file_runs_no_code_and_takes_no_memory(tmp_path, text, message):
+    file, made = tmp_path / "calibration.yaml", tmp_path / "made"
+    file.write_text(text.replace("{}", str(made)) if "os.system" in text else text)
+    with pytest.raises(TwinError, match=message):
+        read_calibration(file)
+    assert not made.exists()
+
+
+def test_a_colmap_camera_without_a_rig_has_no_baseline(tmp_path):
+    file = recorded.write_colmap(tmp_path / "cameras.txt")
+    file.with_name("rigs.txt").unlink()
+    with pytest.raises(TwinError, match="has no baseline"):
+        read_calibration(file)
+
+
+def raw_calibration(kind):
+    """A stereo rig with distortion, convergence and different focal lengths."""
+    size, pose = (320, 240), geometry.exp(np.array([0.01, 0.03, -0.02, -0.15, 0.004, 0.002]))
+    coefficients = {"radtan": ([-0.2, 0.05, 1e-3, -5e-4, 0.0], [-0.15, 0.03, -8e-4, 4e-4, 0.0]),
+                    "fisheye": ([-0.02, 0.01, -0.004, 0.001], [0.01, -0.006, 0.003, -0.001])}[kind]  # fmt: skip
+    matrices = [np.array([[f, 0, cx], [0, 1.01 * f, cy], [0, 0, 1.0]]) for f, cx, cy in
+                ((260, 158, 121), (265, 163, 118))]  # fmt: skip
+    cameras = [RecordedCamera(size, k, np.array(d), kind) for k, d in zip(matrices, coefficients, strict=True)]
+    return checked(StereoCalibration(*cameras, pose, Path("calibration.yaml")))
+
+
+@pytest.mark.parametrize("kind", ["radtan", "fisheye"])
+def test_rectified_pixels_come_from_where_opencv_projects_their_points(kind):
+    """The map at the rectified projection of a point is the projection of the point by the recorded lens."""
+    calibration = raw_calibration(kind)
+    found = rectification(calibration, 10.0)
+    rig = found.rig
+    points = np.column_stack([RNG.uniform(-0.5, 0.5, 60), RNG.uniform(-0.35, 0.35, 60), RNG.uniform(1.5, 3, 60)])
+    left = rig.project(points)
+    right = left - np.column_stack([rig.fx_px * rig.baseline_m / points[:, 2], np.zeros(60)])
+    in_left = geometry.transform(found.left_from_rectified, points)
+    in_right = geometry.transform(calibration.right_from_left, in_left)
+    project = cv2.fisheye.projectPoints if kind == "fisheye" else cv2.projectPoints
+    for pixels, xyz, camera, maps in (
+        (left, in_left, calibration.left, found.maps[0]), (right, in_right, calibration.right, found.maps[1]),
+    ):  # fmt: skip
+        expected = project(xyz[:, None], np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0]
+        inside = (pixels > 1).all(axis=1) & (pixels < [318, 238]).all(axis=1)
+        assert inside.sum() > 40
+        at = [cv2.remap(one, *pixels[inside].astype(np.float32).T[..., None], cv2.INTER_LINEAR)[:, 0] for one in maps]
+        # bilinear interpolation between pixels of a smooth map, in 1/32 px
+        np.testing.assert_allclose(np.column_stack(at), expected[inside], atol=0.05)
+
+
+def test_principal_points_that_differ_in_their_columns_shift_the_right_image_only():
+    shifted = RIG.matrix.copy()
+    shifted[0, 2] += 7
+    cameras = [RecordedCamera((RIG.width_px, RIG.height_px), matrix, np.zeros(4)) for matrix in (RIG.matrix, shifted)]
+    found = rectification(StereoCalibration(*cameras, geometry.inverse(RIG.left_from_right), Path("c")), 1.0)
+    image = np.repeat(GRAY[..., None], 3, axis=2)
+    assert found.left(image) is image
+    np.testing.assert_array_equal(found.right(image)[:, :-7], image[:, 7:])
+
+
+def test_grey_colour_raw_and_deep_images_become_rgb(tmp_path):
+    size = RIG.width_px, RIG.height_px
+    colour = np.dstack([GRAY, GRAY // 2, 255 - GRAY])
+    twelve = GRAY.astype(np.uint16) * 16
+    twelve[0, 0] = 4095
+    raw = np.zeros_like(GRAY)
+    raw[::2, ::2] = 200  # the red pixels of RGGB
+    for name, image in (("grey.png", GRAY), ("colour.tiff", colour[..., ::-1]), ("deep.png", twelve),
+                        ("deep.tif", twelve), ("raw.png", raw)):  # fmt: skip
+        assert cv2.imwrite(str(tmp_path / name), image)
+    np.testing.assert_array_equal(read_rgb(tmp_path / "grey.png", size, ImageFormat()), np.dstack([GRAY] * 3))
+    np.testing.assert_array_equal(read_rgb(tmp_path / "colour.tiff", size, ImageFormat()), colour)
+    for name in ("deep.png", "deep.tif"):
+        form = image_format([tmp_path / name], size, None)
+        assert form.bits == 12
+        assert np.abs(read_rgb(tmp_path / name, size, form)[5:, 5:, 0].astype(int) - GRAY[5:, 5:]).max() <= 1
+    inner = read_rgb(tmp_path / "raw.png", size, ImageFormat(8, "RGGB"))[4:-4, 4:-4]
+    assert inner[..., 0].min() == 200 and inner[..., 1:].max() == 0
+
+
+@pytest.mark.parametrize(
+    ("suffix", "reason"), [("png", "truncated"), ("jpg", "truncated"), ("tif", "truncated|no image")]
+)
+def test_a_truncated_image_is_not_used(tmp_path, suffix, reason):
+    file = tmp_path / f"image.{suffix}"
+    cv2.imwrite(str(file), GRAY)
+    file.write_bytes(file.read_bytes()[: len(file.read_bytes()) // 2])
+    with pytest.raises(UnreadableImage, match=reason):
+        read_rgb(file, (RIG.width_px, RIG.height_px), ImageFormat())
+
+
+def test_a_frame_that_cannot_be_used_is_skipped_and_counted(euroc):
+    left, right = (euroc / "mav0" / camera / "data" for camera in ("cam0", "cam1"))
+    names = sorted(file.name for file in left.iterdir())
+    (left / names[1]).write_bytes((left / names[1]).read_bytes()[:-20])
+    (right / names[2]).unlink()
+    cv2.imwrite(str(left / "9.png"), GRAY[:50])
+    with (euroc / "mav0" / "cam0" / "data.csv").open("a") as file:
+        file.write(f"5,{names[0]}\n9000000000,9.png\n")  # a time that goes backwards; another size
+    dataset, _ = read_dataset(euroc)
+    frames = RecordedFrames(dataset, dataset.calibration)
+    found = list(frames)
+    assert [frame.left[0, 0, 0] for frame in found] == [0, 20, 30]
+    assert [frame.right is None for frame in found] == [False, True, False]
+    assert [frame.index for frame in found] == [0, 1, 2]
+    assert dict(frames.skipped) == {
+        "left image: truncated": 1,
+        "right image: missing": 1,
+        "time not after that of the frame before": 1,
+        "left image: another size": 1,
+    }
+
+
+def test_an_euroc_folder_is_read_as_it_was_written(euroc):
+    dataset, name = read_dataset(euroc)
+    assert name == "euroc" and len(dataset.images) == 4
+    np.testing.assert_allclose(np.diff([frame.time_s for frame in dataset.images]), 0.2, atol=1e-9)
+    truth = recorded.trajectory(recorded.poses(4))
+    np.testing.assert_allclose(dataset.truth.world_from_camera, truth.world_from_camera, atol=1e-9)
+    np.testing.assert_allclose(dataset.truth.times_s, [frame.time_s for frame in dataset.images], atol=1e-9)
+    found = rectification(dataset.calibration.for_images(RIG.width_px, RIG.height_px), 5.0)
+    assert found.maps == (None, None)
+    np.testing.assert_allclose(found.rig.matrix, RIG.matrix)
+    assert found.rig.baseline_m == pytest.approx(RIG.baseline_m)
+
+
+def test_kitti_truth_of_camera_0_becomes_that_of_the_left_colour_camera(tmp_path):
+    folder = tmp_path / "sequences" / "03"
+    for k, value in ((2, 40), (3, 50)):
+        (folder / f"image_{k}").mkdir(parents=True)
+        for name in ("000000", "000002"):
+            cv2.imwrite(str(folder / f"image_{k}" / f"{name}.png"), rgb(value))
+    lines = []
+    for k, offset_m in enumerate((0.0, -0.15, 0.06, -0.09)):
+        projection = RIG.matrix @ np.hstack([np.eye(3), [[offset_m], [0], [0]]])
+        lines.append(f"P{k}: " + " ".join(f"{value:.12e}" for value in projection.ravel()))
+    (folder / "calib.txt").write_text("\n".join(lines))
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
+    (tmp_path / "poses").mkdir()
+    turn = geometry.rotation_from_rpy(0.1, 0.2, 0.3)
+    poses = [geometry.pose(turn, np.array([1.0, 2, k])) for k in range(3)]
+    np.savetxt(tmp_path / "poses" / "03.txt", [pose[:3].ravel() for pose in poses])
+    dataset, name = read_dataset(folder)
+    assert name == "kitti"
+    assert [frame.time_s for frame in dataset.images] == [0.0, 0.2]  # the second image is missing
+    assert dataset.calibration.baseline_m == pytest.approx(0.15)
+    expected = [1.0, 2, 0] + turn @ [-0.06, 0, 0]
+    np.testing.assert_allclose(dataset.truth.positions[0], expected, atol=1e-9)
+
+
+def test_times_of_a_plain_folder_come_from_its_list_or_from_the_names(tmp_path):
+    recorded.write_folder(tmp_path / "a", frames_of(3))
+    assert [frame.time_s for frame in read_dataset(tmp_path / "a")[0].images] == pytest.approx([100, 100.2, 100.4])
+    (tmp_path / "a" / "times.txt").write_text("1\n2\n")
+    with pytest.raises(TwinError, match=r"times.txt: has 2 times .*3, one per image"):
+        read_dataset(tmp_path / "a")
+    (tmp_path / "a" / "times.txt").unlink()
+    dataset, _ = read_dataset(tmp_path / "a")
+    assert [frame.time_s for frame in dataset.images] == [0, 1, 2] and "no times" in dataset.notes[0]
+    for side in ("left", "right"):
+        for k in range(3):
+            old = tmp_path / "a" / side / f"{k:04d}.png"
+            old.rename(old.with_name(f"{1_500_000_000_000_000_000 + k * 50_000_000}.png"))
+    dataset, _ = read_dataset(tmp_path / "a")
+    np.testing.assert_allclose(np.diff([frame.time_s for frame in dataset.images]), 0.05, atol=1e-6)
+    assert dataset.notes == ()
+
+
+@pytest.mark.parametrize("name", ["../../../secret.png", "/etc/passwd", "a\0b"])
+def test_a_list_cannot_name_a_file_outside_its_folder(euroc, name):
+    (euroc / "mav0" / "cam0" / "data.csv").write_text(f"1000000000,{name}\n")
+    with pytest.raises(TwinError, match="leads out of the folder"):
+        read_dataset(euroc)
+
+
+def test_a_link_cannot_lead_out_of_the_folder(tmp_path):
+    recorded.write_folder(tmp_path / "set", frames_of(1))
+    cv2.imwrite(str(tmp_path / "secret.png"), GRAY)
+    (tmp_path / "set" / "left" / "0001.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(TwinError, match="leads out of the folder"):
+        read_dataset(tmp_path / "set")
+
+
+def test_a_folder_without_a_data_set_is_one_line(tmp_path):
+    with pytest.raises(TwinError, match="is not a folder"):
+        read_dataset(tmp_path / "none")
+    with pytest.raises(TwinError, match="is empty"):
+        read_dataset(tmp_path)
+    (tmp_path / "notes.txt").write_text("no images")
+    with pytest.raises(TwinError, match="no layout that a reader knows .*euroc: .*kitti: .*folder: "):
+        read_dataset(tmp_path)
+    (tmp_path / "left").mkdir()
+    (tmp_path / "right").mkdir()
+    with pytest.raises(TwinError, match="no images of the left camera"):
+        read_dataset(tmp_path)
+
+
+def test_a_calibration_of_another_image_size_is_refused(tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", frames_of(1))
+    recorded.write_opencv(folder / "calibration.yaml", image_width=2 * RIG.width_px)
+    dataset, _ = read_dataset(folder)
+    with pytest.raises(TwinError, match="calibrated for images of 480 x 180 px .*240 x 180 px, the size of the images"):
+        RecordedFrames(dataset, dataset.calibration)
+
+
+class _Listed:
+    """A reader of another package."""
+
+    name, layout = "listed", "a file called listed.txt"
+
+    def recognises(self, folder):
+        return (folder / "listed.txt").is_file()
+
+    def read(self, folder):
+        return Dataset(folder, [StereoImages(0.0, folder / "l.png", folder / "r.png")], None)
+
+
+def test_a_reader_of_another_package_is_found(tmp_path, monkeypatch):
+    entry = SimpleNamespace(name="listed", value="other:Listed", load=lambda: _Listed)
+    monkeypatch.setattr(readers, "entry_points", lambda group: [entry] if group == "twin.readers" else [])
+    (tmp_path / "listed.txt").touch()
+    assert read_dataset(tmp_path)[1] == "listed"
+
+    def fail():
+        raise ImportError("no module")
+
+    entry.load = fail
+    with pytest.raises(TwinError, match="twin.readers listed: other:Listed: ImportError"):
+        read_dataset(tmp_path)
+
+
+def test_files_of_true_poses_are_told_apart(euroc, tmp_path):
+    dataset, _ = read_dataset(euroc)
+    truth = recorded.trajectory(recorded.poses(4))
+    truth.save(tmp_path / "tum.txt")
+    np.savetxt(tmp_path / "kitti.txt", truth.world_from_camera[:, :3].reshape(-1, 12))
+    tum = read_truth(tmp_path / "tum.txt", dataset, dataset.calibration)
+    np.testing.assert_allclose(tum.world_from_camera, truth.world_from_camera, atol=1e-7)
+    kitti = read_truth(tmp_path / "kitti.txt", dataset, dataset.calibration)
+    np.testing.assert_allclose(kitti.world_from_camera, truth.world_from_camera @ RIG.body_from_camera, atol=1e-9)
+    bad = {
+        "": "has no poses",
+        "1 2 3\n": "has 3 columns",
+        "0 1 2 3 0 0 0 2\n": "not of unit length",
+        "0 1 2 3 0 0 0 x\n": ":1: is not a line of numbers",
+    }
+    for text, message in bad.items():
+        (tmp_path / "bad.txt").write_text(text)
+        with pytest.raises(TwinError, match=message):
+            read_truth(tmp_path / "bad.txt", dataset, dataset.calibration)

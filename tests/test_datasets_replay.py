@@ -1,0 +1,177 @@
+"""Replay of a recorded data set: path, map and report without a simulator; swapped cameras, clocks, preview."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import recorded_datasets as recorded
+import seafloor_scene as scene
+from recorded_datasets import RIG
+
+import twin
+from twin.core import geometry
+from twin.core.records import Trajectory
+from twin.datasets import preview
+from twin.datasets.replay import ReplayOptions, alignment_name, bayer_pattern, open_dataset
+from twin.errors import TwinError
+from twin.estimate.first_pair import floor_plane, inspect_pair
+from twin.exchange.euroc import EurocWriter
+from twin.report import recording, survey_page
+from twin.report.run_folder import load_run
+
+N = 10
+PATH = recorded.poses(N)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return recorded.frames(PATH)
+
+
+@pytest.fixture(scope="module")
+def euroc(frames, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("euroc")
+    writer = EurocWriter(folder, RIG)
+    for frame in frames:
+        writer.add(frame)
+    writer.add_truth(recorded.trajectory(PATH))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def replayed(euroc, tmp_path_factory):
+    return twin.replay(euroc, tmp_path_factory.mktemp("run"), ReplayOptions(outputs=()))
+
+
+def test_the_replayed_path_and_map_are_accurate(replayed):
+    assert replayed.metrics["timing"]["frames"] == N
+    assert replayed.metrics["trajectory"]["final"]["ate_max_m"] < 0.003
+    elevation = replayed.elevation
+    world = geometry.inverse(elevation.map_from_world)
+    true_from_world = PATH[0] @ geometry.inverse(replayed.result.final.world_from_camera[0]) @ world
+    x, y = np.meshgrid(*elevation.grid.centres())
+    known = np.isfinite(elevation.height_m)
+    points = geometry.transform(true_from_world, np.column_stack([x[known], y[known], elevation.height_m[known]]))
+    error_m = np.abs(points[:, 2] - recorded.hills().height_at(points[:, 0], points[:, 1]))
+    assert np.percentile(error_m, 90) < 0.012
+    assert abs(np.median(elevation.height_m[known])) < 0.03  # the plane of the map is that of the floor
+
+
+def test_the_run_folder_is_that_of_a_survey(replayed):
+    run = load_run(replayed.folder)
+    assert run.finished and {"truth", "f2f", "online", "final"} <= run.trajectories.keys()
+    assert {"dem", "dem_sigma", "mosaic"} <= run.rasters.keys() and "dem_truth" not in run.rasters
+    aligned = run.trajectories["truth"].positions - run.trajectories["final"].positions
+    assert np.abs(aligned).max() < 0.003
+    page = survey_page.write_report(replayed.folder).read_text()
+    assert "frames of recorded stereo data" in page and "reference plane" not in page.split("<main>")[0]
+    assert recording.write_recording(replayed.folder).is_file()
+
+
+def test_without_a_truth_there_is_no_error_but_consistency(frames, tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", frames)
+    (folder / "left" / "0003.png").write_bytes(b"")
+    found = twin.replay(folder, tmp_path / "run", ReplayOptions(outputs=())).metrics
+    errors = [found["trajectory"], found["map"], found["consistency"], found["stages"], found["tracks"]]
+    assert set(json.dumps(errors)) and all(value is None for value in found["trajectory"]["final"].values())
+    assert all(value is None for key, value in found["map"].items() if key != "cell_m")
+    assert found["replay"]["skipped"] == {"left image: empty file": 1} and found["timing"]["frames"] == N - 1
+    assert found["replay"]["network"]["links"] > 0 and found["self_check"]["link_chi2"] > 0
+    assert not (tmp_path / "run" / "trajectory_truth.tum").exists()
+
+
+def test_swapped_images_and_swapped_calibrations_are_named(frames, tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", frames[:1], swapped=True)
+    with pytest.raises(TwinError, match="the left and the right images are swapped"):
+        open_dataset(folder, ReplayOptions())
+    turned = recorded.write_opencv(tmp_path / "turned.yaml", T=np.array([0.15, 0, 0]))
+    with pytest.raises(TwinError, match=r"turned.yaml: the baseline is negative"):
+        open_dataset(folder, ReplayOptions(calibration=turned))
+
+
+def test_a_truth_of_another_clock_is_refused_before_anything_is_computed(euroc, tmp_path):
+    truth = recorded.trajectory(PATH)
+    truth.times_s += 1e5
+    truth.save(tmp_path / "truth.tum")
+    with pytest.raises(TwinError, match=r"truth.tum: the truth is of another clock"):
+        twin.replay(euroc, tmp_path / "run", ReplayOptions(truth=tmp_path / "truth.tum"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_without_calibration_or_with_uniform_images_is_one_line(tmp_path):
+    blank = [frame_of(np.full((RIG.height_px, RIG.width_px, 3), 90, np.uint8))]
+    folder = recorded.write_folder(tmp_path / "set", blank)
+    with pytest.raises(TwinError, match="points of the first pair are matched"):
+        open_dataset(folder, ReplayOptions())
+    (folder / "calibration.yaml").unlink()
+    with pytest.raises(TwinError, match="has no calibration"):
+        open_dataset(folder, ReplayOptions())
+
+
+def frame_of(image):
+    return recorded.Frame(0, 0.0, image, image)
+
+
+def test_the_preview_is_one_sheet(euroc, tmp_path):
+    opened = open_dataset(euroc, ReplayOptions())
+    file = preview.draw(opened, tmp_path / "sheet.png")
+    assert cv2.imread(str(file)).shape[1] > 1000
+    table = {row[0]: row[1:] for row in preview.rows(opened)}
+    assert int(table["matched points"][0]) > 100 and table["reader"][0] == "euroc"
+    assert abs(float(table["row difference"][0].split()[0])) < 0.1
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.35, 0.6])
+def test_the_plane_of_the_map_is_that_of_a_tilted_floor(tilt_rad):
+    """A camera that looks obliquely at a plane: the world has the plane at z = 0 and the camera at its true height."""
+    rng, pose = np.random.default_rng(1), scene.down_camera(0, 0, 1.6, (0.0, tilt_rad, 0.0))
+    left, right, _ = scene.stereo_pair(scene.plane(), RIG, pose, rng)
+    pair = inspect_pair(recorded.Frame(0, 0.0, *(np.repeat(one[..., None], 3, axis=2) for one in (left, right))), RIG)
+    plane = floor_plane(pair.points)
+    assert plane.fitted and not pair.swapped
+    assert plane.distance_m == pytest.approx(1.6, abs=0.02)
+    assert np.arccos(-plane.normal[2]) == pytest.approx(tilt_rad, abs=0.02)
+    np.testing.assert_allclose(plane.world_from_camera[:3, :3] @ plane.normal, [0, 0, 1], atol=1e-9)
+
+
+def test_the_motorcycle_pair_is_matched_as_accurately_as_without_a_data_set(outside_data, tmp_path):
+    """Limits of test_estimate_disparity; focal length, doffs and baseline of Middlebury 2014 at quarter size."""
+    truth = np.load(outside_data("motorcycle_disp.npz"))["arr_0"]
+    for side in ("left", "right"):
+        (tmp_path / "set" / side).mkdir(parents=True)
+        image = cv2.imread(str(outside_data(f"motorcycle_{side}.png")))
+        cv2.imwrite(str(tmp_path / "set" / side / "0.png"), image)
+    height, width = truth.shape
+    left = np.array([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]])
+    right = left + [[0, 0, 31.086], [0, 0, 0], [0, 0, 0]]
+    recorded.write_opencv(
+        tmp_path / "set" / "calibration.yaml", image_width=width, image_height=height, M1=left, M2=right,
+        T=np.array([-0.193001, 0, 0]),
+    )  # fmt: skip
+    opened = open_dataset(tmp_path / "set", ReplayOptions())
+    error = np.abs(opened.pair.disparity.disparity_px - 31.086 - truth)
+    known = np.isfinite(error)
+    visible = np.isfinite(truth) & (np.arange(width) >= truth + 31.086)  # the shift loses the right image's margin
+    assert known[visible].mean() >= 0.85
+    assert (error[known] > 1).mean() <= 0.065
+    assert 2 < np.median(opened.pair.points.xyz[:, 2]) < 5
+
+
+def test_unknown_names_are_one_line():
+    assert alignment_name("se3") == "se3" and bayer_pattern(None) is None
+    with pytest.raises(TwinError, match="--align: 'sim3' is not an alignment .*se3, first, none"):
+        alignment_name("sim3")
+    with pytest.raises(TwinError, match="--bayer: 'RGB' is not a Bayer pattern"):
+        bayer_pattern("RGB")
+
+
+def test_pairs_too_far_apart_for_tracking_are_linked_directly(tmp_path):
+    """Steps of 0.3 m are 39 px at 5 Hz; the prediction at rest misses them, so the features must find them."""
+    path = recorded.poses(6, step_m=0.3)
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(path))
+    truth = Trajectory(100 + recorded.trajectory(path).times_s, path)
+    truth.save(tmp_path / "truth.tum")
+    found = twin.replay(folder, tmp_path / "run", ReplayOptions(truth=tmp_path / "truth.tum", outputs=()))
+    assert found.metrics["links"]["bridged"] == 0 and found.metrics["timing"]["keyframes"] == 6
+    assert found.metrics["trajectory"]["final"]["ate_max_m"] < 0.006

@@ -1,0 +1,115 @@
+"""Tank experiments: sizes in a map, closure of loops, path of the rig, bad cells among the uncertain ones."""
+
+import numpy as np
+import pytest
+
+from twin.core.records import SurveyResult, Trajectory
+from twin.reproduce.tank import TABLES, flagged_share, sizes_table
+from twin.reproduce.tank_path import N_LOOP, STEP_M, lawnmower_path, two_loops_path
+from twin.reproduce.tank_scene import OBJECTS, tank_floor
+from twin.reproduce.tank_sizes import measure, true_size
+from twin.reproduce.tank_survey import closures, map_grid
+
+GRID = map_grid(0.003)
+X, Y = np.meshgrid(*GRID.centres())
+NAMES = [item.name for item in OBJECTS]
+
+
+@pytest.mark.parametrize("item", OBJECTS, ids=NAMES)
+@pytest.mark.parametrize("floor_m", [0.0, -0.3])
+def test_the_true_surface_has_the_true_size_whatever_the_height_of_the_floor(item, floor_m):
+    row = measure(item, item.height_at(X, Y) + floor_m, GRID)
+    # the sides of a box lie in the middle between cells of 3 mm; a curved edge falls up to half a cell from its place
+    np.testing.assert_allclose(row.measured[:2], row.true[:2], atol=1e-9 if item.shape == "box" else 0.003)
+    assert row.measured.height_m == pytest.approx(row.true.height_m, abs=0.001)
+
+
+def test_a_linear_ramp_at_the_edges_does_not_change_the_size_of_a_box():
+    """The height of a box blurred by a box filter is half of its top at the true edge."""
+    item = OBJECTS[0]._replace(centre_m=(0.0, 0.0), size_m=(0.144, 0.096, 0.06))
+    ramp = [
+        np.clip(0.5 - (np.abs(axis) - side / 2) / 0.02, 0, 1) for axis, side in zip((X, Y), item.size_m, strict=False)
+    ]
+    row = measure(item, 0.06 * ramp[0] * ramp[1], GRID)
+    np.testing.assert_allclose(row.measured, item.size_m, atol=1e-9)
+
+
+def test_holes_are_passed_over_and_an_object_without_heights_has_no_size():
+    item = OBJECTS[0]
+    height = item.height_at(X, Y)
+    holes = np.where(np.random.default_rng(1).random(height.shape) < 0.2, np.nan, height)
+    np.testing.assert_allclose(measure(item, holes, GRID).errors_m, 0, atol=0.008)
+    strip = np.where(np.abs(np.abs(X - item.centre_m[0]) - 0.075) < 0.003, np.nan, height)  # no heights at two sides
+    assert abs(measure(item, strip, GRID).errors_m.x_m) < 0.003
+    assert np.isnan(measure(item, np.full_like(height, np.nan), GRID).measured).all()
+
+
+def test_a_dome_is_narrower_at_half_of_its_height():
+    stone = next(item for item in OBJECTS if item.shape == "dome")
+    assert true_size(stone).x_m == pytest.approx(0.866 * stone.size_m[0], rel=1e-3)
+
+
+def poses(positions):
+    found = np.tile(np.eye(4), (len(positions), 1, 1))
+    found[:, :3, 3] = positions
+    return Trajectory(np.arange(len(positions)) / 30, found)
+
+
+def test_the_closure_error_is_the_distance_between_a_repeated_frame_and_the_first():
+    drift = np.outer(np.arange(61), [3e-4, 0, -4e-4])  # 0.5 mm a frame
+    none = np.zeros(0, np.int64)
+    result = SurveyResult(poses(drift), poses(drift / 5), poses(0 * drift), none, none, np.zeros((0, 6, 6)))
+    found = closures(result, (30, 60))
+    np.testing.assert_allclose([c[1:] for c in found], [[0.015, 0.003, 0], [0.030, 0.006, 0]], atol=1e-12)
+    assert [c.frame for c in found] == [31, 61]
+
+
+@pytest.mark.parametrize("path", [lawnmower_path(130, 1), two_loops_path(1)], ids=["legs", "loops"])
+def test_frames_are_5_cm_apart_on_a_track_that_bends_at_one_place(path):
+    steps = np.abs(np.diff(path.planned_m, axis=0)).sum(axis=1)
+    chord = np.linalg.norm(np.diff(path.planned_m, axis=0), axis=1)
+    assert steps.max() < 1.42 * STEP_M and chord.min() > 0.68 * STEP_M  # corners and arcs cut less than this
+    off = path.world_from_camera[:, 1, 3] - path.planned_m[:, 1]
+    at_bend = np.abs(path.planned_m[:, 0] - 0.2) < 0.05
+    away = path.planned_m[:, 0] < -0.2
+    assert off[at_bend].mean() > 0.009 and np.abs(off[away].mean()) < 0.001
+
+
+def test_the_second_path_has_61_pairs_and_returns_to_its_first_pose_at_frames_31_and_61():
+    path = two_loops_path(1)
+    assert len(path.planned_m) == 61 and path.repeats == (N_LOOP, 2 * N_LOOP)
+    for k in path.repeats:
+        np.testing.assert_array_equal(path.world_from_camera[k], path.world_from_camera[0])
+    assert len(lawnmower_path(130, 1).planned_m) == 130
+
+
+def test_the_floor_has_the_objects_at_their_heights_with_a_saturated_pipe_and_a_shade():
+    floor = tank_floor(1)
+    for item in OBJECTS:
+        assert float(floor.height_at(*item.centre_m)) == pytest.approx(item.size_m[2], rel=0.01)
+    rows, cols = floor.texture.shape[:2]
+
+    def level(x, y):
+        row, col = int((floor.north_m - y) / floor.texture_px_m), int((x - floor.west_m) / floor.texture_px_m)
+        assert 0 <= row < rows and 0 <= col < cols
+        return floor.texture[row - 20 : row + 20, col - 20 : col + 20].mean()
+
+    assert level(0.3, 0.3) > 3 * level(-0.9, 0.3)
+    assert floor.texture[..., 0].max() > 200
+
+
+def test_the_share_of_flagged_cells_counts_bad_cells_in_the_worst_fifth_by_sigma():
+    sigma = np.arange(100.0).reshape(10, 10)
+    error = np.zeros((10, 10))
+    error[9, 5:] = 0.03  # among the twenty largest
+    error[0, :1] = -0.03
+    error[0, 1] = 0.019
+    assert flagged_share(error, sigma) == pytest.approx(5 / 6)
+    assert flagged_share(0 * error, sigma) is None
+
+
+def test_the_table_of_sizes_has_every_object_and_the_closure_is_reported_for_the_loops_only():
+    rows = sizes_table([measure(item, item.height_at(X, Y), GRID) for item in OBJECTS]).rows
+    assert [row[0] for row in rows] == ["object", *NAMES]
+    assert [float(row[-1]) for row in rows[1:]] == pytest.approx([0] * len(NAMES), abs=3)
+    assert "closure" in TABLES["tank2"] and "closure" not in TABLES["tank1"]

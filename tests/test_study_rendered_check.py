@@ -1,0 +1,111 @@
+"""Rendered surveys that check a surrogate study: which ones are flown, and when they agree."""
+
+import numpy as np
+import pytest
+from study_surveys import study_of
+
+from twin.study.analysis import StudyAnalysis
+from twin.study.engine import Outcome
+from twin.study.flight import row_of
+from twin.study.progress import StudyProgress
+from twin.study.rendered_check import FOLDER, RenderedCheck, check, nearest_surveys, summary
+from twin.study.results_log import ResultsLog
+from twin.study.surveys import surveys
+
+STUDY = """
+scenario = "quickstart"
+
+[set]
+imaging.fidelity = "surrogate"
+
+[vary]
+water.turbidity = { log_uniform = [1.0, 4.0] }
+
+[sampling]
+method = "random"
+samples = 12
+
+[require]
+"map.le90_m" = 0.02
+"map.completeness" = 0.9
+"""
+ERRORS_M = (0.001, 0.019, 0.05, 0.0205, 0.03, np.inf, 0.0195, 0.01, 0.0225, 0.04, 0.018, 0.021)
+
+
+def row_with(survey, error_m, completeness=0.99, status="complete"):
+    """Returns the row of a survey with a map of this LE90 and completeness."""
+    row = row_of(survey, status, "") | {"map.le90_m": error_m, "map.completeness": completeness}
+    for name, limit, met in (("map.le90_m", 0.02, error_m <= 0.02), ("map.completeness", 0.9, completeness >= 0.9)):
+        row |= {f"require.{name}.limit": limit, f"require.{name}.passed": met}
+    return row
+
+
+def analysed(folder, completeness=(0.99,) * 12, statuses=("complete",) * 12):
+    """Returns a study and its analysis: survey k has the error `ERRORS_M[k]` and these completenesses and statuses."""
+    study, log = study_of(folder, STUDY), ResultsLog(folder)
+    for survey, *values in zip(surveys(study, folder), ERRORS_M, completeness, statuses, strict=True):
+        log.add(row_with(survey, *values))
+    return study, StudyAnalysis(log.table(), study)
+
+
+def test_the_surveys_closest_to_the_limits_are_flown(tmp_path):
+    """At an LE90 of 19, 20.5, 19.5, 22.5, 18 and 21 mm; the limit is 20 mm."""
+    _, analysis = analysed(tmp_path)
+    assert nearest_surveys(analysis, 2).tolist() == [3, 6]  # equally close: in the order of the table
+    assert set(nearest_surveys(analysis, 6).tolist()) == {1, 3, 6, 8, 10, 11}
+    assert 5 not in nearest_surveys(analysis, 100)  # an infinite error is not close to any limit
+
+
+def test_the_worst_metric_counts_and_a_lower_limit_is_missed_from_below(tmp_path):
+    """Survey 0 is close to the limit of completeness alone; surveys 2, 5 and 6 miss it clearly."""
+    completeness = [0.99] * 12
+    completeness[0], completeness[2], completeness[5], completeness[6] = 0.9005, 0.5, 0.5, 0.5
+    statuses = ["complete"] * 12
+    statuses[3] = "failed"
+    _, analysis = analysed(tmp_path, completeness, statuses)
+    assert nearest_surveys(analysis, 3).tolist() == [0, 11, 1]
+
+
+class Calls:
+    """Engine that calls a function in place of the one that flies surveys, and counts the calls."""
+
+    def __init__(self, row_of_survey):
+        self.row_of_survey, self.flown = row_of_survey, []
+
+    def run_many(self, function, tasks, limits):
+        for survey in tasks:
+            self.flown.append(survey)
+            yield Outcome(survey, self.row_of_survey(survey), "", 1)
+
+
+def test_rendered_surveys_have_scenario_and_seed_of_their_surrogate_surveys_and_are_reused(tmp_path):
+    study, analysis = analysed(tmp_path)
+    engine = Calls(lambda survey: row_with(survey, 0.0199))
+    checked = check(study, analysis, 6, tmp_path, engine, StudyProgress())
+    originals = {survey.key: survey for survey in surveys(study, tmp_path)}
+    for survey in engine.flown:
+        assert survey.scenario.imaging.fidelity == "rendered"
+        assert survey.folder.is_relative_to(tmp_path / FOLDER)
+        original = originals[survey.key].scenario
+        assert survey.scenario.model_copy(update={"imaging": original.imaging}) == original
+    assert checked.rendered.tolist() == [True] * 6
+    assert int(checked.surrogate.sum()) == 3  # errors of 19, 19.5 and 18 mm
+    assert summary(checked)["same_verdict"] == 3
+    again = Calls(lambda survey: row_with(survey, 0.0199))
+    assert check(study, analysis, 6, tmp_path, again, StudyProgress()).rendered.all()
+    assert again.flown == []
+
+
+@pytest.mark.parametrize(
+    ("rendered", "surrogate", "agrees"), [(6, 6, True), (6, 8, True), (6, 11, False), (1, 6, False)]
+)
+def test_the_surrogate_agrees_if_its_pass_rate_lies_in_the_interval_of_the_rendered_one(rendered, surrogate, agrees):
+    """Wilson intervals of 6 and of 1 of 12: 25 to 75 % and 1 to 35 %."""
+    checked = RenderedCheck(np.arange(12) < rendered, np.arange(12) < surrogate, [])
+    assert checked.agrees is agrees
+    assert ("does not agree" in checked.sentence()) is not agrees
+
+
+def test_without_surveys_near_the_limits_nothing_agrees():
+    checked = RenderedCheck(np.zeros(0, bool), np.zeros(0, bool), [])
+    assert not checked.agrees and "No survey" in checked.sentence()

@@ -1,0 +1,181 @@
+"""Objects on a floor: mesh files, placement and the errors of bad input."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+
+import terrains
+from terrains.objects import mesh_file, placement
+from terrains.objects.mesh_header import face_count
+from terrains.objects.model import model_of
+from terrains.objects.shapes import SHAPES, build_shape
+from twin.errors import TwinError
+from twin.scenario.model import ObjectConfig
+
+FIELD = "objects.0.mesh_file"
+CUBE = trimesh.creation.box((2.0, 1.0, 0.5))
+FLOOR = terrains.generate("reef", (8.0, 6.0), 1.2, 0.0, 0.04, terrains.TextureSource(0.04), 5)
+PLANE = terrains.generate("flat", (6.0, 4.0), 0.0, 0.0, 0.5, terrains.TextureSource(0.05), 1)
+
+
+def read(file, **options):
+    return mesh_file.read_mesh(file, FIELD, (0.4, 0.4, 0.4), **options)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_a_mesh_file_keeps_its_triangles_and_vertex_colours(suffix, tmp_path):
+    cube = CUBE.copy()
+    cube.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4) * 7
+    cube.export(tmp_path / f"cube.{suffix}")
+    mesh = read(tmp_path / f"cube.{suffix}")
+    assert face_count(tmp_path / f"cube.{suffix}") == len(mesh.faces) == 12
+    np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), [2.0, 1.0, 0.5], rtol=1e-6)
+    order = np.lexsort(mesh.vertices_m.T), np.lexsort(cube.vertices.T)
+    np.testing.assert_array_equal(mesh.colours[order[0]], cube.visual.vertex_colors[order[1], :3])
+
+
+def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
+    """A square with a texture that is dark in the west and bright in the east, over 2 m."""
+    from PIL import Image
+
+    ramp = np.repeat(np.linspace(0, 255, 256).astype(np.uint8)[None, :, None], 3, axis=2).repeat(4, axis=0)
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    uv = np.array([[0.001, 0], [0.999, 0], [0.999, 1], [0.001, 1]])
+    visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(ramp))
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False).export(tmp_path / "square.glb")
+    mesh = read(tmp_path / "square.glb")
+    assert mesh_file.TEXTURED_FACES / 4 < len(mesh.faces) <= mesh_file.TEXTURED_FACES
+    assert np.abs(mesh.colours[:, 0] - (mesh.vertices_m[:, 0] + 1) / 2 * 255).max() < 2
+
+
+def ply_header(n_faces):
+    return f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nelement face {n_faces}\nend_header\n".encode()
+
+
+def broken(name, folder):
+    """Returns a file that is not a valid mesh."""
+    contents = {
+        "huge.ply": ply_header(10**8), "text.ply": b"not a mesh", "points.ply": b"ply\nelement vertex 3\nend_header\n",
+        "cut.ply": CUBE.export(file_type="ply")[:400], "empty.obj": b"v 0 0 0\n", "empty.ply": b"",
+        "broken.glb": b"glTF" + struct.pack("<III", 2, 40, 20) + b"JSON" + b"{" * 20, "mesh.stl": b"solid",
+        "dot.obj": b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "nan.obj": b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "fan.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 0 -1 0\nf 1 2 3\nf 1 2 4\nf 1 2 5\n",
+    }  # fmt: skip
+    if name in contents:
+        (folder / name).write_bytes(contents[name])
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("missing.ply", "no such file"),
+        ("huge.ply", "has 100000000 triangles"),
+        ("text.ply", "has no PLY header"),
+        ("empty.ply", "has no PLY header"),
+        ("points.ply", "is a point cloud without faces"),
+        ("cut.ply", "cannot be read"),
+        ("empty.obj", "has no triangles"),
+        ("broken.glb", "has an invalid description"),
+        ("mesh.stl", "is not a mesh file"),
+        ("dot.obj", "has no extent"),
+        ("nan.obj", "not finite"),
+        ("fan.obj", "is not manifold: 1 edges belong to more than two triangles"),
+    ],
+)
+def test_a_bad_mesh_file_is_one_clear_error(name, problem, tmp_path):
+    with pytest.raises(TwinError, match=problem) as raised:
+        read(broken(name, tmp_path))
+    assert raised.value.field == FIELD and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_built_in_shapes_are_manifold_of_size_one_and_seeded(name):
+    """Closed shapes enclose a positive volume, so their triangles face outwards; kelp is a sheet."""
+    mesh, again, other = (build_shape(name, None, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(mesh.vertices_m, again.vertices_m)
+    assert not np.array_equal(mesh.colours, other.colours)
+    assert mesh_file.crowded_edges(mesh) == 0 and 0.8 < np.ptp(mesh.vertices_m, axis=0).max() < 1.3
+    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+    assert (solid.is_watertight and solid.volume > 0) or name == "kelp"
+
+
+CONE = model_of(mesh_file._mesh(*(lambda c: (c.vertices, c.faces, np.full((len(c.vertices), 3), 99)))(
+    trimesh.creation.cone(0.5, 1.0))))  # fmt: skip
+
+
+def scattered(floor=FLOOR, seed=1, taken=(), **keys):
+    config = ObjectConfig(shape="boulder", **({"per_m2": 1.0, "size_m": 0.3} | keys))
+    return placement.place(2, config, [CONE], floor, taken, seed)
+
+
+def test_scattered_objects_have_the_density_and_do_not_overlap():
+    items = scattered(size_spread=0.4)
+    centres = np.array([item.world_from_object[:2, 3] for item in items])
+    radii = np.array([item.scale for item in items]) * np.hypot(*(CONE.high_m - CONE.low_m)[:2]) / 2
+    gaps = np.hypot(*(centres[:, None] - centres).T) - radii - radii[:, None]
+    assert len(items) == 48 and gaps[~np.eye(48, dtype=bool)].min() >= 0
+
+
+def test_spacing_is_a_poisson_disc():
+    centres = np.array([item.world_from_object[:2, 3] for item in scattered(spacing_m=0.7)])
+    apart = np.hypot(*(centres[:, None] - centres).T)[~np.eye(len(centres), dtype=bool)]
+    assert apart.min() >= 0.7 and np.median(np.abs(centres), axis=0).min() > 1
+
+
+def test_sizes_are_log_normal():
+    sizes = np.array([item.scale for item in scattered(per_m2=10.0, size_m=0.1, size_spread=0.3)])
+    assert len(sizes) == 480
+    logs = np.log(sizes / 0.1)
+    assert abs(logs.mean()) < 3 * 0.3 / np.sqrt(480) and 0.24 < logs.std() < 0.3  # a cut at 2 sigma takes 4 %
+    assert np.abs(logs).max() <= 0.6 + 1e-9
+
+
+@pytest.mark.parametrize(("ground", "steep"), [("sand", False), ("slopes", True)])
+def test_scattered_objects_stand_on_their_ground(ground, steep):
+    for item in scattered(on=ground):
+        x, y = item.world_from_object[:2, 3, None]
+        reach_m = 0.3 / np.sqrt(2) / 2
+        assert (placement.slope_deg(FLOOR, x, y, reach_m)[0] >= placement.STEEP_DEG) == steep
+
+
+def test_placement_is_seeded_and_independent_of_other_entries():
+    first, same, other = scattered(), scattered(), scattered(seed=2)
+    poses = [np.array([item.world_from_object for item in items]) for items in (first, same, other)]
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert not np.array_equal(poses[0], poses[2])
+
+
+def test_objects_are_sunk_and_perpendicular_to_the_floor():
+    config = ObjectConfig(shape="boulder", position_m=(0.0, 0.0), size_m=0.4, sunk=0.25)
+    item = placement.place(0, config, [CONE], PLANE, [], 1)[0]
+    np.testing.assert_allclose(item.corners_m()[:, 2].min(), -0.1, atol=1e-6)
+    floor = terrains.Terrain(
+        np.tile(np.linspace(0, 2, 21, dtype=np.float32), (21, 1)), 0.2, -2.0, -2.0, np.zeros((4, 4, 3), np.uint8), 1.0
+    )
+    tilted = placement.place(0, config.model_copy(update={"upright": False}), [CONE], floor, [], 1)[0]
+    axis = tilted.world_from_object[:3, 2] / tilted.scale
+    np.testing.assert_allclose(axis, np.array([-0.5, 0, 1]) / np.sqrt(1.25), atol=1e-6)
+    np.testing.assert_allclose(tilted.world_from_object[:3, 3], [0, 0, 1] - 0.1 * axis, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "field", "problem"),
+    [
+        ({"per_m2": None, "position_m": (3.95, 0.0)}, "objects.2.position_m", "reaches beyond the terrain"),
+        ({"per_m2": None, "position_m": (30.0, 0.0)}, "objects.2.position_m", "reaches beyond the terrain"),
+        ({"per_m2": 9.0, "size_m": 0.8}, "objects.2.per_m2", r"only \d+ of 432 objects fit without overlap"),
+        ({"per_m2": 900.0}, "objects.2.per_m2", "43200 objects"),
+        ({"per_m2": 0.001}, "objects.2.per_m2", "no object on 48.00 m2"),
+        ({"area_m": (1.0, 1.0), "centre_m": (50.0, 0.0)}, "objects.2.per_m2", "no object on 0.00 m2"),
+        ({"size_m": 12.0}, "objects.2.per_m2", "only 0 of 48 objects fit"),
+    ],
+)
+def test_objects_that_do_not_fit_are_errors(keys, field, problem):
+    with pytest.raises(TwinError, match=problem) as raised:
+        scattered(**keys)
+    assert raised.value.field == field

@@ -1,0 +1,62 @@
+"""Grid and tiles of an orthomosaic, which is made, written and evaluated tile by tile so that memory is bounded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.records import Image, MapGrid
+
+#: Side of a tile [px]. A tile in progress takes 24 bytes per pixel, 110 MB.
+TILE_PX = 2048
+
+
+class OrthoTile(NamedTuple):
+    """Rectangular part of an orthomosaic.
+
+    Args:
+        grid: grid of the pixels of the tile.
+        row, col: position of the first pixel of the tile in the orthomosaic.
+        rgba: (rows, cols, 4) uint8; the last band is 255 where the orthomosaic has a colour, otherwise 0.
+    """
+
+    grid: MapGrid
+    row: int
+    col: int
+    rgba: Image
+
+    @property
+    def known(self) -> np.ndarray:
+        """Returns a mask (rows, cols) of the pixels that have a colour."""
+        return self.rgba[..., 3] > 0
+
+
+def finer_grid(grid: MapGrid, pixel_m: float) -> MapGrid:
+    """Returns the grid that divides the cells of a map into the fewest squares that are not larger than `pixel_m`."""
+    n = max(1, int(np.ceil(grid.cell_m / pixel_m - 1e-9)))
+    return replace(grid, cell_m=grid.cell_m / n, rows=grid.rows * n, cols=grid.cols * n)
+
+
+def tile_side_px(n: int) -> int:
+    """Returns the side of a tile [px]: the largest multiple of n up to `TILE_PX`, but at least n (one map cell)."""
+    return max(TILE_PX - TILE_PX % n, n)
+
+
+def mean_colours(tile: OrthoTile, n: int) -> Image:
+    """Returns the mean colours (rows / n, cols / n, 3) of squares of n x n pixels.
+
+    Only known pixels count; a square without known pixels is black.
+    """
+    rows, cols = (size // n for size in tile.rgba.shape[:2])
+    squares = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4).astype(np.float32)
+    known = (squares[..., 3:] > 0).sum(axis=(1, 3))
+    total = (squares[..., :3] * (squares[..., 3:] > 0)).sum(axis=(1, 3))
+    return (total / np.maximum(known, 1) + 0.5).astype(np.uint8)
+
+
+def window(grid: MapGrid, row: int, col: int, rows: int, cols: int) -> MapGrid:
+    """Returns the part of a grid with the given first pixel and size; it may extend beyond the grid."""
+    west_m, north_m = grid.west_m + col * grid.cell_m, grid.north_m - row * grid.cell_m
+    return MapGrid(west_m, north_m, grid.cell_m, rows, cols)

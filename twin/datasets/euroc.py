@@ -1,0 +1,85 @@
+"""Reader of EuRoC/ASL folders (Burri et al. 2016): mav0/cam0, mav0/cam1, true poses of the body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.records import Trajectory
+from twin.datasets.calibration import StereoCalibration, checked
+from twin.datasets.calibration_files import camera_from_kalibr, pose_of
+from twin.datasets.dataset import Dataset, ImageTime, pair_by_time
+from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
+from twin.errors import TwinError
+
+_TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0", "leica0")
+
+
+class EurocReader:
+    """Reads EuRoC/ASL folders: times in nanoseconds, sensor poses relative to the body, true poses of the body."""
+
+    name = "euroc"
+    layout = "mav0/cam0 and mav0/cam1, each with data.csv, data/ and sensor.yaml"
+
+    def recognises(self, folder: Path) -> bool:
+        """Returns whether a folder, or its subfolder mav0, has the images of two cameras."""
+        return all((_root(folder) / camera / "data.csv").is_file() for camera in ("cam0", "cam1"))
+
+    def read(self, folder: Path) -> Dataset:
+        """Returns the data set in a folder; raises TwinError if one of its files is damaged."""
+        root = _root(folder)
+        frames, n_right_only = pair_by_time(*(_image_times(root / camera) for camera in ("cam0", "cam1")))
+        calibration = _calibration(root)
+        truth = None
+        file = next((root / name / "data.csv" for name in _TRUTH if (root / name / "data.csv").is_file()), None)
+        if file is not None and calibration is not None and calibration.body_from_left is not None:
+            truth = camera_truth(file, calibration.body_from_left)
+        return Dataset(folder, frames, calibration, truth, n_right_only)
+
+
+def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
+    """Returns the poses of the left camera from true poses of the body: time [ns], x, y, z [m], qw, qx, qy, qz.
+
+    Args:
+        file: data.csv of the truth.
+        body_from_left: (4, 4) pose of the left camera in the body.
+
+    Raises:
+        TwinError: the file is damaged.
+    """
+    rows = read_table(file, 8)
+    norm = np.linalg.norm(rows[:, 4:8], axis=1)
+    if not len(rows) or not (np.abs(norm - 1) < 0.01).all():
+        raise TwinError(str(file), "is not a list of poses with unit quaternions", "timestamp, x, y, z, qw, qx, qy, qz")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = geometry.rotation_from_wxyz(rows[:, 4:8]), rows[:, 1:4]
+    return Trajectory(rows[:, 0] * 1e-9, poses @ body_from_left)
+
+
+def _root(folder: Path) -> Path:
+    """Returns the folder of the sensors: mav0, or the folder itself."""
+    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+
+
+def _image_times(camera: Path) -> list[ImageTime]:
+    """Returns the times and files of the images of a camera, in the order of data.csv."""
+    images, source = [], camera / "data.csv"
+    for number, parts in text_rows(source):
+        if len(parts) < 2 or not parts[0].strip().isdigit():
+            raise TwinError(f"{source}:{number}", "is not a time and a file name", "timestamp [ns],filename")
+        images.append(ImageTime(int(parts[0]) * 1e-9, inside(camera / "data", parts[1].strip(), source)))
+    return images
+
+
+def _calibration(root: Path) -> StereoCalibration | None:
+    """Returns the calibration from the files sensor.yaml of both cameras; None if one of the files is missing."""
+    files = [root / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+    if not all(file.is_file() for file in files):
+        return None
+    trees = [read_yaml(file) for file in files]
+    left, right = (camera_from_kalibr(tree, file) for tree, file in zip(trees, files, strict=True))
+    body_from_left, body_from_right = (pose_of(tree, "T_BS", file) for tree, file in zip(trees, files, strict=True))
+    right_from_left = geometry.inverse(body_from_right) @ body_from_left
+    return checked(StereoCalibration(left, right, right_from_left, files[1], body_from_left))

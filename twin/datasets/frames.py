@@ -1,0 +1,113 @@
+"""Frames of a data set for the estimators: images read, rectified and checked; unusable images are counted."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from twin.core.records import Frame, Image
+from twin.datasets.calibration import StereoCalibration
+from twin.datasets.dataset import Dataset
+from twin.datasets.image_files import Bayer, UnreadableImage, image_format, image_size, read_rgb
+from twin.datasets.rectification import Rectification, rectification
+from twin.errors import TwinError
+
+_NOMINAL_HZ = 1.0  # frame rate of a data set with a single frame
+
+
+class RecordedFrames:
+    """Rectified frames of a data set, one at a time. A frame that cannot be used is skipped and counted.
+
+    Args:
+        dataset: the data set.
+        calibration: calibration of the cameras.
+        bayer: pattern of raw images; None: grey or colour images.
+
+    Attributes:
+        rectification: conversion of the recorded images to a rectified pair.
+        start_s: time of the first frame in the clock of the data set [s]; the times of frames are relative to it.
+        skipped: number of frames or right images that could not be used, by reason, filled while the frames are read.
+
+    Raises:
+        TwinError: no image can be read, or the calibration is that of images of another size.
+    """
+
+    def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
+        self.dataset = dataset
+        self.size_px = _first_size(dataset)
+        self.rectification: Rectification = rectification(
+            calibration.for_images(*self.size_px), _frame_rate_hz(dataset)
+        )
+        self._format = image_format([frame.left for frame in dataset.images], self.size_px, bayer)
+        self.start_s = dataset.images[0].time_s
+        self.skipped = Counter[str]()
+
+    def __len__(self) -> int:
+        """Returns the number of frames of the data set, including those that will be skipped."""
+        return len(self.dataset.images)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yields the usable frames; a frame whose right image cannot be used has only the left image."""
+        self.skipped = Counter[str]()
+        if self.dataset.n_right_only:
+            self.skipped["right image without left image"] = self.dataset.n_right_only
+        index, last_s = 0, -np.inf
+        for images in self.dataset.images:
+            if images.time_s <= last_s:
+                self.skipped["time not after that of the frame before"] += 1
+                continue
+            left = self._read(images.left, "left")
+            if left is None:
+                continue
+            right = self._read(images.right, "right")
+            last_s = images.time_s
+            yield Frame(
+                index,
+                images.time_s - self.start_s,
+                self.rectification.left(left),
+                None if right is None else self.rectification.right(right),
+            )
+            index += 1
+
+    def _read(self, file: Path | None, side: str) -> Image | None:
+        """Returns an image; if it cannot be used, counts the reason in `skipped` and returns None."""
+        try:
+            if file is None:
+                raise UnreadableImage("missing")
+            return read_rgb(file, self.size_px, self._format)
+        except UnreadableImage as error:
+            self.skipped[f"{side} image: {error}"] += 1
+            return None
+
+    def first_pair(self) -> Frame:
+        """Returns the first frame with both images.
+
+        Raises:
+            TwinError: there is none.
+        """
+        for frame in self:
+            if frame.right is not None:
+                return frame
+        reasons = "; ".join(f"{reason}: {count}" for reason, count in self.skipped.items())
+        raise TwinError(str(self.dataset.folder), f"has no usable stereo pair ({reasons})", "at least one stereo pair")
+
+
+def _first_size(dataset: Dataset) -> tuple[int, int]:
+    """Returns (width, height) of the first readable left image [px]; raises TwinError if there is none."""
+    problem = ""
+    for frame in dataset.images:
+        try:
+            return image_size(frame.left)
+        except UnreadableImage as error:
+            problem = problem or f"{frame.left.name}: {error}"
+    raise TwinError(str(dataset.folder), f"has no readable left image ({problem})", "PNG, JPEG or TIFF")
+
+
+def _frame_rate_hz(dataset: Dataset) -> float:
+    """Returns the frame rate, from the median of the positive intervals between the frames [Hz]."""
+    intervals = np.diff([frame.time_s for frame in dataset.images])
+    intervals = intervals[intervals > 0]
+    return 1 / float(np.median(intervals)) if len(intervals) else _NOMINAL_HZ

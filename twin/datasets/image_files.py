@@ -1,0 +1,129 @@
+"""Reading of image files (PNG, JPEG, TIFF; 8 or 16 bits; grey, colour or Bayer) as 8-bit RGB."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from twin.core.records import Image
+
+Bayer = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
+BAYER: tuple[Bayer, ...] = ("RGGB", "GRBG", "GBRG", "BGGR")
+_MOST_BYTES = 512 * 2**20  # largest image file
+_MOST_PIXELS = 2**28
+#: Bytes with which a complete file of a format ends (before padding with zeros).
+_ENDS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
+_N_SAMPLES = 8  # number of images from which the number of used bits is determined
+
+
+class UnreadableImage(Exception):  # noqa: N818 (the frame is skipped)
+    """An image cannot be used; the message is a short reason without the file name, by which images are counted."""
+
+
+class ImageFormat(NamedTuple):
+    """Format of the values in image files, for the conversion to 8-bit RGB.
+
+    Args:
+        bits: number of bits in use in 16-bit images; 8 for 8-bit images.
+        bayer: pattern of the first two rows of raw images; None: grey or colour images.
+    """
+
+    bits: int = 8
+    bayer: Bayer | None = None
+
+
+def image_size(file: Path) -> tuple[int, int]:
+    """Returns (width, height) of an image file [px], from its header.
+
+    Raises:
+        UnreadableImage: the file is missing, too large or no image.
+    """
+    return _header(_contents(file))[:2]
+
+
+def read_rgb(file: Path, size_px: tuple[int, int], form: ImageFormat) -> Image:
+    """Returns the image in a file as 8-bit RGB (H, W, 3).
+
+    Args:
+        file: PNG, JPEG or TIFF file.
+        size_px: (width, height) that the image must have.
+        form: number of bits and Bayer pattern.
+
+    Raises:
+        UnreadableImage: the file is missing, truncated, no image, or has another size.
+    """
+    pixels = _pixels(file, size_px)
+    if pixels.dtype == np.uint16:
+        pixels = np.clip(pixels.astype(np.float32) * (255 / (2**form.bits - 1)) + 0.5, 0, 255).astype(np.uint8)
+    if form.bayer is not None and pixels.ndim == 2:
+        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_Bayer{form.bayer}2RGB")), np.uint8)
+    codes = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
+    return np.asarray(cv2.cvtColor(pixels, codes[2 if pixels.ndim == 2 else pixels.shape[2]]), np.uint8)
+
+
+def image_format(files: Sequence[Path], size_px: tuple[int, int], bayer: Bayer | None) -> ImageFormat:
+    """Returns the format of the images of a data set, from a sample of them.
+
+    Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
+    is the smallest one, at least 8, that holds the largest value in the sample. It is the same for all images of a
+    data set, so that grey levels stay comparable.
+    """
+    largest = 0
+    for k in np.unique(np.linspace(0, len(files) - 1, _N_SAMPLES).astype(int)):
+        try:
+            pixels = _pixels(files[k], size_px)
+        except UnreadableImage:
+            continue
+        if pixels.dtype == np.uint16:
+            largest = max(largest, int(pixels.max()))
+    return ImageFormat(max(8, largest.bit_length()), bayer)
+
+
+def _contents(file: Path) -> bytes:
+    """Returns the bytes of a file."""
+    try:
+        if not file.is_file():
+            raise UnreadableImage("missing")
+        if file.stat().st_size > _MOST_BYTES:
+            raise UnreadableImage("too large")
+        return file.read_bytes()
+    except OSError:
+        raise UnreadableImage("unreadable") from None
+
+
+def _header(data: bytes) -> tuple[int, int, str]:
+    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on damaged metadata, which are not used
+            image = PillowImage.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF"))
+        return image.width, image.height, str(image.format)
+    except (OSError, ValueError, SyntaxError, PillowImage.DecompressionBombError):
+        raise UnreadableImage("no image" if data else "empty file") from None
+
+
+def _pixels(file: Path, size_px: tuple[int, int]) -> NDArray[Any]:
+    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR, uint8 or uint16."""
+    data = _contents(file)
+    width, height, kind = _header(data)
+    if (width, height) != size_px or width * height > _MOST_PIXELS:
+        raise UnreadableImage("another size")
+    if kind in _ENDS and not data.rstrip(b"\0").endswith(_ENDS[kind].rstrip(b"\0")):
+        raise UnreadableImage("truncated")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise UnreadableImage("truncated" if kind == "TIFF" else "damaged")
+    if pixels.dtype not in (np.uint8, np.uint16) or (pixels.ndim == 3 and pixels.shape[2] not in (3, 4)):
+        raise UnreadableImage("not grey or RGB with 8 or 16 bits")
+    return pixels

@@ -1,0 +1,82 @@
+"""Reader of KITTI odometry folders (Geiger et al. 2012): rectified images, calib.txt, times.txt, poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import Trajectory
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
+from twin.datasets.dataset import Dataset, StereoImages
+from twin.datasets.plain_folder import image_files
+from twin.datasets.text_files import read_table, text_rows
+from twin.errors import TwinError
+
+
+class KittiReader:
+    """Reads a sequence of KITTI odometry, in colour (image_2, image_3) if it has colour images."""
+
+    name = "kitti"
+    layout = "image_0 and image_1 (or image_2 and image_3), calib.txt and times.txt"
+
+    def recognises(self, folder: Path) -> bool:
+        """Returns whether a folder has calib.txt, and image_0 or image_2."""
+        return (folder / "calib.txt").is_file() and any((folder / f"image_{k}").is_dir() for k in (0, 2))
+
+    def read(self, folder: Path) -> Dataset:
+        """Returns the data set in a folder; raises TwinError if one of its files is damaged."""
+        number = 2 if (folder / "image_2").is_dir() else 0
+        left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))
+        calibration = _calibration(folder / "calib.txt", number)
+        times_s = read_table(folder / "times.txt", 1)[:, 0]
+        names = sorted(left.keys() | right.keys())
+        if not all(name.isdigit() and int(name) < len(times_s) for name in names):
+            problem = f"has {len(times_s)} times, but an image is called {names[-1][:40]}"
+            raise TwinError(str(folder / "times.txt"), problem, "images that are numbered from 000000, one time each")
+        frames = [
+            StereoImages(float(times_s[int(name)]), left[name], right.get(name)) for name in names if name in left
+        ]
+        file = folder.parent.parent / "poses" / f"{folder.name}.txt"
+        truth = camera_poses(file, times_s, calibration.body_from_left) if file.is_file() else None
+        return Dataset(folder, frames, calibration, truth, len(right.keys() - left.keys()))
+
+
+def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Trajectory:
+    """Returns the poses of the left camera from a file with the pose (3, 4) of camera 0 in each line.
+
+    Args:
+        file: file of the poses.
+        times_s: (n,) times of the poses [s].
+        body_from_left: (4, 4) pose of the left camera in the axes of camera 0; None: the left camera is camera 0.
+
+    Raises:
+        TwinError: the file is damaged, or has more lines than there are times.
+    """
+    rows = read_table(file, 12)
+    if len(rows) > len(times_s):
+        raise TwinError(str(file), f"has {len(rows)} poses", f"up to {len(times_s)}, one per image")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows.reshape(-1, 3, 4)
+    if not (np.abs(np.linalg.det(poses[:, :3, :3]) - 1) < 0.01).all():
+        raise TwinError(str(file), "is not a list of poses", "12 numbers per line, a rotation and a translation")
+    poses = geometry.nearest_rigid(poses)
+    return Trajectory(times_s[: len(rows)], poses if body_from_left is None else poses @ body_from_left)
+
+
+def _calibration(file: Path, number: int) -> StereoCalibration:
+    """Returns the calibration of the cameras `number` and `number` + 1 from their projection matrices (3, 4)."""
+    projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
+    try:
+        left, right = (np.array(projections[f"P{k}"], float).reshape(3, 4) for k in (number, number + 1))
+        in_left, in_right = (np.linalg.solve(p[:, :3], p[:, 3]) for p in (left, right))
+    except (KeyError, ValueError, np.linalg.LinAlgError):
+        allowed = f"P{number} and P{number + 1}, each with 12 numbers"
+        raise TwinError(str(file), "has no projection matrices of these cameras", allowed) from None
+    left_camera, right_camera = (RecordedCamera(None, p[:, :3] / p[2, 2], np.zeros(0)) for p in (left, right))
+    right_from_left = geometry.pose(np.eye(3), in_right - in_left)
+    return checked(
+        StereoCalibration(left_camera, right_camera, right_from_left, file, geometry.pose(np.eye(3), -in_left))
+    )

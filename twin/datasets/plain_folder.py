@@ -1,0 +1,77 @@
+"""Reader of a plain folder: left/ and right/ with images of equal names, and a calibration file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from twin.datasets.calibration_files import find_calibration, read_calibration
+from twin.datasets.dataset import Dataset, StereoImages
+from twin.datasets.text_files import inside, read_table
+from twin.errors import TwinError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # unit of a time by its number of digits, as counted since 1970 [s]
+_ASSUMED_HZ = 1.0
+
+
+class PlainFolderReader:
+    """Reads left/ and right/ with images of equal names; the times are in times.txt or in the names of the images."""
+
+    name = "folder"
+    layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr or COLMAP)"
+
+    def recognises(self, folder: Path) -> bool:
+        """Returns whether a folder has the subfolders left and right."""
+        return (folder / "left").is_dir() and (folder / "right").is_dir()
+
+    def read(self, folder: Path) -> Dataset:
+        """Returns the data set in a folder; raises TwinError if its calibration or its times are damaged."""
+        left, right = image_files(folder / "left"), image_files(folder / "right")
+        names = sorted(left.keys() | right.keys(), key=_natural_order)
+        times_s, notes = _times(folder / "times.txt", names)
+        frames = [
+            StereoImages(time_s, left[name], right.get(name))
+            for name, time_s in zip(names, times_s, strict=True)
+            if name in left
+        ]
+        file = find_calibration(folder)
+        calibration = None if file is None else read_calibration(file)
+        return Dataset(folder, frames, calibration, None, len(right.keys() - left.keys()), notes)
+
+
+def image_files(folder: Path) -> dict[str, Path]:
+    """Returns the image files of a folder, by file name without suffix.
+
+    Raises:
+        TwinError: an image is a symbolic link that leads out of the folder.
+    """
+    if not folder.is_dir():
+        return {}
+    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
+    return {file.stem: inside(folder, file.name, folder) for file in sorted(files)}
+
+
+def _natural_order(name: str) -> list[tuple[int, int | str]]:
+    """Returns a key that sorts names by the numbers in them: img2 before img10."""
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
+    """Returns the times of the images [s], from times.txt or the names of the images, and notes on assumptions made.
+
+    Raises:
+        TwinError: times.txt does not have one time per image.
+    """
+    if file.is_file():
+        times_s = read_table(file, 1)[:, 0].tolist()
+        if len(times_s) != len(names):
+            raise TwinError(str(file), f"has {len(times_s)} times", f"{len(names)}, one per image")
+        return times_s, ()
+    if all(re.fullmatch(r"\d{9,10}\.\d+|\d+\.\d+", name) for name in names):
+        return [float(name) for name in names], ()
+    lengths = {len(name) for name in names if name.isdigit()}
+    if len(lengths) == 1 and all(name.isdigit() for name in names) and (unit := _UNITS.get(*lengths)):
+        return [int(name) * unit for name in names], ()
+    note = f"The data set has no times (times.txt); {_ASSUMED_HZ:g} frame per second was assumed."
+    return [k / _ASSUMED_HZ for k in range(len(names))], (note,) if len(names) > 1 else ()

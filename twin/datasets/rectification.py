@@ -1,0 +1,142 @@
+"""Rectification of recorded stereo pairs: removes lens distortion and turns both cameras to parallel axes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import Image, StereoRig
+from twin.datasets.calibration import RecordedCamera, StereoCalibration
+from twin.errors import TwinError
+
+#: Largest differences of a pair that counts as rectified: rotation [rad], offset of the right camera across the
+#: baseline as a fraction of it, focal lengths and principal points [px].
+_PARALLEL_RAD, _ACROSS, _EQUAL_PX = 1e-6, 1e-6, 1e-3
+
+_Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+
+class Rectification(NamedTuple):
+    """Conversion of recorded images to a rectified pair.
+
+    Args:
+        rig: calibration of the rectified pair.
+        left_from_rectified: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation).
+        maps: for each camera, column and row (H, W) of every rectified pixel in the recorded image; None if the
+            recorded images are rectified.
+    """
+
+    rig: StereoRig
+    left_from_rectified: Array
+    maps: tuple[_Maps | None, _Maps | None]
+
+    @property
+    def sentence(self) -> str:
+        """Returns a phrase that states whether the images were recorded rectified or rectified by the replay."""
+        return "rectified as recorded" if self.maps == (None, None) else "rectified by `twin replay`"
+
+    def left(self, image: Image) -> Image:
+        """Returns the rectified image of the left camera."""
+        return _resampled(image, self.maps[0])
+
+    def right(self, image: Image) -> Image:
+        """Returns the rectified image of the right camera."""
+        return _resampled(image, self.maps[1])
+
+
+def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Rectification:
+    """Returns the rectification for a calibration that states the size of the images.
+
+    The rotations and the common camera matrix are those of `cv2.stereoRectify` (Bouguet's method), or of
+    `cv2.fisheye.stereoRectify`; all pixels of a rectified image without fisheye distortion lie in the recorded image.
+
+    Raises:
+        TwinError: the cameras have different lens models, or their views do not overlap.
+    """
+    left, right = calibration.left, calibration.right
+    assert left.size_px is not None
+    width_px, height_px = left.size_px
+    if is_rectified(calibration):
+        rig = _rig(left.matrix, calibration.baseline_m, left.size_px, frame_rate_hz)
+        equal = np.abs(left.matrix - right.matrix).max() < _EQUAL_PX
+        return Rectification(rig, np.eye(4), (None, None if equal else _maps(right, np.eye(3), rig)))
+    if left.kind != right.kind:
+        raise TwinError(str(calibration.file), "the cameras have different lens models", "two radtan or two fisheye")
+    rotation, translation = calibration.right_from_left[:3, :3].copy(), calibration.right_from_left[:3, 3:].copy()
+    if left.kind == "fisheye":
+        turns = cv2.fisheye.stereoRectify(
+            left.matrix, _four(left), right.matrix, _four(right), (width_px, height_px), rotation, translation,
+            flags=cv2.CALIB_ZERO_DISPARITY, balance=0.0,
+        )[:4]  # fmt: skip
+    else:
+        turns = cv2.stereoRectify(
+            left.matrix, left.distortion, right.matrix, right.distortion, (width_px, height_px), rotation, translation,
+            flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
+        )[:4]  # fmt: skip
+    left_turn, right_turn, projection, _ = (np.asarray(turn, np.float64) for turn in turns)
+    if not (np.isfinite(projection).all() and projection[0, 0] > 1):
+        raise TwinError(str(calibration.file), "the views of the two cameras do not overlap", "a stereo pair")
+    rig = _rig(projection[:, :3], calibration.baseline_m, left.size_px, frame_rate_hz)
+    maps = _maps(left, left_turn, rig), _maps(right, right_turn, rig)
+    return Rectification(rig, geometry.pose(left_turn.T, np.zeros(3)), maps)
+
+
+def is_rectified(calibration: StereoCalibration) -> bool:
+    """Returns whether the recorded images are a rectified pair: no distortion, parallel axes, equal intrinsics.
+
+    The columns of the principal points may differ, as in the Middlebury data sets; the right image is then shifted.
+    """
+    left, right = calibration.left, calibration.right
+    offset = calibration.right_from_left[:3, 3]
+    parallel = np.linalg.norm(geometry.so3_log(calibration.right_from_left[:3, :3])) < _PARALLEL_RAD
+    aligned = float(np.abs(offset[1:]).max()) <= _ACROSS * calibration.baseline_m
+    equal = np.abs(left.matrix - right.matrix)[[0, 1, 1], [0, 1, 2]].max() < _EQUAL_PX
+    return bool(parallel and aligned and equal and not left.distortion.any() and not right.distortion.any())
+
+
+def _rig(matrix: Array, baseline_m: float, size_px: tuple[int, int], frame_rate_hz: float) -> StereoRig:
+    """Returns the calibration of a rectified pair, given the camera matrix (3, 3) of both cameras."""
+    return StereoRig(
+        width_px=size_px[0],
+        height_px=size_px[1],
+        focal_px=float(matrix[0, 0]),
+        baseline_m=baseline_m,
+        frame_rate_hz=frame_rate_hz,
+        focal_y_px=None if matrix[0, 0] == matrix[1, 1] else float(matrix[1, 1]),
+        principal_point_px=(float(matrix[0, 2]), float(matrix[1, 2])),
+    )
+
+
+def _four(camera: RecordedCamera) -> Array:
+    """Returns the four distortion coefficients of a fisheye camera."""
+    return camera.distortion if len(camera.distortion) == 4 else np.zeros(4)
+
+
+def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
+    """Returns column and row (H, W) [px] in the recorded image for each pixel of the rectified image.
+
+    Args:
+        camera: the recorded camera.
+        turn: (3, 3) rotation from the axes of the recorded camera to those of the rectified one.
+        rig: calibration of the rectified pair.
+    """
+    size = rig.width_px, rig.height_px
+    if camera.kind == "fisheye":
+        maps = cv2.fisheye.initUndistortRectifyMap(camera.matrix, _four(camera), turn, rig.matrix, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, rig.matrix, size, cv2.CV_32FC1)
+    return np.asarray(maps[0], np.float32), np.asarray(maps[1], np.float32)
+
+
+def _resampled(image: Image, maps: _Maps | None) -> Image:
+    """Returns the image resampled at the positions of the maps by cubic interpolation, black outside the image.
+
+    Without maps, returns the image unchanged."""
+    if maps is None:
+        return image
+    return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -1,0 +1,132 @@
+"""Reading of text files of an untrusted data set: bounded size, YAML without code, paths inside the folder."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from twin.core.geometry import Array
+from twin.core.paths import is_file, resolved
+from twin.errors import TwinError
+
+_MOST_BYTES = 256 * 2**20  # largest list of images or poses
+_MOST_YAML_BYTES = 2**20
+_MOST_ELEMENTS = 64  # largest matrix of a calibration file
+
+
+class _CalibrationLoader(yaml.SafeLoader):
+    """Loader of YAML without code, which also reads the matrices that OpenCV writes."""
+
+
+def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
+    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows."""
+    assert isinstance(node, yaml.MappingNode)
+    matrix = loader.construct_mapping(node, deep=True)
+    data, rows, cols = matrix["data"], int(matrix["rows"]), int(matrix["cols"])
+    if not 0 < rows * cols <= _MOST_ELEMENTS or len(data) != rows * cols:
+        raise yaml.YAMLError(f"a matrix of {rows} rows and {cols} columns has {len(data)} numbers")
+    return [data[k * cols : (k + 1) * cols] for k in range(rows)]
+
+
+def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
+    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list."""
+    assert isinstance(node, yaml.MappingNode)
+    array = loader.construct_mapping(node, deep=True)
+    if not 0 < len(array["data"]) <= _MOST_ELEMENTS:
+        raise yaml.YAMLError(f"an array has {len(array['data'])} numbers")
+    return list(array["data"])
+
+
+for _tag in ("tag:yaml.org,2002:opencv-", "!opencv-"):
+    _CalibrationLoader.add_constructor(_tag + "matrix", _opencv_matrix)
+    _CalibrationLoader.add_constructor(_tag + "nd-matrix", _opencv_array)
+
+
+def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
+    """Returns the contents of a text file.
+
+    Raises:
+        TwinError: the file is missing, is larger than `most_bytes`, or is not text.
+    """
+    if not is_file(file):
+        raise TwinError(str(file), "does not exist or is not a file")
+    try:
+        if file.stat().st_size > most_bytes:
+            raise TwinError(str(file), "is too large", f"up to {most_bytes / 2**20:g} MiB")
+        return file.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise TwinError(str(file), f"cannot be read: {error}", "a text file") from None
+
+
+def read_yaml(file: Path) -> dict[str, Any]:
+    """Returns the contents of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, matrices).
+
+    Raises:
+        TwinError: the file is missing, too large or not a YAML table.
+    """
+    text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
+    try:
+        tree = yaml.load(text, Loader=_CalibrationLoader)  # a SafeLoader: it builds plain values only
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise TwinError(str(file), f"is not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    if not isinstance(tree, dict):
+        raise TwinError(str(file), "is not a YAML table")
+    return tree
+
+
+def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[float]] | None = None) -> Array:
+    """Returns the numbers (n, columns) of a text file; columns are separated by commas or spaces.
+
+    Lines that are empty or begin with # are ignored; further columns are ignored as well.
+
+    Args:
+        file: the file.
+        columns: number of columns to read.
+        convert: function that converts the texts of one line to numbers; by default, float.
+
+    Raises:
+        TwinError: the file cannot be read, or a line has too few columns or a value that is not a finite number.
+    """
+    rows = []
+    for number, parts in text_rows(file):
+        try:
+            values = [float(part) for part in parts[:columns]] if convert is None else convert(parts)
+        except ValueError:
+            values = []
+        if len(values) != columns or not np.isfinite(values).all():
+            raise TwinError(f"{file}:{number}", "is not a line of numbers", f"{columns} finite numbers")
+        rows.append(values)
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def text_rows(file: Path) -> list[tuple[int, list[str]]]:
+    """Returns line number and columns of each line of a text file that is not empty and does not begin with #."""
+    lines = read_text(file).splitlines()
+    return [
+        (number, next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split())
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+
+
+def inside(folder: Path, name: str, source: Path) -> Path:
+    """Returns the path of a file, given its name in a data set; the file must lie in `folder`.
+
+    Args:
+        folder: the folder; a symbolic link that leads out of it is rejected as well.
+        name: name of the file relative to `folder`.
+        source: file or folder that contains the name, for the message.
+
+    Raises:
+        TwinError: the path leads out of the folder.
+    """
+    path = resolved(folder / name)
+    if "\0" in name or not path.is_relative_to(resolved(folder)):
+        raise TwinError(str(source), f"{name[:100]!r} leads out of the folder", f"files in {folder}")
+    return path

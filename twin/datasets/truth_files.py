@@ -1,0 +1,53 @@
+"""Files of true poses: EuRoC/ASL (body), KITTI (camera 0), TUM (left camera)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.records import Trajectory
+from twin.datasets.calibration import StereoCalibration
+from twin.datasets.dataset import Dataset
+from twin.datasets.euroc import camera_truth
+from twin.datasets.kitti import camera_poses
+from twin.datasets.text_files import read_table, text_rows
+from twin.errors import TwinError
+
+_ALLOWED = "TUM (8 columns), KITTI (12 columns) or EuRoC (timestamp in ns and 7 or more columns, by commas)"
+
+
+def read_truth(file: Path, dataset: Dataset, calibration: StereoCalibration) -> Trajectory:
+    """Returns the true poses of the left camera, in the clock of the data set.
+
+    Args:
+        file: EuRoC/ASL data.csv (poses of the body), KITTI poses (camera 0, one line per frame), or TUM (poses of the
+            left camera: time x y z qx qy qz qw).
+        dataset: data set, for the times of a KITTI file.
+        calibration: calibration, for the pose of the left camera in the body.
+
+    Raises:
+        TwinError: the file cannot be read or is of another kind.
+    """
+    rows = text_rows(file)
+    if not rows:
+        raise TwinError(str(file), "has no poses", _ALLOWED)
+    columns, first = len(rows[0][1]), rows[0][1][0].strip()
+    if columns == 12:
+        return camera_poses(file, np.array([frame.time_s for frame in dataset.images]), calibration.body_from_left)
+    if columns >= 8 and first.isdigit() and len(first) >= 16:
+        return camera_truth(file, np.eye(4) if calibration.body_from_left is None else calibration.body_from_left)
+    if columns == 8:
+        return _tum(file)
+    raise TwinError(str(file), f"has {columns} columns", _ALLOWED)
+
+
+def _tum(file: Path) -> Trajectory:
+    """Returns the poses in a TUM trajectory file."""
+    values = read_table(file, 8)
+    if not (np.abs(np.linalg.norm(values[:, 4:], axis=1) - 1) < 0.01).all():
+        raise TwinError(str(file), "has quaternions that are not of unit length", "time x y z qx qy qz qw")
+    poses = np.tile(np.eye(4), (len(values), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = geometry.rotation_from_wxyz(values[:, [7, 4, 5, 6]]), values[:, 1:4]
+    return Trajectory(values[:, 0], poses)

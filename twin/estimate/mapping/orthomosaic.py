@@ -1,0 +1,184 @@
+"""Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
+
+It is made in tiles of at most `TILE_PX` x `TILE_PX` pixels, one after the other; an image is read once for each tile
+that it touches. Memory is that of one tile and of two images (about 250 MB), whatever the size of the survey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.orthomosaic import OrthoTile, finer_grid, tile_side_px, window
+from twin.core.records import Array, ElevationMap, Exposure, Image, MapGrid, StereoRig
+from twin.estimate.mapping import exposure_balance
+from twin.estimate.mapping.orthophoto import Colours, OrthoLayers, add_view, empty_layers, footprint
+
+Map = NDArray[np.float32]
+
+#: Extent of the floor around a tile that may hide its pixels [px].
+_MARGIN_PX = 64
+#: Unmapped cells are filled up to this distance from mapped ones, so that small holes of the map have a colour [cells].
+_FILLED_CELLS = 3
+
+
+class Views(NamedTuple):
+    """Images of an orthomosaic.
+
+    Args:
+        world_from_camera: (n, 4, 4) poses in the axes of the map.
+        depth_m: (n,) median depth of the floor in each image [m].
+        exposures: exposure of each image, None where the cameras did not report it.
+        load: returns an image (H, W, 3) by its number; its pixels are square.
+    """
+
+    world_from_camera: Array
+    depth_m: Array
+    exposures: Sequence[Exposure | None]
+    load: Callable[[int], Image]
+
+
+class Restore(Protocol):
+    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white."""
+
+    def __call__(self, image: Image, exposure: Exposure | None, world_from_camera: Array, /) -> Map: ...
+
+
+def orthomosaic(
+    views: Views,
+    elevation: ElevationMap,
+    rig: StereoRig,
+    restore: Restore | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[OrthoTile]:
+    """Yields the tiles of the orthomosaic, from north-west to south-east; tiles without any colour too.
+
+    The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.
+
+    Args:
+        views: the images.
+        elevation: the estimated map.
+        rig: calibration of the images, with square pixels.
+        restore: removes the effects of lamps and water. None: colours as seen, at equal exposure.
+        progress: called with the finished fraction, 0 to 1.
+    """
+    grid = ortho_grid(views, elevation, rig)
+    factors = np.ones((len(views.depth_m), 3)) if restore else _exposure_factors(views, elevation, rig)
+    lowest_m = float(np.nanmin(elevation.height_m)) if np.isfinite(elevation.height_m).any() else np.nan
+    boxes = np.array([footprint(pose, rig, lowest_m) for pose in views.world_from_camera]).reshape(-1, 4)
+    side = tile_side_px(round(elevation.grid.cell_m / grid.cell_m))
+    tiles = [(row, col) for row in range(0, grid.rows, side) for col in range(0, grid.cols, side)]
+    parts = [_padded(grid, row, col, side) for row, col in tiles]
+    touching = [_touching(boxes, part) for part in parts]
+    n_done, n_all = 0, max(1, sum(map(len, touching)))
+    for (row, col), part, numbers in zip(tiles, parts, touching, strict=True):
+        layers = empty_layers(part, heights_of(elevation, part))
+        for k, colours in _prepared(views, numbers, factors, restore):
+            add_view(layers, colours, views.world_from_camera[k], rig, lowest_m)
+            n_done += 1
+            if progress is not None:
+                progress(n_done / n_all)
+        yield OrthoTile(grid, row, col, _rgba(layers)[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX])
+
+
+def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:
+    """Returns the grid of an orthomosaic, whose pixels have the median ground sample distance of its images."""
+    return finer_grid(elevation.grid, float(np.median(views.depth_m)) / rig.focal_px)
+
+
+def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
+    """Returns the heights (rows, cols) of a map at the pixels of a finer grid, linearly interpolated.
+
+    Small holes of the map are filled with the height of the nearest mapped cell; other holes and pixels outside the map
+    are NaN.
+    """
+    grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
+    first = np.array([grid.north_m - part.north_m, part.west_m - grid.west_m]) / grid.cell_m
+    row, col = np.floor(first + 1e-6).astype(int) - _FILLED_CELLS - 1
+    rows, cols = (-(-size // n) + 2 * _FILLED_CELLS + 3 for size in (part.rows, part.cols))
+    coarse = np.full((rows, cols), np.nan, np.float32)
+    r0, r1, c0, c1 = max(row, 0), min(row + rows, grid.rows), max(col, 0), min(col + cols, grid.cols)
+    if r0 < r1 and c0 < c1:
+        coarse[r0 - row : r1 - row, c0 - col : c1 - col] = elevation.height_m[r0:r1, c0:c1]
+    coarse, known = _filled(coarse)
+    fine = cv2.resize(coarse, (cols * n, rows * n), interpolation=cv2.INTER_LINEAR)
+    fine[cv2.resize(known.astype(np.uint8), (cols * n, rows * n), interpolation=cv2.INTER_NEAREST) == 0] = np.nan
+    top, left = np.round((first - [row, col]) * n).astype(int)
+    return np.ascontiguousarray(fine[top : top + part.rows, left : left + part.cols], np.float32)
+
+
+def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
+    """Returns heights with NaN replaced by the nearest known height, and a mask of known cells and small holes."""
+    unknown = np.isnan(height)
+    if unknown.all():
+        return np.zeros_like(height), ~unknown
+    distance, labels = cv2.distanceTransformWithLabels(
+        unknown.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    label = np.asarray(labels, np.int64)
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[~unknown]] = height[~unknown]
+    closed = cv2.morphologyEx((~unknown).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3)), iterations=_FILLED_CELLS)
+    return of_label[label], (closed > 0) & (np.asarray(distance) <= _FILLED_CELLS)
+
+
+def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> Array:
+    """Returns the factors (n, 3) by which to multiply the images, so that they have equal exposure."""
+    reported = exposure_balance.reported_factors(views.exposures)
+    if reported is not None:
+        return reported
+    points = exposure_balance.patch_points(elevation, rig, float(np.median(views.depth_m)))
+    poses = views.world_from_camera
+    return exposure_balance.estimated_factors(
+        exposure_balance.patch_colours(views.load(k), poses[k], rig, points) for k in range(len(poses))
+    )
+
+
+def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
+    """Returns the grid of the pixels of a tile and of a margin on all its sides."""
+    rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
+    return window(grid, row - _MARGIN_PX, col - _MARGIN_PX, rows + 2 * _MARGIN_PX, cols + 2 * _MARGIN_PX)
+
+
+def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
+    """Returns the numbers of the images whose bounding boxes (n, 4), see `footprint`, overlap a part of the grid."""
+    west, south, east, north = boxes.T
+    east_m, south_m = part.west_m + part.cols * part.cell_m, part.north_m - part.rows * part.cell_m
+    return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))
+
+
+def _prepared(
+    views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
+) -> Iterator[tuple[int, Colours]]:
+    """Yields the numbers and the colours of images, while a second thread prepares the next one."""
+
+    def colours(k: int) -> Colours:
+        image = views.load(k)
+        saturated = cv2.dilate((image.max(axis=2) == 255).astype(np.uint8), np.ones((3, 3), np.uint8))
+        if restore is not None:
+            rgb = restore(image, views.exposures[k], views.world_from_camera[k])
+        else:
+            rgb = image * factors[k].astype(np.float32)
+        return Colours(rgb, np.asarray(saturated, np.uint8))
+
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(colours, int(numbers[0])) if len(numbers) else None
+        for k, following in zip(numbers, [*numbers[1:], None], strict=True):
+            assert coming is not None
+            done = coming.result()
+            coming = None if following is None else pool.submit(colours, int(following))
+            yield int(k), done
+
+
+def _rgba(layers: OrthoLayers) -> NDArray[np.uint8]:
+    """Returns the colours of finished layers with their alpha band (rows, cols, 4)."""
+    known = layers.weight > 0
+    rgba = np.zeros((*known.shape, 4), np.uint8)
+    rgba[known, :3] = np.clip(layers.colour[known] / layers.weight[known][:, None] + 0.5, 0, 255)
+    rgba[known, 3] = 255
+    return rgba

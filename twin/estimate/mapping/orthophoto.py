@@ -1,0 +1,215 @@
+"""Rectification of single images onto the pixels of an orthomosaic, by the estimated heights and poses.
+
+Every pixel of the orthomosaic is projected, at its height, into the image, whose colour there is interpolated
+bicubically. Where several images show a pixel, their colours are averaged with the weights
+
+    w = r exp(-K tan^2(n)),
+
+n the angle of the view from the vertical (zero at nadir) and r a ramp from 0 to 1 at the border of the image. K is so
+large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are blended.
+Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is smaller by a factor, so
+that it is used only where no other image shows the floor. A view of a pixel is discarded where nearer floor hides it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.interpolation import catmull_rom_weights
+from twin.core.records import Array, MapGrid, StereoRig
+
+Map = NDArray[np.float32]
+
+#: K of the weight. Between two cameras 0.15 heights apart, the seam (10 % to 90 % of the weight) is 0.03 heights wide:
+#: 8 pixels of an image with a focal length of 277 px.
+SHARPNESS = 240.0
+_SATURATED = 60.0  # added to -log w where a pixel of the image is saturated; as an angle from nadir: 27 deg
+#: A view whose weight is less than exp(-this) of the best one so far is not added.
+_NEGLIGIBLE = 7.0
+_RAMP_PX, _LEAST_RAMP = 12.0, 1e-3  # width of the ramp at the border of the image, and its value at the border
+#: A pixel is hidden if floor that projects to the same pixel of the image is nearer by more than this fraction.
+_HIDDEN_SHARE = 0.02
+
+
+class OrthoLayers(NamedTuple):
+    """Part of an orthomosaic in progress.
+
+    Args:
+        grid: grid of the pixels of this part.
+        height_m: (rows, cols) height of each pixel, NaN where unknown.
+        colour: (rows, cols, 3) sum of the weighted colours.
+        weight: (rows, cols) sum of the weights relative to exp(-best).
+        best: (rows, cols) least value of -log w so far; inf without a view.
+    """
+
+    grid: MapGrid
+    height_m: Map
+    colour: Map
+    weight: Map
+    best: Map
+
+
+def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
+    """Returns layers of a grid without colours, for pixels of these heights (rows, cols)."""
+    shape = grid.rows, grid.cols
+    best = np.full(shape, np.inf, np.float32)
+    return OrthoLayers(grid, height_m, np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), best)
+
+
+def footprint(world_from_camera: Array, rig: StereoRig, height_m: float) -> Array:
+    """Returns the bounding box (west, south, east, north) [m] of an image on a horizontal plane.
+
+    It is infinite if a corner of the image does not show the plane.
+    """
+    u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
+    corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([rig.normalised(corners), np.ones(4)]) @ world_from_camera[:3, :3].T
+    down_m = world_from_camera[2, 3] - height_m
+    if down_m <= 0 or (rays[:, 2] >= -1e-3).any():
+        return np.array([-np.inf, -np.inf, np.inf, np.inf])
+    at = world_from_camera[:2, 3] - rays[:, :2] * (down_m / rays[:, 2:])
+    return np.concatenate([at.min(axis=0), at.max(axis=0)])
+
+
+class Colours(NamedTuple):
+    """Colours of an image.
+
+    Args:
+        rgb: (H, W, 3) float32.
+        saturated: (H, W) uint8, 1 where the colour is not known because the image is saturated, else 0.
+    """
+
+    rgb: Map
+    saturated: NDArray[np.uint8]
+
+
+def add_view(layers: OrthoLayers, colours: Colours, world_from_camera: Array, rig: StereoRig, lowest_m: float) -> None:
+    """Adds an image to the layers, in place.
+
+    Args:
+        layers: part of the orthomosaic.
+        colours: the image.
+        world_from_camera: (4, 4) pose of the camera.
+        rig: calibration, with square pixels.
+        lowest_m: height below which there is no floor.
+    """
+    grid = layers.grid
+    bounds = _pixels_within(footprint(world_from_camera, rig, lowest_m), grid)
+    if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
+        return
+    camera_from_world = geometry.inverse(world_from_camera)
+    north_west = np.array([grid.west_m + grid.cell_m / 2, grid.north_m - grid.cell_m / 2, 0.0])
+    rotation = camera_from_world[:3, :3]
+    steps = np.column_stack([rotation[:, 0] * grid.cell_m, -rotation[:, 1] * grid.cell_m, rotation[:, 2]])
+    view = (
+        np.ascontiguousarray(steps),
+        rotation @ (north_west - world_from_camera[:3, 3]),
+        np.append(world_from_camera[:3, 3] - north_west, grid.cell_m),
+        np.array([rig.focal_px, rig.cx_px, rig.cy_px]),
+    )
+    nearest = np.full(colours.saturated.shape, np.inf, np.float32)
+    _mark_nearest(layers.height_m, *bounds, *view, nearest)
+    _blend(*layers[1:], *bounds, *view, *colours, nearest)
+
+
+def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
+    """Returns first and end row, first and end column of the pixels of a grid in a box, see `footprint`."""
+    west, south, east, north = box_m
+    rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
+    cols = np.clip([(west - grid.west_m) / grid.cell_m, (east - grid.west_m) / grid.cell_m + 1], 0, grid.cols)
+    return int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
+    """Fills `nearest` (H, W), for each pixel of an image, with the smallest depth of orthomosaic pixels imaged there.
+
+    The arguments are those of `_blend`.
+    """
+    focal, cx, cy = camera
+    for i in range(first, end):
+        for j in range(left, right):
+            z = height[i, j]
+            depth = origin[2] + j * steps[2, 0] + i * steps[2, 1] + z * steps[2, 2]
+            if not depth > 0:
+                continue
+            per_z = focal / depth
+            u = int(cx + per_z * (origin[0] + j * steps[0, 0] + i * steps[0, 1] + z * steps[0, 2]))
+            v = int(cy + per_z * (origin[1] + j * steps[1, 0] + i * steps[1, 1] + z * steps[1, 2]))
+            # two by two pixels of the image, as one may be smaller than a pixel of the orthomosaic
+            for row in range(max(v, 0), min(v + 2, nearest.shape[0])):
+                for col in range(max(u, 0), min(u + 2, nearest.shape[1])):
+                    nearest[row, col] = min(nearest[row, col], np.float32(depth))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(
+    height, colour, weight, best, first, end, left, right, steps, origin, camera_at, camera, image, clipped,
+    nearest,
+):  # fmt: skip
+    """Adds the colours of an image to `colour`, `weight` and `best`, see `OrthoLayers`.
+
+    Args:
+        first, end, left, right: rows and columns of the pixels to process.
+        steps: (3, 3) change of the point in camera axes by one column, one row and one metre of height.
+        origin: (3,) point of pixel (0, 0) at height 0 in camera axes.
+        camera_at: x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
+        camera: focal length, column and row of the principal point [px].
+        image, clipped: see `Colours`.
+        nearest: (H, W) smallest depth in each pixel of the image.
+    """
+    focal, cx, cy = camera
+    rows, cols, _ = image.shape
+    east, north, up, cell = camera_at
+    for i in range(first, end):
+        for j in range(left, right):
+            z = height[i, j]
+            depth = origin[2] + j * steps[2, 0] + i * steps[2, 1] + z * steps[2, 2]
+            if not depth > 0:
+                continue
+            dx, dy, dz = j * cell - east, -i * cell - north, up - z
+            score = SHARPNESS * (dx * dx + dy * dy) / (dz * dz)
+            if not score < best[i, j] + _NEGLIGIBLE:
+                continue
+            u = cx + focal / depth * (origin[0] + j * steps[0, 0] + i * steps[0, 1] + z * steps[0, 2])
+            v = cy + focal / depth * (origin[1] + j * steps[1, 0] + i * steps[1, 1] + z * steps[1, 2])
+            inside = min(min(u, cols - 1 - u), min(v, rows - 1 - v))
+            if inside < 0 or depth > nearest[int(v + 0.5), int(u + 0.5)] * (1 + _HIDDEN_SHARE):
+                continue
+            score += _SATURATED * clipped[int(v + 0.5), int(u + 0.5)] - np.log(
+                max(min(inside / _RAMP_PX, 1.0), _LEAST_RAMP)
+            )
+            if score < best[i, j]:
+                scale = np.exp(score - best[i, j])
+                weight[i, j] *= scale
+                for k in range(3):
+                    colour[i, j, k] *= scale
+                best[i, j] = score
+            w = np.float32(np.exp(best[i, j] - score))
+            weight[i, j] += w
+            _add_sample(image, u, v, w, colour[i, j])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_sample(image, u, v, w, colour):
+    """Adds w times the colour of an image at column u and row v, interpolated bicubically, to `colour` (3,)."""
+    rows, cols, _ = image.shape
+    i, j = int(v), int(u)
+    down, across = catmull_rom_weights(np.float32(v - i)), catmull_rom_weights(np.float32(u - j))
+    red = green = blue = np.float32(0.0)
+    for a in range(4):
+        row = image[min(max(i - 1 + a, 0), rows - 1)]
+        for b in range(4):
+            share = down[a] * across[b]
+            pixel = row[min(max(j - 1 + b, 0), cols - 1)]
+            red += share * pixel[0]
+            green += share * pixel[1]
+            blue += share * pixel[2]
+    colour[0] += w * red
+    colour[1] += w * green
+    colour[2] += w * blue

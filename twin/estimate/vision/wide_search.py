@@ -1,0 +1,81 @@
+"""Coarse motion between two keyframes without a prediction: features matched over the whole images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import StereoRig
+from twin.estimate.vision import matching
+from twin.estimate.vision.stereo import StereoPoints
+
+_MOST_FEATURES = 1000
+_RATIO = 0.8  # largest ratio of the distances of the best and the second best descriptor (Lowe 2004)
+_INLIER_PX = 2.0
+_MIN_INLIERS, _MIN_INLIER_SHARE = 15, 0.3
+_CONFIDENCE, _ITERATIONS = 0.999, 500
+
+
+def coarse_motion(
+    node: matching.Gray, other: matching.Gray, points: StereoPoints, rig: StereoRig, patch_px: int
+) -> Array | None:
+    """Returns the pose (4, 4) of a node in the left camera of another one; None if too few features agree.
+
+    SIFT features (Lowe 2004) of the left images are matched by their descriptors. The features of the node get their
+    depth from the nearest matched stereo point within a patch. The pose follows from the points and their pixels in
+    the other image (perspective-n-point with RANSAC). It is accurate to a pixel or two: a prediction, not a
+    measurement.
+
+    Args:
+        node, other: (H, W) grey levels of the left images.
+        points: matched stereo points of the node.
+        rig: calibration at the scale of the images.
+        patch_px: largest distance of a feature from a stereo point [px].
+    """
+    sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
+    node_px, node_descriptors = _features(sift, node)
+    other_px, other_descriptors = _features(sift, other)
+    if len(node_px) < _MIN_INLIERS or len(other_px) < _MIN_INLIERS:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(node_descriptors, other_descriptors, k=2)
+    best = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < _RATIO * pair[1].distance]
+    rows, columns = np.array([[m.queryIdx, m.trainIdx] for m in best], dtype=np.int64).reshape(-1, 2).T
+    distances_px, indices = KDTree(points.pixels).query(node_px[rows])
+    distance_px, nearest = np.asarray(distances_px), np.asarray(indices)
+    near = distance_px <= patch_px
+    xyz, pixels = _at_features(points, nearest[near], node_px[rows[near]], rig), other_px[columns[near]]
+    if len(xyz) < _MIN_INLIERS:
+        return None
+    ok, rotation, translation, inliers = cv2.solvePnPRansac(
+        xyz, pixels, rig.matrix, np.zeros(4), reprojectionError=_INLIER_PX, confidence=_CONFIDENCE,
+        iterationsCount=_ITERATIONS, flags=cv2.SOLVEPNP_EPNP,
+    )  # fmt: skip
+    n = 0 if not ok or inliers is None else len(inliers)
+    if n < max(_MIN_INLIERS, _MIN_INLIER_SHARE * len(xyz)):
+        return None
+    return geometry.pose(
+        geometry.so3_exp(np.asarray(rotation, np.float64).ravel()), np.asarray(translation, np.float64).ravel()
+    )
+
+
+def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Returns positions (n, 2) [px] and descriptors (n, 128) of the features of an image."""
+    levels = np.clip(matching.normalise(np.asarray(image, np.float32)), 0, 255).astype(np.uint8)
+    found, descriptors = sift.detectAndCompute(levels, None)
+    pixels = np.array([feature.pt for feature in found], np.float64).reshape(-1, 2)
+    return pixels, np.zeros((0, 128), np.float32) if descriptors is None else np.asarray(descriptors, np.float32)
+
+
+def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array, rig: StereoRig) -> Array:
+    """Returns the positions (n, 3) [m] of features at `pixels` (n, 2), in the axes of the left camera.
+
+    The disparity of a feature is extrapolated linearly from its nearest stereo point.
+    """
+    offset_px = pixels - points.pixels[nearest]
+    disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
+    depth_m = rig.focal_px * rig.baseline_m / np.maximum(disparity, 0.5)
+    return np.column_stack([rig.normalised(pixels), np.ones(len(pixels))]) * depth_m[:, None]

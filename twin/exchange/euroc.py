@@ -1,0 +1,78 @@
+"""Writer of EuRoC/ASL folders: stereo images, calibration and truth in a layout that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from twin.core import geometry
+from twin.core.records import Frame, StereoRig, Trajectory
+
+_FIRST_NS = 1_000_000_000  # time of a frame at 0 s: EuRoC has no times of zero
+
+
+class EurocWriter:
+    """Writes the frames of a survey to an EuRoC/ASL folder, one by one, and finally the truth.
+
+    Args:
+        folder: folder to write; `mav0` is created in it.
+        rig: calibration of the frames.
+        jpeg_quality: quality of JPEG images, 1 to 100; None: PNG, without loss.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, rig: StereoRig, jpeg_quality: int | None = None):
+        self.root, self.rig, self._quality = folder / "mav0", rig, jpeg_quality
+        self._suffix = ".png" if jpeg_quality is None else ".jpg"
+        for camera, pose in (("cam0", np.eye(4)), ("cam1", rig.left_from_right)):
+            (self.root / camera / "data").mkdir(parents=True, exist_ok=True)
+            self._write_sensor(camera, rig.body_from_camera @ pose)
+            (self.root / camera / "data.csv").write_text("#timestamp [ns],filename\n", encoding="utf-8")
+
+    def add(self, frame: Frame) -> None:
+        """Writes the images of a frame; the right one may be missing."""
+        for camera, image in (("cam0", frame.left), ("cam1", frame.right)):
+            if image is not None:
+                name = f"{timestamp_ns(frame.time_s)}{self._suffix}"
+                options = [] if self._quality is None else [cv2.IMWRITE_JPEG_QUALITY, self._quality]
+                if not cv2.imwrite(str(self.root / camera / "data" / name), image[..., ::-1], options):
+                    raise OSError(f"{name} cannot be written")
+                with (self.root / camera / "data.csv").open("a", encoding="utf-8") as file:
+                    file.write(f"{timestamp_ns(frame.time_s)},{name}\n")
+
+    def add_truth(self, truth: Trajectory) -> None:
+        """Writes the true poses of the left camera as poses of the body."""
+        folder = self.root / "state_groundtruth_estimate0"
+        folder.mkdir(exist_ok=True)
+        world_from_body = truth.world_from_camera @ geometry.inverse(self.rig.body_from_camera)
+        lines = ["#timestamp [ns],x [m],y [m],z [m],qw [],qx [],qy [],qz []"]
+        for time_s, pose in zip(truth.times_s, world_from_body, strict=True):
+            values = [*pose[:3, 3], *geometry.quaternion_wxyz(pose[:3, :3])]
+            lines.append(",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in values)]))
+        (folder / "data.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def _write_sensor(self, camera: str, body_from_camera: np.ndarray) -> None:
+        """Writes sensor.yaml of one camera; the images are rectified, so their distortion is zero."""
+        rig = self.rig
+        tree = {
+            "sensor_type": "camera",
+            "T_BS": {"cols": 4, "rows": 4, "data": [float(value) for value in body_from_camera.ravel()]},
+            "rate_hz": float(rig.frame_rate_hz),
+            "resolution": [rig.width_px, rig.height_px],
+            "camera_model": "pinhole",
+            "intrinsics": [float(value) for value in (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px)],
+            "distortion_model": "radial-tangential",
+            "distortion_coefficients": [0.0] * 4,
+        }
+        text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
+        (self.root / camera / "sensor.yaml").write_text(text, encoding="utf-8")
+
+
+def timestamp_ns(time_s: float) -> int:
+    """Returns the EuRoC timestamp of a frame [ns]: its time after the start of the survey, plus one second."""
+    return _FIRST_NS + round(time_s * 1e9)

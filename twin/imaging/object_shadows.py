@@ -1,0 +1,213 @@
+"""Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
+
+For each light, the objects are drawn into a depth image as seen from the light (shadow map, Williams 1978), which spans
+the points that the camera sees and has as many pixels as its image. A point is in the shadow where the map shows a
+nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the image.
+Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit unless
+the map is nearer to the light by more than a bias of some pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import StereoRig
+from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
+from twin.imaging.object_view import Objects
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
+MARGIN_PX = 2.0  #: of the map around these points
+WIDEST_TANGENT = 5.0  #: of half the field of view of a map; points farther off its axis count as lit
+BIAS_PX = 1.5  #: least distance between a lit point of an object and what occludes it, on a surface facing the light
+STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias grows
+
+
+class _LightView(NamedTuple):
+    """View of a light for its shadow map.
+
+    Args:
+        light_from_camera: (4, 4) transform from the axes of the camera to those of the view.
+        projection: projection of the map.
+        limits: (k, 4) planes of the view, see `Objects.in_view`.
+        shape: rows and columns of the map.
+    """
+
+    light_from_camera: Array
+    projection: Projection
+    limits: Array
+    shape: tuple[int, int]
+
+
+class ObjectShadows:
+    """Shadow casting by objects.
+
+    Args:
+        objects: the objects.
+        rig: the rendered cameras.
+        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
+        to_sun: (3,) unit direction to the sun in world axes; None: the sun casts no shadow.
+    """
+
+    def __init__(self, objects: Objects, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None):
+        self._objects, self._focal_px = objects, rig.focal_px
+        self._lamps, self._to_sun = lamp_positions_m, to_sun
+
+    def darken(
+        self,
+        lit: NDArray[np.uint8],
+        depth: Depth,
+        view: ObjectView,
+        world_from_camera: Array,
+        moment: tuple[int, float],
+    ) -> None:
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun.
+
+        The last mask is that of the sun if it casts shadows.
+
+        Args:
+            lit: 0 where the floor occludes the light, else 1; modified in place.
+            depth: (H, W) depth of floor and objects along the optical axis [m].
+            view: the objects in the image.
+            world_from_camera: (4, 4) pose of this camera.
+            moment: camera (0 left, 1 right), and time since the start of the survey [s].
+        """
+        camera, time_s = moment
+        points = self._sampled_points(depth)
+        if not len(points):
+            return
+        camera_from_world = geometry.inverse(world_from_camera)
+        for k in range(len(lit)):
+            if k < len(self._lamps[camera]):
+                light = _lamp_view(self._lamps[camera][k], points, depth.shape)
+            else:
+                assert self._to_sun is not None
+                light = _sun_view(camera_from_world[:3, :3] @ self._to_sun, points, depth.shape)
+            if light is None:
+                continue
+            nearest = np.full(light.shape, np.inf, np.float32)
+            light_from_world = light.light_from_camera @ camera_from_world
+            for item in self._objects.in_view(light_from_world, light.limits, light.projection, time_s):
+                draw_mesh(item.mesh, item.camera_from_object, light.projection, Target(nearest), 0, item.closed)
+            matrix = np.ascontiguousarray(light.light_from_camera[:3])
+            _darken(lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection)
+
+    def _sampled_points(self, depth: Depth) -> Array:
+        """Returns points (n, 3) [m] of floor and objects in camera axes, for every STRIDE_PX-th row and column."""
+        height, width = depth.shape
+        rows = np.unique(np.append(np.arange(0, height, STRIDE_PX), height - 1))
+        cols = np.unique(np.append(np.arange(0, width, STRIDE_PX), width - 1))
+        z = depth[np.ix_(rows, cols)].astype(np.float64)
+        x = (cols - (width - 1) / 2) / self._focal_px * z
+        y = (rows[:, None] - (height - 1) / 2) / self._focal_px * z
+        return np.stack([x, y, z], axis=-1)[np.isfinite(z)]
+
+
+def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
+    """Returns the view of a lamp, with its axis in the mean direction of the points; None if none is in front."""
+    away = points - lamp_m
+    rotation = _axes_along((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0))
+    seen = away @ rotation
+    ahead = seen[seen[:, 2] > NEAR_M]
+    if not len(ahead):
+        return None
+    tangents = np.clip(ahead[:, :2] / ahead[:, 2:], -WIDEST_TANGENT, WIDEST_TANGENT)
+    low, high = tangents.min(axis=0), tangents.max(axis=0)
+    focal_px = _scale(low, high, shape)
+    margin = MARGIN_PX / focal_px
+    low, high = low - margin, high + margin
+    planes = np.array(
+        [[1, 0, -low[0], 0], [-1, 0, high[0], 0], [0, 1, -low[1], 0], [0, -1, high[1], 0], [0, 0, 1, -NEAR_M]]
+    )
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, NEAR_M, True)
+    return _LightView(_looking(rotation, lamp_m), projection, planes, _size(low, high, focal_px))
+
+
+def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
+    """Returns the parallel view of the sun, whose direction `to_sun` (3,) is in the axes of the camera."""
+    rotation = _axes_along(-to_sun)
+    seen = points @ rotation
+    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    focal_px = _scale(low, high, shape)
+    margin = MARGIN_PX / focal_px
+    low, high = low - margin, high + margin
+    planes = np.array([[1, 0, 0, -low[0]], [-1, 0, 0, high[0]], [0, 1, 0, -low[1]], [0, -1, 0, high[1]]])
+    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, -np.inf, False)
+    return _LightView(_looking(rotation, np.zeros(3)), projection, planes, _size(low, high, focal_px))
+
+
+def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
+    """Returns the focal length or scale [px] of a shadow map of this extent with about as many pixels as the image."""
+    area = np.maximum(high - low, 1e-3).prod()
+    return float(np.sqrt(shape[0] * shape[1] / area))
+
+
+def _size(low: Array, high: Array, focal_px: float) -> tuple[int, int]:
+    """Returns the number of rows and columns of a shadow map of the given extent."""
+    cols, rows = np.ceil((high - low) * focal_px).astype(int) + 1
+    return int(rows), int(cols)
+
+
+def _axes_along(forward: Array) -> Array:
+    """Returns a rotation (3, 3) whose third column is along `forward`."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _looking(rotation: Array, position_m: Array) -> Array:
+    """Returns the transform (4, 4) from camera axes to those of a view, whose axes are the columns of `rotation`."""
+    return geometry.inverse(geometry.pose(rotation, position_m))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _darken(lit, depth, focal, normal, label, nearest, matrix, projection):
+    """Sets `lit` (H, W) to 0 where the map `nearest` shows an object that occludes the light.
+
+    A point is occluded if the map is nearer than the point minus a bias. On an object, the bias is BIAS_PX pixels of
+    the map times 1 + the tangent of the angle of incidence; on the floor, it is one pixel of the map.
+    """
+    scale, cx, cy, _, perspective = projection
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            z = np.float64(depth[v, u])
+            if lit[v, u] == 0 or not np.isfinite(z):
+                continue
+            x, y = (u - 0.5 * (width - 1)) / focal * z, (v - 0.5 * (height - 1)) / focal * z
+            a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+            b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+            c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+            share = 1.0
+            if perspective:
+                if c <= 0:
+                    continue
+                share = 1 / c
+            col, row = np.rint(scale * a * share + cx), np.rint(scale * b * share + cy)
+            if not (0 <= col < nearest.shape[1] and 0 <= row < nearest.shape[0]):
+                continue
+            bias = 1 / (scale * share)
+            if label[v, u]:
+                nx, ny, nz = normal[v, u, 0], normal[v, u, 1], normal[v, u, 2]
+                # direction to the light, in the axes of the view: towards its origin, or against its axis
+                da, db, dc = (-a, -b, -c) if perspective else (0.0, 0.0, -1.0)
+                na = matrix[0, 0] * nx + matrix[0, 1] * ny + matrix[0, 2] * nz
+                nb = matrix[1, 0] * nx + matrix[1, 1] * ny + matrix[1, 2] * nz
+                nc = matrix[2, 0] * nx + matrix[2, 1] * ny + matrix[2, 2] * nz
+                cosine = (na * da + nb * db + nc * dc) / np.sqrt(da * da + db * db + dc * dc)
+                if cosine <= 0:
+                    lit[v, u] = 0
+                    continue
+                tangent = np.sqrt(max(1 - cosine * cosine, 0.0)) / cosine
+                bias *= BIAS_PX * (1 + min(tangent, STEEPEST))
+            if nearest[int(row), int(col)] < c - bias:
+                lit[v, u] = 0

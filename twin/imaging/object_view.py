@@ -1,0 +1,112 @@
+"""Objects in the images of the cameras: drawn over the rendered floor where they are nearer to the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.mesh import Mesh
+from terrains.objects.model import PlacedObject
+from twin.core import geometry
+from twin.core.records import Image, StereoRig
+from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
+from twin.imaging.sway import swayed
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+LEVEL_PX = 1.0  #: largest cell of a level of detail in the image [px]
+
+
+class DrawnMesh(NamedTuple):
+    """A mesh to draw: triangles, pose relative to the camera (4, 4), number of the object, and whether it is closed."""
+
+    mesh: Mesh
+    camera_from_object: Array
+    number: int
+    closed: bool
+
+
+class Objects:
+    """Objects in the world, with the level of detail that a view needs.
+
+    Args:
+        placed: the objects.
+        current_mps: (3,) velocity of the current, in which plants sway.
+    """
+
+    def __init__(self, placed: Sequence[PlacedObject], current_mps: Array | None = None):
+        self.placed = tuple(placed)
+        self._current_mps = np.zeros(3) if current_mps is None else current_mps
+        self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
+        self._radii_m = np.array([item.radius_m for item in placed])
+
+    def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> Iterator[DrawnMesh]:
+        """Yields the meshes of the objects in view, nearest first.
+
+        Args:
+            camera_from_world: (4, 4) transform to the axes of the camera.
+            limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
+            pixel: projection, whose pixels determine the levels of detail.
+            time_s: time since the start of the survey.
+        """
+        centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
+        order = np.flatnonzero(visible)
+        for k in order[np.argsort(centres[order, 2])]:
+            item = self.placed[k]
+            nearest_m = max(centres[k, 2] - self._radii_m[k], pixel.near_m)
+            pixel_m = (nearest_m if pixel.perspective else 1.0) / pixel.focal_px
+            mesh = _level(item, LEVEL_PX * pixel_m)
+            if item.model.sways:
+                mesh = swayed(mesh, item, self._current_mps, time_s)
+            yield DrawnMesh(mesh, camera_from_world @ item.world_from_object, int(k), item.model.closed)
+
+
+class ObjectRenderer:
+    """Draws objects into rendered images of the floor.
+
+    Args:
+        objects: the objects.
+        rig: calibration of the rendered cameras.
+    """
+
+    def __init__(self, objects: Objects, rig: StereoRig):
+        self._objects = objects
+        self._projection = Projection(rig.focal_px, rig.cx_px, rig.cy_px, NEAR_M, True)
+        self._limits = frustum(rig)
+
+    def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
+        """Draws the objects into `albedo` (H, W, 3) and `depth` (H, W) in place; returns their normals and labels.
+
+        Args:
+            albedo: (H, W, 3) uint8 albedo of the floor.
+            depth: (H, W) depth of the floor along the optical axis [m].
+            world_from_camera: (4, 4) pose of the camera.
+            time_s: time since the start of the survey.
+        """
+        view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
+        target = Target(depth, albedo, *view)
+        camera_from_world = geometry.inverse(world_from_camera)
+        for item in self._objects.in_view(camera_from_world, self._limits, self._projection, time_s):
+            draw_mesh(item.mesh, item.camera_from_object, self._projection, target, item.number + 1, item.closed)
+        return view
+
+
+def frustum(rig: StereoRig) -> Array:
+    """Returns the planes (5, 4) of the view of a camera in its axes: inward unit normal and offset [m]."""
+    left, right = (rig.cx_px + 0.5) / rig.focal_px, (rig.width_px - 0.5 - rig.cx_px) / rig.focal_px
+    top, bottom = (rig.cy_px + 0.5) / rig.focal_px, (rig.height_px - 0.5 - rig.cy_px) / rig.focal_px
+    planes = np.array(
+        [[1, 0, left, 0], [-1, 0, right, 0], [0, 1, top, 0], [0, -1, bottom, 0], [0, 0, 1, -NEAR_M]], np.float64
+    )
+    return planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+
+
+def _level(item: PlacedObject, cell_m: float) -> Mesh:
+    """Returns the coarsest level of detail of an object whose cells are at most `cell_m` in the world."""
+    fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
+    return fine_enough[-1].mesh

@@ -1,0 +1,104 @@
+"""Weighted sums of neighbouring colours, in vector instructions.
+
+The compiler does not vectorize across the bands of a colour, and reads tables element by element. These intrinsics emit
+the vector operations themselves: for 4 x 4 pixels of an image, and for entries of a table of R, G, B and a zero.
+"""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+_PIXELS, _BANDS = 4, 3
+_FUSED = ("contract",)  # lets the compiler fuse multiplication and addition
+_NUMBER, _INDEX = ir.FloatType(), ir.IntType(32)
+
+
+@intrinsic
+def sum_of_pixels(typingctx, image, start, stride, weights, at):
+    """Returns the three weighted sums (R, G, B) of 4 x 4 pixels of a float32 image; no bounds are checked.
+
+    Args:
+        image: (H, 3 W) image, contiguous.
+        start: index of the first band of the top left pixel in the flattened image.
+        stride: number of values from row to row.
+        weights: (8, n) weights of the columns (0 to 3) and of the rows (4 to 7), contiguous float32.
+        at: column of `weights`.
+    """
+    result = types.UniTuple(types.float32, _BANDS)
+    signature = result(image, types.int64, types.int64, weights, types.int64)
+
+    def emit(context, builder, sig, args):
+        image_type, _, _, weights_type, _ = sig.args
+        values = context.make_array(image_type)(context, builder, args[0]).data
+        shares = context.make_array(weights_type)(context, builder, args[3])
+        n = cgutils.unpack_tuple(builder, shares.shape)[1]
+        wide, narrow = ir.VectorType(_NUMBER, _PIXELS * _BANDS), ir.VectorType(_NUMBER, _PIXELS)
+
+        def weight(k, vector):
+            place = builder.add(builder.mul(n, ir.Constant(n.type, k)), args[4])
+            return _repeated(builder, builder.load(builder.gep(shares.data, [place])), vector)
+
+        column = None
+        for k in range(_PIXELS):
+            place = builder.add(args[1], builder.mul(args[2], ir.Constant(args[2].type, k)))
+            column = _add(builder, column, _load(builder, values, place, wide), weight(_PIXELS + k, wide))
+        total = None
+        for k in range(_PIXELS):
+            bands = [min(_BANDS * k + band, _PIXELS * _BANDS - 1) for band in range(_PIXELS)]
+            mask = ir.Constant(ir.VectorType(_INDEX, _PIXELS), bands)
+            pixel = builder.shuffle_vector(column, ir.Constant(wide, ir.Undefined), mask)
+            total = _add(builder, total, pixel, weight(k, narrow))
+        return context.make_tuple(builder, result, _bands(builder, total))
+
+    return signature, emit
+
+
+@intrinsic
+def sum_of_entries(typingctx, table, places, weights):
+    """Returns the three weighted sums (R, G, B) of entries of a float32 table; no bounds are checked.
+
+    Args:
+        table: flattened table of R, G, B and a zero, contiguous.
+        places: tuple of the indices of R of each entry, uint32.
+        weights: tuple of their weights, float32.
+    """
+    result = types.UniTuple(types.float32, _BANDS)
+
+    def emit(context, builder, sig, args):
+        values, vector = context.make_array(sig.args[0])(context, builder, args[0]).data, ir.VectorType(_NUMBER, 4)
+        places, weights = (cgutils.unpack_tuple(builder, pair) for pair in args[1:])
+        total = None
+        for place, weight in zip(places, weights, strict=True):
+            entry = _load(builder, values, builder.zext(place, ir.IntType(64)), vector)
+            total = _add(builder, total, entry, _repeated(builder, weight, vector))
+        return context.make_tuple(builder, result, _bands(builder, total))
+
+    return result(table, places, weights), emit
+
+
+def _load(builder, values, place, vector):
+    """Returns the LLVM code that loads a vector of consecutive values, the first with the index `place`."""
+    loaded = builder.load(builder.bitcast(builder.gep(values, [place]), vector.as_pointer()))
+    loaded.align = 4
+    return loaded
+
+
+def _repeated(builder, number, vector):
+    """Returns the LLVM code for a vector whose elements all equal a number."""
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, _INDEX(0))
+    zeros = ir.Constant(ir.VectorType(_INDEX, vector.count), [0] * vector.count)
+    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
+
+
+def _add(builder, total, value, weight):
+    """Returns the LLVM code for total + value * weight; a total of None counts as 0."""
+    term = builder.fmul(value, weight, flags=_FUSED)
+    return term if total is None else builder.fadd(total, term, flags=_FUSED)
+
+
+def _bands(builder, vector):
+    """Returns the LLVM code for the first three elements of a vector: R, G and B."""
+    return [builder.extract_element(vector, _INDEX(band)) for band in range(_BANDS)]

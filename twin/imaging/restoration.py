@@ -1,0 +1,166 @@
+"""Restoration: the albedo of the floor from an image, without the effects of lamps, daylight and water.
+
+It inverts the model of `optics` with the believed calibration, lamps and water, and with the estimated floor. With W
+the light of a white floor that absorption alone attenuates, u = exp(-b r) the unscattered share, k the share that
+arrives without blur, F the blur by forward scatter (`forward_scatter`) and B the backscatter, the radiance of an image
+is
+
+    L = rho W u + F(rho W) + B.
+
+A floor of uniform albedo gives the first estimate rho = (L - B) / (W u + F(W)). Then the blurred light of this estimate
+is subtracted, and what remains is light without blur:
+
+    rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
+
+The first estimate is right for all detail that is wider than the blur, so few steps suffice. Marine snow, caustics,
+blur of the lens and of motion, and saturated pixels are not restored; the floor is taken to be Lambertian.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import floor_rays, geometry
+from twin.core.records import ElevationMap, Exposure, Image, StereoRig
+from twin.errors import TwinError
+from twin.imaging.facets import Facets
+from twin.imaging.illumination import Illumination
+from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface
+from twin.imaging.photons import vignetting
+from twin.imaging.shadows import Shadows
+from twin.imaging.tone import linear_of
+from twin.scenario.model import Scenario
+
+Array = NDArray[np.float64]
+
+DEPTH_STEP_PX = 4  # spacing of the pixels whose depth is computed; light depends on depth smoothly
+STEPS = 2  # number of corrections of the blur
+_NEAR_ENOUGH = 0.02  # least weight of the mapped cells around a hole that is filled from them
+_DARK = 1e-6  # least light of a white floor, relative to the brightest pixel, that is divided by
+
+
+class EstimatedFloor(NamedTuple):
+    """Heights of the estimated floor, see `facets.Heights`."""
+
+    height_m: NDArray[np.float32]
+    spacing_m: float
+    west_m: float
+    south_m: float
+
+
+class Restoration:
+    """Restores the images of the left camera of a survey.
+
+    Args:
+        scenario: believed lamps, sensor and daylight.
+        illumination: believed water and daylight.
+        rig: believed calibration.
+        elevation: estimated map.
+    """
+
+    def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
+        self._rig, self._optics = rig, Optics(rig, illumination, scenario.lamps)
+        floor = estimated_floor(elevation)
+        self._facets = Facets(floor)
+        self._field = floor_rays.height_field(floor.height_m, *floor[1:])
+        sources = self._optics.light_sources
+        self._shadows = None
+        if scenario.imaging.shadows:
+            self._shadows = Shadows(floor, rig, [source.position_m for source in sources])
+        self._signal = linear_signal(scenario)
+        power = 0.0 if scenario.sensor is None else scenario.sensor.vignetting_power
+        self._vignetting = vignetting(rig, power)[..., None]
+        self._sunny = bool(illumination.daylight.surface_lx.any())
+        self._reference_depth_m = illumination.daylight.reference_depth_m
+        self._world_from_map = geometry.inverse(elevation.map_from_world)
+
+    def __call__(self, image: Image, exposure: Exposure | None, map_from_camera: Array) -> Radiance:
+        """Returns the albedo (H, W, 3) float32 of the floor in an image, 255 = white.
+
+        Args:
+            image: (H, W, 3) left image.
+            exposure: exposure of the image (`Frame.exposure`).
+            map_from_camera: (4, 4) pose of the camera in the axes of the estimated map.
+
+        Raises:
+            TwinError: the exposure is not known.
+        """
+        if exposure is None:
+            raise TwinError("map.restore", "the exposures of the images are not known", "frames with an exposure")
+        radiance = (self._signal[image] / (self._vignetting * np.array(exposure))).astype(np.float32)
+        depth = self._depth(map_from_camera)
+        return np.float32(255) * self._albedo(radiance, depth, map_from_camera)
+
+    def _albedo(self, radiance: Radiance, depth: Depth, map_from_camera: Array) -> Radiance:
+        """Returns the albedo (H, W, 3), 1 = white, of a floor at this depth (H, W) [m] in an image of this radiance."""
+        lit = None if self._shadows is None else self._shadows.lit(depth, map_from_camera, 0)
+        floor = FloorView(self._facets.seen_from(map_from_camera), lit)
+        surface = self._surface(map_from_camera) if self._sunny else None
+        white = self._optics.white_floor(depth, 0, floor, surface)
+        light = np.maximum(radiance - white.backscatter, 0)
+        dark = white.floor < _DARK * white.floor.max()
+        divisor = np.where(dark, np.float32(np.inf), white.floor)
+        if white.spread is None:
+            return (light / divisor).astype(np.float32)
+        whole = divisor * white.unscattered + white.spread(white.floor, np.ones((1, 1, 3), np.float32))
+        albedo = (light / whole).astype(np.float32)
+        for _ in range(STEPS):
+            floor_light = (albedo * white.floor).astype(np.float32)
+            blurred = white.spread(floor_light, albedo) - white.core * floor_light
+            sharp = np.maximum(light - blurred, 0) / (divisor * (white.unscattered + white.core))
+            albedo = sharp.astype(np.float32)
+        return albedo
+
+    def _depth(self, map_from_camera: Array) -> Depth:
+        """Returns the depth (H, W) of the estimated floor [m]; outside the map, that of a fitted plane."""
+        rig = self._rig
+        columns = max(2, rig.width_px // DEPTH_STEP_PX)
+        pixels = floor_rays.ray_grid(rig, columns)
+        depth = floor_rays.cast_pixels(self._field, map_from_camera[None], rig, pixels)[0]
+        terms, per_m = np.column_stack([pixels, np.ones(len(pixels))]), 1 / depth
+        known = per_m > 0
+        if known.sum() < 3:  # the image shows next to nothing of the map, so its colours are not used
+            known, per_m = np.ones_like(known), np.full_like(per_m, 1 / rig.focal_px)
+        plane = np.linalg.lstsq(terms[known], per_m[known], rcond=None)[0]
+        per_m = np.where(known, per_m, np.maximum(terms @ plane, per_m[known].min()))
+        coarse = per_m.reshape(-1, columns).astype(np.float32)
+        return 1 / cv2.resize(coarse, (rig.width_px, rig.height_px), interpolation=cv2.INTER_LINEAR)
+
+    def _surface(self, map_from_camera: Array) -> WaterSurface:
+        """Returns the calm water surface above a camera."""
+        east, north, up = (self._world_from_map @ map_from_camera)[:3]
+        from_camera = np.array([east, north, -up])
+        from_camera[2, 3] += self._reference_depth_m
+        return WaterSurface(None, from_camera)
+
+
+def estimated_floor(elevation: ElevationMap) -> EstimatedFloor:
+    """Returns the heights of a map, with holes filled by a weighted mean of the heights around them.
+
+    The nodes are the centres of the cells. The heights are not smoothed: smoothing tilts the facets at every edge,
+    where the light depends on them most.
+    """
+    grid, height = elevation.grid, elevation.height_m.astype(np.float64)
+    known = np.isfinite(height)
+    weight, value, scale = known.astype(np.float64), np.where(known, height, 0.0), 1.0
+    while known.any() and np.isnan(height).any():
+        total = cv2.GaussianBlur(weight, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
+        blurred = cv2.GaussianBlur(value, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
+        near = np.isnan(height) & (total > _NEAR_ENOUGH)
+        height[near] = blurred[near] / total[near]
+        scale *= 2
+        if scale > max(height.shape):
+            height[np.isnan(height)] = np.nanmean(height)
+    south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
+    upwards = np.ascontiguousarray(height[::-1], np.float32)
+    return EstimatedFloor(upwards, grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
+
+
+def linear_signal(scenario: Scenario) -> NDArray[np.float32]:
+    """Returns the linear signal (256,) of each level of an image, 1 at full scale: the inverse of the tone curve."""
+    curve = "linear" if scenario.sensor is None else scenario.sensor.tone_curve
+    return np.array([linear_of(level / 255, curve) for level in range(256)], np.float32)

@@ -1,0 +1,46 @@
+"""Plants that bend and sway in the current.
+
+A plant is modelled as a cantilever: its deflection grows with the square of the height above its holdfast. It leans
+with the current and oscillates about this mean deflection, at the Strouhal frequency of eddies shed by its width.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.mesh import Mesh
+from terrains.objects.model import PlacedObject
+
+Array = NDArray[np.float64]
+
+HALF_BENT_MPS = 0.5  #: current at which a plant leans by half of its largest lean
+LARGEST_LEAN = 0.6  #: deflection of the tip in a strong current, as a fraction of the height
+OSCILLATION = 0.25  #: amplitude of the oscillation, as a fraction of the lean
+STROUHAL = 0.2
+WAVES = 0.5  #: number of waves along a plant
+
+
+def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) -> Mesh:
+    """Returns the mesh of a plant as the current bends it; unchanged without a horizontal current.
+
+    Args:
+        mesh: a level of detail of the plant, upright.
+        item: the plant.
+        current_mps: (3,) velocity of the current in the world.
+        time_s: time since the start of the survey.
+    """
+    speed = float(np.hypot(*current_mps[:2]))
+    if speed == 0:
+        return mesh
+    in_world = np.append(current_mps[:2] / speed, 0.0)
+    direction = np.linalg.inv(item.world_from_object[:3, :3] / item.scale) @ in_world
+    height_m = item.model.high_m[2]
+    share = mesh.vertices_m[:, 2] / height_m  # of the height
+    lean = LARGEST_LEAN * speed**2 / (speed**2 + HALF_BENT_MPS**2)
+    width_m = item.scale * float((item.model.high_m - item.model.low_m)[:2].max())
+    angle = 2 * np.pi * (STROUHAL * speed / width_m * time_s - WAVES * share) + item.phase
+    deflection = height_m * lean * share**2 * (1 + OSCILLATION * np.sin(angle))
+    vertices = mesh.vertices_m + deflection[:, None] * direction
+    vertices[:, 2] -= deflection**2 / (2 * height_m)  # a bent plant keeps its length
+    return mesh._replace(vertices_m=vertices.astype(np.float32))

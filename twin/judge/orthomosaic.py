@@ -1,0 +1,151 @@
+"""Errors of the orthomosaic against the true one: position, colour and resolution, tile by tile in bounded memory."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.orthomosaic import OrthoTile
+from twin.core.records import Array
+from twin.judge.colour_difference import ciede2000, lab_of
+from twin.judge.patch_shift import patch_shift, transfer
+from twin.judge.summary_statistics import finite_float, percentile
+
+KEYS = (
+    "pixel_m", "coverage_area", "ce90_m", "ce90_px", "bias_east_m", "bias_north_m", "matched",
+    "colour_difference_median", "colour_difference_p90", "edge_width_m",
+)  # fmt: skip
+
+PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest displacement
+#: Patches without any relation reach a correlation of 0.2 at the best displacement, as it has a standard deviation
+#: of 0.06 with about 300 independent pixels.
+LEAST_CORRELATION = 0.25
+_COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is judged
+_BINS = np.linspace(0, 100, 10001)  # of the colour differences
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+#: Distance from 10 % to 90 % of the edge response of a Gaussian blur, in standard deviations.
+_EDGE_PER_SIGMA = 2 * 1.2815515655446004
+_HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1  # of the fit of the blur [1/px]
+
+
+class OrthomosaicJudge:
+    """Compares an orthomosaic with the true one.
+
+    Args:
+        restored: whether the colours are those of the floor; otherwise they are as seen, and are not evaluated.
+    """
+
+    def __init__(self, restored: bool):
+        self._restored = restored
+        self._pixel_m: float | None = None
+        self._shifts: list[tuple[float, float]] = []
+        self._n_patches = 0
+        self._colours = np.zeros(len(_BINS) - 1, np.int64)
+        self._spectra = np.zeros((2, PATCH_PX, PATCH_PX))
+        self._n_asked, self._n_known = 0, 0
+
+    def add(self, tile: OrthoTile, albedo: NDArray[np.float32], asked: NDArray[np.bool_]) -> None:
+        """Adds the errors of a tile.
+
+        Args:
+            tile: part of the orthomosaic.
+            albedo: (rows, cols, 3) true albedo of its pixels, 255 = white; NaN where there is no floor.
+            asked: (rows, cols) whether each pixel lies in the asked area.
+        """
+        self._pixel_m = tile.grid.cell_m
+        self._n_asked += int(asked.sum())
+        self._n_known += int((asked & tile.known).sum())
+        known = tile.known & np.isfinite(albedo[..., 0])
+        if self._restored:
+            self._compare_colours(tile.rgba[..., :3], albedo, known)
+        self._match(tile.rgba[..., :3] @ _LUMINANCE, np.nan_to_num(albedo) @ _LUMINANCE, known)
+
+    def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
+        """Adds the colour differences of every n-th pixel along rows and columns to the histogram."""
+        some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
+        colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
+        self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
+
+    def _match(self, shown: NDArray[np.float32], true: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
+        """Measures the displacement and the spectra of all patches whose surroundings have a colour."""
+        n, m = PATCH_PX, SEARCH_PX
+        for row in range(m, len(shown) - n - m + 1, n):
+            for col in range(m, shown.shape[1] - n - m + 1, n):
+                around = np.s_[row - m : row + n + m, col - m : col + n + m]
+                if not known[around].all():
+                    continue
+                self._n_patches += 1
+                patch = np.ascontiguousarray(shown[row : row + n, col : col + n], np.float32)
+                shift = patch_shift(patch, np.ascontiguousarray(true[around], np.float32), LEAST_CORRELATION)
+                if shift is None:
+                    continue
+                self._shifts.append((shift.right_px, -shift.down_px))
+                down, right = round(shift.down_px), round(shift.right_px)
+                same = true[row - down : row - down + n, col - right : col - right + n]
+                rest = shift._replace(right_px=shift.right_px - right, down_px=shift.down_px - down)
+                self._spectra += np.array(transfer(patch, same, rest))
+
+    def metrics(self) -> dict[str, float | None]:
+        """Returns `orthomosaic.*` of metrics.json; every value is None without an orthomosaic.
+
+        pixel_m is the side of a pixel, coverage_area the fraction of the asked area that has a colour. ce90_m and
+        ce90_px are the 90th percentile of the horizontal displacement of patches against the true orthomosaic (circular
+        error at 90 %), bias_east_m and bias_north_m the medians of its components, and matched the fraction of the
+        patches that were found in the true orthomosaic. colour_difference_median and _p90 are percentiles of CIEDE2000
+        between restored and true albedo; None without restoration. edge_width_m is the distance over which the image of
+        an edge of albedo rises from 10 % to 90 %, for the Gaussian blur that best fits the modulation transfer function
+        between the true orthomosaic and this one.
+        """
+        pixel_m = self._pixel_m
+        if pixel_m is None:
+            return dict.fromkeys(KEYS)
+        shift = np.array(self._shifts).reshape(-1, 2)
+        ce90_px = percentile(np.hypot(*shift.T), 90)
+        east, north = (percentile(column, 50) for column in shift.T)
+        edge_px = edge_width_px(*self._spectra)
+        values = (
+            pixel_m, self._n_known / self._n_asked if self._n_asked else None, _times(ce90_px, pixel_m), ce90_px,
+            _times(east, pixel_m), _times(north, pixel_m), len(shift) / self._n_patches if self._n_patches else None,
+            _percentile_of_counts(self._colours, 50), _percentile_of_counts(self._colours, 90),
+            _times(edge_px, pixel_m),
+        )  # fmt: skip
+        return dict(zip(KEYS, map(finite_float, values), strict=True))
+
+
+def edge_width_px(cross: Array, power: Array) -> float | None:
+    """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits a modulation transfer function.
+
+    The blur has the transfer function exp(-2 (pi sigma f)^2), the measured one is `cross` / `power`. None if too few
+    frequencies have a usable ratio.
+
+    Args:
+        cross: (n, n) sum of the cross-spectra.
+        power: (n, n) sum of the power spectra of the true patches.
+    """
+    n = len(power)
+    f = np.hypot(np.fft.fftfreq(n), np.fft.fftfreq(n)[:, None])
+    ring = np.rint(f * n).astype(int).ravel()
+    total, true, frequency = (np.bincount(ring, values.ravel()) for values in (cross, power, f))
+    frequency /= np.bincount(ring)
+    used = (frequency > 1.5 / n) & (frequency < _HIGHEST_FREQUENCY) & (true > 0)
+    ratio = np.divide(total, true, out=np.zeros_like(total), where=true > 0)
+    used &= ratio > _LEAST_TRANSFER * ratio[used].max(initial=0.0)
+    if used.sum() < 4:
+        return None
+    # ln(H) = ln(gain) - 2 (pi sigma)^2 f^2; the gain absorbs the unknown exposure of colours as seen
+    terms = np.column_stack([np.ones(used.sum()), -2 * np.pi**2 * frequency[used] ** 2])
+    weight = ratio[used]
+    _, variance = np.linalg.lstsq(terms * weight[:, None], np.log(ratio[used]) * weight, rcond=None)[0]
+    return float(_EDGE_PER_SIGMA * np.sqrt(max(variance, 0.0)))
+
+
+def _percentile_of_counts(counts: NDArray[np.int64], percent: float) -> float | None:
+    """Returns a percentile (0 to 100) of values counted in `_BINS`, the upper edge of its bin; None without values."""
+    if not counts.any():
+        return None
+    return float(_BINS[1 + np.searchsorted(np.cumsum(counts), percent / 100 * counts.sum())])
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    """Returns the value times the factor; None if the value is None."""
+    return None if value is None else value * factor

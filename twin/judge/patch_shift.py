@@ -1,0 +1,70 @@
+"""Local displacement of one picture against another, by normalised cross-correlation of patches."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import Array
+
+Layer = NDArray[np.float32]
+
+
+class PatchShift(NamedTuple):
+    """Displacement of a patch.
+
+    Args:
+        right_px, down_px: displacement of the patch in the first picture from its position in the second one.
+        correlation: normalised cross-correlation at the displacement, rounded to pixels.
+    """
+
+    right_px: float
+    down_px: float
+    correlation: float
+
+
+def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchShift | None:
+    """Returns the displacement of a patch (n, n) against a larger picture (n + 2 m, n + 2 m) with the same centre.
+
+    The peak of the correlation is interpolated by a parabola through three values along each axis. Returns None if one
+    of the two has no texture, if the correlation is below `least_correlation`, if the peak lies at the border of the
+    search range of m pixels, or if a second peak, apart from the first, is nearly as high.
+    """
+    if min(patch.std(), around.std()) < 1e-3:
+        return None
+    score = np.asarray(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), np.float64)
+    row, col = np.unravel_index(score.argmax(), score.shape)
+    peak, last = score[row, col], score.shape[0] - 1
+    if not (0 < row < last and 0 < col < last) or peak < least_correlation:
+        return None
+    others = score.copy()
+    others[max(row - 3, 0) : row + 4, max(col - 3, 0) : col + 4] = -1
+    if others.max() > 0.9 * peak:
+        return None
+    down = row + _vertex(*score[row - 1 : row + 2, col]) - last / 2
+    right = col + _vertex(*score[row, col - 1 : col + 2]) - last / 2
+    return PatchShift(-float(right), -float(down), float(peak))
+
+
+def _vertex(before: float, at: float, after: float) -> float:
+    """Returns the position of the vertex of a parabola through values at -1, 0 and 1; the value at 0 is the largest."""
+    curvature = before - 2 * at + after
+    return 0.0 if curvature >= 0 else 0.5 * (before - after) / curvature
+
+
+def transfer(patch: Layer, true: Layer, shift: PatchShift) -> tuple[Array, Array]:
+    """Returns the cross-spectrum of a patch and the true patch (n, n), and the power spectrum of the true patch.
+
+    Both patches are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift`, and its
+    real part is returned. The ratio of the spectra is the modulation transfer function.
+    """
+    n = len(patch)
+    hann = np.hanning(n + 2)[1:-1]
+    taper = hann * hann[:, None]
+    first, second = (np.fft.fft2((picture - picture.mean()) * taper) for picture in (patch, true))
+    f = np.fft.fftfreq(n)
+    phase = np.exp(2j * np.pi * (f * shift.right_px + f[:, None] * shift.down_px))
+    return np.real(first * phase * np.conj(second)), np.abs(second) ** 2

@@ -1,0 +1,259 @@
+"""The mission of Negahdaripour & Madjidi (2003, section V-A): 25 tracks over 100 ft x 100 ft, and the paper's figures.
+
+The mission is flown three times: over the paper's coarse texture with alignment, over the same floor on the integrated
+F2F motion alone, and at full resolution with alignment. All flights are by vision alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.records import Array
+from twin.judge.alignment import farthest_error_m, track_metrics
+from twin.judge.map_error import height_error
+from twin.judge.trajectory import PathErrors, path_errors
+from twin.reproduce import paper_sheet
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
+from twin.reproduce.paper_flight import Flown, fly_aligned, fly_without_alignment
+from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
+
+FOOT_M = 0.3048
+#: Tracks whose errors the paper shows in Fig. 5.
+SHOWN_TRACKS = (1, 2, 3, 4, 5, 11, 16, 21, 25)
+FIRST_TRACKS, FEW = 5, 3  # the paper distinguishes the first five tracks, and "a few" others with larger errors
+MEAN_RANGE_M = 8 * FOOT_M  # the paper relates its errors of elevation to this range
+#: Overrides of the scenarios of the coarse texture and of the full resolution.
+COARSE: tuple[str, ...] = ()
+FINE = ("navigation.aiding=[]",)
+#: The quick plan: 25 tracks as far apart as the paper's, with legs of half a metre, five frames per second and the
+#: paper's motion without rotation.
+QUICK = (
+    "plan.area_m=[0.5, 30.48]", "terrain.size_m=[6.0, 36.0]", "rig.frame_rate_hz=5", "control.hold_s=0.4",
+    "plan.overlap_along=0.8", "vehicle.dynamics=kinematic",
+)  # fmt: skip
+
+
+class Flights(NamedTuple):
+    """The three flights: coarse texture, coarse texture without alignment, full resolution."""
+
+    coarse: Flown
+    unaligned: Flown
+    fine: Flown
+
+
+class Claim(NamedTuple):
+    """A result that the paper states.
+
+    Args:
+        label: name of the quantity.
+        paper: the paper's values, as text.
+        limit_m: the least of the paper's values [m]; a result below it is better than the paper's.
+        value_m: function that returns the value of a flight [m]; NaN if it is unknown.
+    """
+
+    label: str
+    paper: str
+    limit_m: float
+    value_m: Callable[[Flown], float]
+
+
+def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Exhibit:
+    """Flies the mission and writes paper.json and the figures to a folder, which is created if missing.
+
+    Args:
+        folder: folder to write.
+        quick: whether to fly the quick plan, with short legs and a low frame rate.
+        settings: further overrides of the scenarios, each "key=value".
+    """
+    coarse, fine = scenarios(quick, settings)
+    flights = Flights(fly_aligned(coarse), fly_without_alignment(coarse), fly_aligned(fine))
+    folder.mkdir(parents=True, exist_ok=True)
+    exhibit = exhibit_of_flights(flights, quick, figures=draw_figures(flights, folder))
+    write_exhibit(exhibit, folder)
+    return exhibit
+
+
+def scenarios(quick: bool, settings: tuple[str, ...] = ()) -> tuple[Scenario, Scenario]:
+    """Returns the scenario with the coarse texture and the one at full resolution."""
+    plan = (*(QUICK if quick else ()), *settings)
+    return load_scenario("paper_coarse", [*COARSE, *plan]), load_scenario("paper", [*FINE, *plan])
+
+
+def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
+    """Draws the counterparts of the paper's Figs. 4 to 7 in a folder; returns the figures with their captions."""
+    aligned = {"coarse texture": flights.coarse, "full resolution": flights.fine}
+    paper_sheet.draw_paths(aligned, folder / "paper_paths.png")
+    paper_sheet.draw_tracks(aligned, SHOWN_TRACKS, folder / "paper_tracks.png")
+    paper_sheet.draw_errors(aligned, folder / "paper_errors.png")
+    paper_sheet.draw_maps(*flights, folder / "paper_maps.png")
+    return (
+        Figure("paper_paths.png", "Integrated frame-to-frame motion, and the path after alignment (Fig. 4)."),
+        Figure("paper_tracks.png", "Position error of the keyframes of a window, just before and after its global "
+               "alignment, for the tracks of Fig. 5."),
+        Figure("paper_errors.png", "Errors of position, height and heading along the path after alignment; dashed: "
+               "ends of tracks (Fig. 6)."),
+        Figure("paper_maps.png", "True elevation, map after alignment, map flown without alignment, and histogram of "
+               "the absolute error (Fig. 7)."),
+    )  # fmt: skip
+
+
+def exhibit_of_flights(flights: Flights, quick: bool, figures: tuple[Figure, ...] = ()) -> Exhibit:
+    """Returns the results of the flights: text, tables and the given figures."""
+    tables = (claims_table(flights), tracks_table(flights), path_table(flights), map_table(flights))
+    return Exhibit("paper", "The paper's mission: 25 tracks", _text(flights, quick), tables, figures)
+
+
+def _text(flights: Flights, quick: bool) -> str:
+    """Returns a description of the flights, in sentences."""
+    plan, n = flights.coarse.mission.plan, len(flights.coarse.result.keyframe_rows)
+    flown = (
+        f"{plan.n_tracks} tracks of two legs of {plan.swath_length_m:.1f} m, {plan.swath_spacing_m:.2f} m apart, by "
+        f"vision alone: {len(flights.coarse.truth.trajectory)} frames and {n} keyframes over a texture of 3 inches at "
+        "320 x 240 pixels (the paper's worst case), and once more over a fine texture at 640 x 480 pixels."
+    )
+    if quick:
+        flown += " Quick plan: short legs, 5 frames per second, level motion without rotation."
+    ended = [flight.ended for flight in flights if flight.ended]
+    return " ".join([flown, *(f"A flight ended early: {reason}." for reason in ended)])
+
+
+CLAIMS = (
+    Claim("largest position error, tracks 1 to 5", "about 1 ft = 0.30 m", FOOT_M,
+          lambda flown: _largest(_first_tracks(flown))),
+    Claim("position error at the far end, worst track after the fifth", "2 to 4 ft = 0.61 to 1.22 m", 2 * FOOT_M,
+          lambda flown: _ranked(_far_ends(flown), 0)),
+    Claim(f"the same, without the {FEW} worst tracks", "at most 1.5 ft = 0.46 m", 1.5 * FOOT_M,
+          lambda flown: _ranked(_far_ends(flown), FEW)),
+    Claim("largest error of elevation", "about 1.5 ft = 0.46 m", 1.5 * FOOT_M,
+          lambda flown: _largest(_height_errors(flown))),
+    Claim("error of elevation, 85 % of the map within", "0.6 ft = 0.18 m", 0.6 * FOOT_M,
+          lambda flown: _percentile(_height_errors(flown), 85)),
+)  # fmt: skip
+
+
+def claims_table(flights: Flights) -> Table:
+    """Returns a table of the paper's results and of those of the flights over both textures."""
+    rows: list[Row] = [("", "paper", "coarse texture", "full resolution", "better than the paper")]
+    for claim in CLAIMS:
+        found = [claim.value_m(flown) for flown in (flights.coarse, flights.fine)]
+        better = [_better(value, claim.limit_m) for value in found]
+        rows.append((claim.label, claim.paper, *map(millimetres, found), " / ".join(better)))
+    for claim, words, limit in ((CLAIMS[3], "20 %", 0.2), (CLAIMS[4], "7.5 %", 0.075)):
+        found = [claim.value_m(flown) / MEAN_RANGE_M for flown in (flights.coarse, flights.fine)]
+        better = [_better(value, limit) for value in found]
+        label = f"{claim.label}, of the mean range 2.44 m".replace(" within", "")
+        rows.append((label, words, *(percent(value, 2) for value in found), " / ".join(better)))
+    return make_table("claims", "The paper's results", rows)
+
+
+def _better(value: float, limit: float) -> str:
+    """Returns whether a value is below a limit, as text; "-" if it is unknown."""
+    return DASH if np.isnan(value) else "yes" if value < limit else "no"
+
+
+def tracks_table(flights: Flights) -> Table:
+    """Returns a table of the RMS position error of windows of tracks before and after their alignment (Fig. 5)."""
+    header = ("track", "paper", "coarse, before", "coarse, after", "full resolution, before", "after")
+    rows: list[Row] = [header]
+    found = [{row["track"]: row for row in track_metrics(f.result, f.truth)} for f in (flights.coarse, flights.fine)]
+    for track in SHOWN_TRACKS:
+        words = "about 0.30 m" if track <= FIRST_TRACKS else "up to 0.46 m, a few 0.61 to 1.22 m"
+        values = [
+            millimetres(tracks.get(track, {}).get(f"{when}_ga_rmse_m"))
+            for tracks in found
+            for when in ("before", "after")
+        ]
+        rows.append((str(track), words, *values))
+    return make_table("tracks", "RMS position error of the keyframes at the end of a track, before and after GA", rows)
+
+
+def path_table(flights: Flights) -> Table:
+    """Returns a table of the RMS and largest errors along the path (Fig. 6)."""
+    rows: list[Row] = [("along the path", "paper", "coarse texture", "full resolution")]
+    both = [_errors(flights.coarse), _errors(flights.fine)]
+    f2f = [_errors(flown, "f2f") for flown in (flights.coarse, flights.fine)]
+    rows += [
+        ("position error, RMS / largest", "Fig. 6 (a)", *(_pair(e.distance_m) for e in both)),
+        ("height error, RMS / largest", "Fig. 6 (b)", *(_pair(e.position_m[:, 2]) for e in both)),
+        ("heading error, RMS / largest", "Fig. 6 (c)", *(_degrees(e.heading_rad) for e in both)),
+        ("position error of F2F alone, RMS / largest", "Fig. 4 (a)", *(_pair(e.distance_m) for e in f2f)),
+    ]
+    return make_table("path", "Errors along the path after alignment", rows)
+
+
+def map_table(flights: Flights) -> Table:
+    """Returns a table of the share of the asked area without a height, with and without alignment (Fig. 7)."""
+    rows: list[Row] = [("", "paper", "coarse texture", "full resolution")]
+    rows += [
+        ("map after alignment: area without a height", "none seen in Fig. 7 (b)",
+         *(percent(holes(flown), 2) for flown in (flights.coarse, flights.fine))),
+        ("flown without alignment: area without a height", "holes in Fig. 7 (c)",
+         percent(holes(flights.unaligned), 2), DASH),
+        ("flown without alignment: 85 % of the map within", DASH,
+         millimetres(_percentile(_height_errors(flights.unaligned), 85)), DASH),
+        ("flown without alignment: distance from the planned path, largest", DASH,
+         millimetres(_off_course_m(flights.unaligned)), DASH),
+    ]  # fmt: skip
+    return make_table("map", "The map with and without alignment", rows)
+
+
+def holes(flown: Flown) -> float:
+    """Returns the share of the asked area that has no height in the map."""
+    return float(np.isnan(flown.elevation.height_m[flown.truth.asked]).mean())
+
+
+def _off_course_m(flown: Flown) -> float:
+    """Returns the largest distance of the true path from the planned one [m]."""
+    truth = flown.truth
+    return _largest(np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1))
+
+
+def _errors(flown: Flown, path: str = "final") -> PathErrors:
+    return path_errors(getattr(flown.result, path), flown.truth.trajectory)
+
+
+def _first_tracks(flown: Flown) -> Array:
+    """Returns the position errors of the frames of the first `FIRST_TRACKS` tracks [m]."""
+    error_m = _errors(flown).distance_m
+    return error_m[flown.truth.track[: len(error_m)] <= FIRST_TRACKS]
+
+
+def _far_ends(flown: Flown) -> list[float]:
+    """Returns the RMS position error at the far end of each track after the first five [m], the largest first."""
+    error_m = _errors(flown).distance_m
+    tracks = range(FIRST_TRACKS + 1, flown.mission.plan.n_tracks + 1)
+    found = [farthest_error_m(track, error_m, flown.truth) for track in tracks]
+    return sorted((value for value in found if value is not None), reverse=True)
+
+
+def _height_errors(flown: Flown) -> Array:
+    error = height_error(flown.elevation, flown.truth)
+    return np.abs(error[np.isfinite(error)])
+
+
+def _largest(values: Array) -> float:
+    return float(np.max(values)) if len(values) else np.nan
+
+
+def _ranked(values: list[float], rank: int) -> float:
+    return values[rank] if rank < len(values) else np.nan
+
+
+def _percentile(values: Array, percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else np.nan
+
+
+def _pair(values_m: Array) -> str:
+    """Returns RMS and largest absolute value of errors (n,) [m] as text."""
+    return f"{millimetres(float(np.sqrt(np.mean(values_m**2))))} / {millimetres(_largest(np.abs(values_m)))}"
+
+
+def _degrees(values_rad: Array) -> str:
+    """Returns RMS and largest absolute value of angles (n,) as text [deg]."""
+    size = np.rad2deg(np.abs(values_rad))
+    return f"{np.sqrt(np.mean(size**2)):.3f} / {_largest(size):.3f} deg"

@@ -1,0 +1,95 @@
+"""Flights of the paper's mission: with alignment, and on the integrated frame-to-frame motion alone."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Truth
+from twin.core.timing import Stopwatch
+from twin.errors import SurveyAborted
+from twin.estimate.pipeline import Navigator
+from twin.scenario.model import Scenario
+from twin.session.assembly import image_vision, make_navigator, open_world
+from twin.survey import fly
+from twin.world.mission import Mission, prepare
+from twin.world.world import World
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A mission that was flown.
+
+    Args:
+        mission: the mission.
+        result: output of the estimators.
+        elevation: map along the final trajectory; after a flight without alignment, along the F2F trajectory.
+        truth: true trajectory and floor.
+        stages: durations of the processing stages, as `Stopwatch.summary` returns them.
+        ended: reason why the flight ended early; "" if it did not.
+    """
+
+    mission: Mission
+    result: SurveyResult
+    elevation: ElevationMap
+    truth: Truth
+    stages: dict[str, Any]
+    ended: str = ""
+
+
+class F2fNavigator(Navigator):
+    """Navigator that reports the integrated frame-to-frame motion as the online pose, without any correction."""
+
+    def update(self, frame: Frame, track: int = 1) -> Estimate:
+        estimate = super().update(frame, track)
+        return estimate._replace(world_from_camera=estimate.f2f_from_start)
+
+    def align_track(self, track: int) -> None:
+        """Does nothing."""
+
+
+def fly_aligned(scenario: Scenario) -> Flown:
+    """Flies a mission with all corrections; after each track, the window of tracks is aligned globally."""
+    return _fly(prepare(scenario), make_navigator)
+
+
+def fly_without_alignment(scenario: Scenario) -> Flown:
+    """Flies a mission on the integrated F2F motion, without F2M and GA, and maps along the F2F trajectory.
+
+    This is the case of Negahdaripour & Madjidi (2003, Fig. 7c): the vehicle follows a path with drift, so its images
+    do not cover the whole area, and the map has holes.
+    """
+    estimate = scenario.estimate.model_copy(update={"use_f2m": False, "use_ga": False, "max_links": 1})
+    return _fly(prepare(scenario.model_copy(update={"estimate": estimate})), _f2f_navigator)
+
+
+def _f2f_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stopwatch) -> Navigator:
+    """Returns an `F2fNavigator`; arguments as for `make_navigator`."""
+    settings, noise = mission.scenario.estimator_settings(), mission.scenario.believed_noise()
+    vision = image_vision(mission, folder, stopwatch)
+    return F2fNavigator(mission.rig, settings, mission.start, noise, vision, stopwatch=stopwatch)
+
+
+def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Navigator]) -> Flown:
+    """Flies a mission with the navigator that `make` returns, and builds its map."""
+    stopwatch, ended = Stopwatch(), ""
+    with (
+        tempfile.TemporaryDirectory(prefix="twin-") as folder,
+        open_world(mission, stopwatch) as world,
+        make(mission, world, Path(folder), stopwatch) as navigator,
+    ):
+        try:
+            fly(mission, world, navigator, lambda *_: None)
+        except SurveyAborted as error:
+            ended = str(error)
+        result = navigator.finish()
+        if isinstance(navigator, F2fNavigator):
+            result = replace(result, online=result.f2f, final=result.f2f)
+        with stopwatch("map"):
+            elevation = navigator.build_map(result, mission.grid)
+        if elevation is None:
+            raise SurveyAborted(f"no keyframe: {ended}")
+        return Flown(mission, result, elevation, world.truth(), stopwatch.summary(), ended)

@@ -1,0 +1,75 @@
+"""The chapter "How true is it?" of the README, generated from the results of `twin reproduce all`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from twin.errors import TwinError
+from twin.reproduce.exhibit import Exhibit, Table
+
+BEGIN = "<!-- begin: written by `twin reproduce chapter`, do not edit -->"
+END = "<!-- end: written by `twin reproduce chapter` -->"
+HEADING = "## How true is it?"
+#: Tables of the chapter: experiment and key. The index page has all of them.
+SHOWN = (
+    ("paper", "claims"), ("paper", "tracks"), ("paper", "map"), ("tank1", "sizes"), ("tank1", "map"),
+    ("tank2", "closure"), ("tank2", "sizes"), ("tank2", "map"), ("budget", "budget"),
+)  # fmt: skip
+
+
+def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
+    """Returns the chapter as Markdown, between its markers."""
+    by_name = {exhibit.name: exhibit for exhibit in exhibits}
+    plans = " (quick plans: `--quick`)" if quick else ""
+    lines = [
+        BEGIN, HEADING, "",
+        f"The experiments of Negahdaripour & Madjidi (2003), flown in the simulated world{plans}. `twin reproduce all` "
+        "writes these tables and all others, with the figures, to one page.",
+    ]  # fmt: skip
+    described = set[str]()
+    for name, key in SHOWN:
+        exhibit = by_name.get(name)
+        table = None if exhibit is None else next((table for table in exhibit.tables if table.key == key), None)
+        if exhibit is None or table is None:
+            continue
+        lines += [""] if name in described else ["", f"**{exhibit.title}.** {exhibit.text}", ""]
+        described.add(name)
+        lines += [f"*{table.title}*", ""]
+        lines += markdown(table)
+    return "\n".join([*lines, END])
+
+
+def markdown(table: Table) -> list[str]:
+    """Returns the lines of a Markdown table."""
+    header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table.rows]
+    return [_line(header), _line(["---"] * len(header)), *map(_line, rows)]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |".replace("|  |", "| |")
+
+
+def with_chapter(readme: str, text: str, name: str = "README") -> str:
+    """Returns a README in which the text between the markers is replaced by the chapter.
+
+    Raises:
+        TwinError: the README does not contain each marker exactly once, the begin marker first.
+    """
+    first, last = readme.find(BEGIN), readme.find(END)
+    if min(first, last) < 0 or last < first or readme.count(BEGIN) != 1 or readme.count(END) != 1:
+        raise TwinError(name, "does not have the markers of the chapter once", f"the lines {BEGIN} and {END}")
+    return readme[:first] + text + readme[last + len(END) :]
+
+
+def update(readme: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
+    """Replaces the chapter in a README file.
+
+    Raises:
+        TwinError: the file cannot be read or lacks the markers.
+    """
+    try:
+        text = readme.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise TwinError(str(readme), f"cannot be read: {error}", "a Markdown file") from None
+    readme.write_text(with_chapter(text, chapter(exhibits, quick), str(readme)), encoding="utf-8")

@@ -1,0 +1,143 @@
+"""Tank experiments of Negahdaripour & Madjidi (2003, section V-B): closure, sizes of objects, and predicted errors."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.judge.map_error import height_error
+from twin.judge.trajectory import path_errors
+from twin.reproduce import tank_sheet
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
+from twin.reproduce.tank_scene import OBJECTS
+from twin.reproduce.tank_sizes import SizeRow, measure
+from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, survey_tank
+
+Array = NDArray[np.floating]
+
+BAD_M, WORST_SHARE = 0.02, 0.2  # a bad cell is off by more; predicted if among this share with the largest sigma
+TITLES = {"tank1": "Tank test 1: 130 pairs on parallel legs", "tank2": "Tank test 2: two loops that cross at the start"}
+#: Keys of the tables of each experiment.
+TABLES = {"tank1": ("rows", "sizes", "map"), "tank2": ("rows", "closure", "sizes", "map")}
+
+
+def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
+    """Returns the results of "tank1" or "tank2"; writes NAME.json and NAME.png to a folder, created if missing."""
+    with tempfile.TemporaryDirectory(prefix="twin-") as images:
+        survey = survey_tank(name, Path(images), QUICK if quick else ())
+    sizes = [measure(item, survey.elevation.height_m, survey.mission.grid) for item in OBJECTS]
+    tables = {
+        "rows": _paper_table(survey),
+        "closure": _closure_table(survey),
+        "sizes": sizes_table(sizes),
+        "map": _map_table(survey),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    tank_sheet.draw(TITLES[name], survey, folder / f"{name}.png")
+    exhibit = Exhibit(
+        name, TITLES[name], _text(survey), tuple(tables[key] for key in TABLES[name]),
+        (Figure(f"{name}.png", _CAPTION),),
+    )  # fmt: skip
+    write_exhibit(exhibit, folder)
+    return exhibit
+
+
+_CAPTION = (
+    "Connections of the network over the mosaic, path before and after the global alignment, true and estimated "
+    "height, logarithm of the predicted standard deviation, and absolute error of the height."
+)
+
+
+def _text(survey: TankSurvey) -> str:
+    rig, n = survey.mission.rig, len(survey.path.planned_m)
+    return (
+        f"{n} stereo pairs of {rig.width_px} x {rig.height_px} pixels, 5 cm apart, 1.52 m (5 ft) above the floor of a "
+        "tank; the track bends by 12 mm and jitters by 1 mm and 0.1 deg on each axis. All pairs with an overlap of "
+        "70 % are connected and aligned together. The light is uneven: the white PVC pipe is saturated, a third of "
+        "the floor lies in the shade."
+    )
+
+
+def _paper_table(survey: TankSurvey) -> Table:
+    """Returns a table of the figures that the paper states for its tank tests and of those of this survey."""
+    rig, height_m = survey.mission.rig, float(survey.path.planned_m[0, 2])
+    x, y = survey.path.planned_m[:, :2].T
+    seen_m2 = survey.truth.seen.sum() * survey.mission.grid.cell_m**2
+    errors = {key: path_errors(getattr(survey.result, key), survey.truth.trajectory) for key in ("f2f", "final")}
+    bend = survey.result.final.positions[:, 1] - survey.path.planned_m[:, 1]
+    bend_m = float(bend[np.abs(x - 0.2) < 0.05].mean() - bend[np.abs(x - 0.2) > 0.3].mean())
+    n_pairs = "61" if survey.path.repeats else "130"
+    rows = [
+        ("", "paper", "ours"),
+        ("stereo pairs", n_pairs, str(len(x))),
+        ("distance to the floor", "about 1.5 m (5 ft)", f"{height_m:.2f} m"),
+        ("pixel on the floor", "about 5 mm (0.2 in)", millimetres(height_m / rig.focal_px)),
+        ("mapped area", "about 2 m2 (1 m x 2 m)", f"{seen_m2:.1f} m2"),
+        ("connections", DASH, str(len(survey.result.links))),
+        ("position error before alignment, largest", DASH, millimetres(float(errors["f2f"].distance_m.max()))),
+        ("position error after alignment, largest", DASH, millimetres(float(errors["final"].distance_m.max()))),
+        ("bend of the track, by the path after alignment", "seen, not measured", f"{millimetres(bend_m)} of 12 mm"),
+    ]
+    return make_table("rows", "The paper's figures", rows)
+
+
+def _closure_table(survey: TankSurvey) -> Table:
+    rows = [("first frame repeated as", "before alignment", "online, with the mosaic", "after alignment", "limit")]
+    rows += [
+        (f"frame {c.frame}", millimetres(c.before_m), millimetres(c.online_m), millimetres(c.after_m), "5 mm")
+        for c in closures(survey.result, survey.path.repeats)
+    ]
+    return make_table("closure", "Closure error (the paper: ground truth of its test, no figure given)", rows)
+
+
+def sizes_table(sizes: Sequence[SizeRow]) -> Table:
+    """Returns the table of the sizes of the objects: true, measured and error [mm]."""
+    rows: list[Row] = [
+        ("object", "along x, true / measured", "along y, true / measured", "height, true / measured", "largest error")
+    ]
+    for row in sizes:
+        pairs = [f"{1e3 * t:.1f} / {_mm(m)}" for t, m in zip(row.true, row.measured, strict=True)]
+        errors = np.abs(row.errors_m)
+        known = errors[np.isfinite(errors)]
+        rows.append((row.name, *pairs, f"{1e3 * known.max():.1f}" if known.size else DASH))
+    return make_table("sizes", "Sizes of the objects in the map, at half of their height [mm]", rows)
+
+
+def _mm(value_m: float) -> str:
+    return DASH if np.isnan(value_m) else f"{1e3 * value_m:.1f}"
+
+
+def _map_table(survey: TankSurvey) -> Table:
+    error = height_error(survey.elevation, survey.truth)
+    known = np.isfinite(error)
+    size = np.abs(error[known])
+    flagged = flagged_share(error, survey.elevation.sigma_m)
+    rows = [
+        ("", "paper", "ours"),
+        ("cells with a height, of those seen by both cameras", DASH, percent(known.sum() / survey.truth.seen.sum(), 1)),
+        ("absolute height error: median", DASH, millimetres(float(np.median(size)))),
+        ("absolute height error: 90th percentile", DASH, millimetres(float(np.percentile(size, 90)))),
+        (f"cells off by more than {1e2 * BAD_M:g} cm", "some, at saturated pipes",
+         percent(float((size > BAD_M).mean()), 2)),
+        ("of these, among the worst fifth by sigma", "predicted, no figure given", percent(flagged)),
+    ]  # fmt: skip
+    return make_table("map", "Heights and their predicted errors", rows)
+
+
+def flagged_share(error_m: Array, sigma_m: Array) -> float | None:
+    """Returns the share of the bad cells that are among the 20 % of cells with the largest sigma; None without any.
+
+    Args:
+        error_m: (rows, cols) height error; NaN where unknown. A cell is bad if its error exceeds `BAD_M`.
+        sigma_m: (rows, cols) predicted standard deviation.
+    """
+    known = np.isfinite(error_m) & np.isfinite(sigma_m)
+    bad = np.abs(error_m[known]) > BAD_M
+    if not bad.any():
+        return None
+    sigma = sigma_m[known]
+    return float((sigma[bad] > np.quantile(sigma, 1 - WORST_SHARE)).mean())

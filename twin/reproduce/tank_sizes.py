@@ -1,0 +1,158 @@
+"""Sizes of the objects in the tank, measured in the elevation map and compared with their true sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import MapGrid
+from twin.reproduce.tank_scene import TankObject
+
+Array = NDArray[np.floating]
+
+MARGIN_M = 0.04  # the window of an object extends beyond it by this much; its outer half shows the floor
+PLATEAU = 0.75  # cells above this fraction of the 90th percentile of height belong to the top of a box or a disc
+CENTRAL = 0.5  # extents are medians over lines through the central part of a box or a pipe, a fraction of its size
+CENTRAL_ROUND = 0.15  # the same for a disc or a dome
+
+
+class Size(NamedTuple):
+    """Extents of an object along x and y at half of its height, and its height above the floor [m]; NaN if unknown."""
+
+    x_m: float
+    y_m: float
+    height_m: float
+
+
+class SizeRow(NamedTuple):
+    """Measured and true size of one object."""
+
+    name: str
+    measured: Size
+    true: Size
+
+    @property
+    def errors_m(self) -> Size:
+        """Returns measured minus true size [m]."""
+        return Size(*np.subtract(self.measured, self.true).tolist())
+
+
+class Window(NamedTuple):
+    """Part of a map around an object.
+
+    Args:
+        x_m, y_m: (cols,), (rows,) coordinates of the cell centres relative to the centre of the object.
+        height_m: (rows, cols) height above the floor around the object; NaN where unknown.
+    """
+
+    x_m: Array
+    y_m: Array
+    height_m: Array
+
+
+def measure(item: TankObject, height_m: Array, grid: MapGrid) -> SizeRow:
+    """Returns the size of an object measured in a map of heights (rows, cols) [m], and its true size."""
+    window = window_around(item, height_m, grid)
+    top = _TOPS[item.shape](window)
+    share = CENTRAL_ROUND if item.shape in ("disc", "dome") else CENTRAL
+    across = np.abs(window.y_m) <= share * item.size_m[1] / 2, np.abs(window.x_m) <= share * item.size_m[0] / 2
+    lines = window.height_m[across[0]], window.height_m[:, across[1]].T
+    x_m, y_m = (
+        _median(_extent(at, line, top / 2) for line in rows) for at, rows in zip(window[:2], lines, strict=True)
+    )
+    return SizeRow(item.name, Size(x_m, y_m, top), true_size(item))
+
+
+def true_size(item: TankObject) -> Size:
+    """Returns the true extents of an object at half of its height, and its height."""
+    share = np.sqrt(3) / 2 if item.shape == "dome" else 1.0  # ellipsoid: at z = c / 2 its axes are sqrt(1 - 1/4) long
+    return Size(share * item.size_m[0], share * item.size_m[1], item.size_m[2])
+
+
+def window_around(item: TankObject, height_m: Array, grid: MapGrid) -> Window:
+    """Returns the part of a map around an object, with heights above the median of its outer border."""
+    x, y = (axis - c for axis, c in zip(grid.centres(), item.centre_m, strict=True))
+    inside = [np.abs(axis) <= side / 2 + MARGIN_M for axis, side in zip((x, y), item.size_m, strict=False)]
+    part = height_m[np.ix_(inside[1], inside[0])].astype(np.float64)
+    x, y = x[inside[0]], y[inside[1]]
+    beside = (np.abs(x) > item.size_m[0] / 2 + MARGIN_M / 2) | (np.abs(y) > item.size_m[1] / 2 + MARGIN_M / 2)[:, None]
+    floor = part[beside & np.isfinite(part)]
+    return Window(x, y, part - (np.median(floor) if floor.size else np.nan))
+
+
+def _plateau(window: Window) -> float:
+    """Returns the median height of the cells on top of an object with a flat top [m]."""
+    known = window.height_m[np.isfinite(window.height_m)]
+    if known.size == 0:
+        return np.nan
+    return float(np.median(known[known >= PLATEAU * np.percentile(known, 90)]))
+
+
+def _summit(window: Window) -> float:
+    """Returns the height of the summit of a dome [m]: the height of the vertex of a paraboloid fitted to the cap."""
+    x, y = np.meshgrid(window.x_m, window.y_m)
+    known = np.isfinite(window.height_m)
+    reach = 0.3 * max(np.abs(window.x_m).max() - MARGIN_M, 0.0)
+    cap = known & (np.hypot(x, y) <= reach)
+    if cap.sum() < 12:
+        return np.nan
+    a, b = x[cap], y[cap]
+    terms = np.column_stack([np.ones_like(a), a, b, a**2, a * b, b**2])
+    c = np.linalg.lstsq(terms, window.height_m[cap], rcond=None)[0]
+    vertex = np.linalg.solve(-np.array([[2 * c[3], c[4]], [c[4], 2 * c[5]]]), c[1:3])
+    return float(c[0] + c[1:3] @ vertex / 2)
+
+
+def _crest(window: Window) -> float:
+    """Returns the height of the crest of a pipe along x [m]: the median over x of the greatest height across it."""
+    along = np.abs(window.x_m) <= CENTRAL * (np.abs(window.x_m).max() - MARGIN_M)
+    part = window.height_m[:, along]
+    known = part[:, np.isfinite(part).any(axis=0)]
+    return float(np.median(np.nanmax(known, axis=0))) if known.size else np.nan
+
+
+_TOPS: dict[str, Callable[[Window], float]] = {"box": _plateau, "disc": _plateau, "dome": _summit, "pipe": _crest}
+
+
+def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
+    """Returns the length of the part of a profile around the place 0 that lies above a level [m]; NaN if there is none.
+
+    The ends are interpolated linearly between the last point above the level and the first one below it.
+
+    Args:
+        at_m: (n,) places along the profile, relative to the centre of the object, in ascending or descending order.
+        height_m: (n,) heights; points without a height are ignored.
+        level_m: the level.
+    """
+    known = np.isfinite(height_m)
+    order = np.argsort(at_m[known])
+    at, above = at_m[known][order], (height_m[known] - level_m)[order]
+    if not np.isfinite(level_m) or not len(at) or above[np.argmin(np.abs(at))] <= 0:
+        return np.nan
+    ends = [_crossing(at[side], above[side]) for side in (at >= 0, at <= 0)]
+    return ends[0] - ends[1]
+
+
+def _crossing(at: Array, above: Array) -> float:
+    """Returns the place nearest to 0 at which a profile falls to the level [m]; NaN if it does not.
+
+    Args:
+        at: (n,) places along the profile on one side of 0 [m].
+        above: (n,) height above the level at these places [m]."""
+    order = np.argsort(np.abs(at))
+    at, above = at[order], above[order]
+    below = np.flatnonzero(above <= 0)
+    if not len(below) or below[0] == 0:
+        return np.nan
+    k = int(below[0])
+    share = above[k - 1] / (above[k - 1] - above[k])
+    return float(at[k - 1] + share * (at[k] - at[k - 1]))
+
+
+def _median(values: Iterable[float]) -> float:
+    """Returns the median of the finite values; NaN if there are none."""
+    found = np.array([value for value in values if np.isfinite(value)])
+    return float(np.median(found)) if found.size else np.nan

@@ -1,0 +1,137 @@
+"""Check of a surrogate study: the surveys with the least certain verdicts are repeated with rendered images.
+
+These are the surveys whose metrics lie closest to the limits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.judge.require import more_is_better
+from twin.study import wording
+from twin.study.analysis import StudyAnalysis
+from twin.study.engine import Engine
+from twin.study.flight import Row, has_passed
+from twin.study.progress import StudyProgress
+from twin.study.runner import fly_surveys, open_folder
+from twin.study.statistics import Array, Interval, wilson_interval
+from twin.study.study_file import Study
+from twin.study.surveys import Survey, surveys
+
+FOLDER = "rendered"  #: subfolder of the results folder
+
+
+class RenderedCheck(NamedTuple):
+    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds.
+
+    Args:
+        rendered: (n,) whether each rendered survey was completed and met every requirement.
+        surrogate: (n,) whether each of the surrogate surveys was completed and met every requirement.
+        rows: result of each rendered survey.
+    """
+
+    rendered: NDArray[np.bool_]
+    surrogate: NDArray[np.bool_]
+    rows: list[Row]
+
+    @property
+    def pass_probability(self) -> Interval:
+        """Returns the fraction of the rendered surveys that passed, with its confidence interval (Wilson)."""
+        return wilson_interval(float(self.rendered.sum()), len(self.rendered))
+
+    @property
+    def agrees(self) -> bool:
+        """Returns whether the fraction of the surrogate surveys that passed lies in `pass_probability`."""
+        interval = self.pass_probability
+        return len(self.rendered) > 0 and interval.low <= float(self.surrogate.mean()) <= interval.high
+
+    def sentence(self) -> str:
+        """Returns the result in one sentence."""
+        n = len(self.rendered)
+        if n == 0:
+            return "No survey was flown rendered: none of the surrogate surveys has a value of every required metric."
+        same = int((self.rendered == self.surrogate).sum())
+        passed, verdict = wording.percent_interval(self.pass_probability), "agrees" if self.agrees else "does not agree"
+        return (
+            f"Of the {n} surveys closest to the limits, {int(self.rendered.sum())} pass when rendered ({passed}) and "
+            f"{int(self.surrogate.sum())} with the surrogate, which {verdict}; {same} have the same verdict."
+        )
+
+
+def check(
+    study: Study, analysis: StudyAnalysis, n: int, folder: Path, engine: Engine, progress: StudyProgress
+) -> RenderedCheck:
+    """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
+
+    Args:
+        study: the study.
+        analysis: results of the study.
+        n: number of surveys to fly, at most.
+        folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+    """
+    nearest = nearest_surveys(analysis, n)
+    keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
+    chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in surveys(study, folder) if survey.key in keys}
+    log = open_folder(folder / FOLDER, True, ((key, survey.scenario_hash) for key, survey in chosen.items()))
+    done = log.done()
+    progress.begin(progress.done + len(set(keys) - done))
+    fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+    log.flush()
+    rows = {(row["sample"], row["seed"]): row for row in log.rows()}
+    flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
+    found = [rows[keys[k]] for k in flown]
+    return RenderedCheck(np.array([has_passed(row) for row in found], bool), analysis.passed[nearest[flown]], found)
+
+
+def summary(checked: RenderedCheck) -> dict[str, Any]:
+    """Returns the check as JSON values."""
+    return {
+        "surveys": len(checked.rendered),
+        "rendered_passed": int(checked.rendered.sum()),
+        "surrogate_passed": int(checked.surrogate.sum()),
+        "same_verdict": int((checked.rendered == checked.surrogate).sum()),
+        "agrees": checked.agrees,
+    }
+
+
+def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
+    """Returns the row numbers of the n surrogate surveys whose metrics are closest to the limits, the closest first.
+
+    The distance of a metric from its limit is the fraction of the surveys whose value lies between the two, so that
+    metrics of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
+    or else closest to it. Surveys without a finite value of every required metric are left out.
+
+    Args:
+        analysis: results of the study.
+        n: largest number of surveys.
+    """
+    is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
+    chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
+    values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
+    if not values:
+        return np.zeros(0, np.int64)
+    excess = [_excess(values[name], limit) * (1 - 2 * more_is_better(name)) for name, limit in analysis.limits.items()]
+    finite = np.isfinite(list(values.values())).all(axis=0)
+    distance = np.abs(np.max(excess, axis=0))[finite]
+    return chosen[finite][np.argsort(distance, kind="stable")][:n]
+
+
+def _excess(values: Array, limit: float) -> Array:
+    """Returns, for each of the values (n,), how many others lie between it and a limit; negative below the limit."""
+    ascending = np.sort(values)
+    rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
+    return rank - np.searchsorted(ascending, limit, "right")
+
+
+def _rendered(survey: Survey, folder: Path) -> Survey:
+    """Returns the rendered survey with the scenario and seed of a surrogate survey, and its run folder in `folder`."""
+    imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
+    scenario = survey.scenario.model_copy(update={"imaging": imaging})
+    run_folder = folder / "runs" / survey.folder.name
+    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint(), folder=run_folder)

@@ -1,0 +1,149 @@
+"""Objects of a scenario: loaded or built, placed on the floor, and checked against the path of the vehicle."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import terrains
+from controllers.survey_plan import SurveyPlan
+from terrains.objects.mesh_file import read_mesh
+from terrains.objects.model import ObjectModel, PlacedObject, model_of
+from terrains.objects.placement import disc_of, place
+from terrains.objects.shapes import SHAPES, build_shape
+from twin.core.geometry import Array
+from twin.errors import TwinError
+from twin.scenario.model import ObjectConfig, Scenario
+
+GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
+SHAPE_SIZE_M = 0.4  #: size of a built-in shape without `size_m`
+MAX_FACES = 8_000_000  #: triangles of all shapes together
+MAX_OBJECTS = 20_000
+VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
+
+Attempt = Callable[[Callable[[], object]], object]
+
+
+def load_objects(scenario: Scenario, terrain: terrains.Terrain, attempt: Attempt) -> tuple[PlacedObject, ...]:
+    """Returns the objects of a scenario; equal shapes are built once.
+
+    Args:
+        scenario: the scenario.
+        terrain: the floor.
+        attempt: calls a function and collects its TwinError, see `mission.prepare`; entries with errors are left out.
+    """
+    models: dict[str, tuple[ObjectModel, ...]] = {}
+    found: list[PlacedObject] = []
+    for scattered in (False, True):  # scattered objects avoid those at given positions
+        for number, config in enumerate(scenario.objects):
+            if (config.position_m is None) == scattered:
+                attempt(lambda k=number, c=config: found.extend(_entry(k, c, models, found, (terrain, scenario.seed))))
+    return tuple(found)
+
+
+def _entry(
+    number: int, config: ObjectConfig, models: dict[str, tuple[ObjectModel, ...]], found: list[PlacedObject],
+    world: tuple[terrains.Terrain, int],
+) -> list[PlacedObject]:  # fmt: skip
+    """Returns the objects of one entry of `[[objects]]` and adds the shapes of the entry to `models`.
+
+    Raises TwinError if the entry is invalid.
+
+    Args:
+        number: number of the entry, from 0.
+        config: the entry.
+        models: models that have been built, by shape.
+        found: objects of the entries before, which scattered objects do not overlap.
+        world: terrain, and seed of the scenario.
+    """
+    _check_keys(number, config)
+    terrain, seed = world
+    key = repr((config.shape, config.mesh_file, config.mesh_up, config.colour, _pipe_width(config)))
+    if key not in models:
+        models[key] = _models(number, config, seed)
+        n_faces = sum(len(model.levels[0].mesh.faces) for shapes in models.values() for model in shapes)
+        if n_faces > MAX_FACES:
+            raise TwinError(f"objects.{number}", f"{n_faces} triangles in all meshes", f"at most {MAX_FACES} triangles")
+    sized = config
+    if config.size_m is None and config.shape != "mesh":
+        sized = config.model_copy(update={"size_m": SHAPE_SIZE_M})
+    items = place(number, sized, models[key], terrain, found, seed)
+    if len(found) + len(items) > MAX_OBJECTS:
+        raise TwinError(f"objects.{number}", f"{len(found) + len(items)} objects", f"at most {MAX_OBJECTS} objects")
+    return items
+
+
+def _models(number: int, config: ObjectConfig, seed: int) -> tuple[ObjectModel, ...]:
+    """Returns the shapes of an entry."""
+    if config.shape == "mesh":
+        assert config.mesh_file is not None
+        file = Path(config.mesh_file)
+        y_up = config.mesh_up == "y" or (config.mesh_up is None and file.suffix.lower() == ".glb")
+        return (model_of(read_mesh(file, f"objects.{number}.mesh_file", config.colour or GREY, y_up)),)
+    shape, name = SHAPES[config.shape], zlib.crc32(config.shape.encode())
+    form = {"width": _pipe_width(config)} if config.shape == "pipe" and config.width_m else {}
+    seeds = np.random.SeedSequence([seed, name]).spawn(shape.variants)
+    meshes = [build_shape(config.shape, config.colour, np.random.default_rng(s), **form) for s in seeds]
+    return tuple(model_of(mesh, shape.sways) for mesh in meshes)
+
+
+def _pipe_width(config: ObjectConfig) -> float:
+    """Returns the width of a pipe as a fraction of its length; 0 where it is not given."""
+    return (config.width_m or 0.0) / (config.size_m or SHAPE_SIZE_M)
+
+
+def _check_keys(number: int, config: ObjectConfig) -> None:
+    """Raises TwinError for keys that are missing, or have no effect on this kind of object."""
+    field = f"objects.{number}"
+    if config.shape == "mesh" and config.mesh_file is None:
+        raise TwinError(f"{field}.mesh_file", "missing", 'a mesh, as shape is "mesh"')
+    if (config.position_m is None) == (config.per_m2 is None):
+        given = "both are given" if config.per_m2 is not None else "missing"
+        raise TwinError(f"{field}.position_m", given, "either position_m or per_m2")
+    for key in _unused_keys(config):
+        if getattr(config, key) != ObjectConfig.model_fields[key].default:
+            place_or_shape = "scattered objects" if config.per_m2 is not None else "an object at position_m"
+            kind = f"shape {config.shape!r}" if key in ("mesh_file", "mesh_up", "width_m") else place_or_shape
+            raise TwinError(f"{field}.{key}", f"has no effect on {kind}", "without it")
+    if config.shape == "pipe" and config.width_m and _pipe_width(config) > 1:
+        raise TwinError(
+            f"{field}.width_m", f"{config.width_m:g}: wider than long", f"up to {config.size_m or SHAPE_SIZE_M:g}"
+        )
+
+
+def _unused_keys(config: ObjectConfig) -> list[str]:
+    """Returns the keys that have no effect, given the shape and the kind of placement."""
+    unused = [] if config.shape == "mesh" else ["mesh_file", "mesh_up"]
+    unused += [] if config.shape == "pipe" else ["width_m"]
+    return unused + (["height_m"] if config.position_m is None else ["on", "area_m", "centre_m", "spacing_m"])
+
+
+def check_path(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
+    """Raises TwinError if the vehicle comes too close to an object on its planned path.
+
+    The object must be `clearance_m` below the cameras wherever the vehicle is above it.
+    """
+    if not objects:
+        return
+    path = _path_points(plan)
+    for item in objects:
+        disc, top_m = disc_of(item), item.corners_m()[:, 2].max()
+        away = np.hypot(path[:, 0] - disc.x_m, path[:, 1] - disc.y_m) - disc.radius_m - VEHICLE_REACH_M
+        gap = np.where(away < 0, path[:, 2] - top_m, np.inf)
+        k = int(gap.argmin())
+        if gap[k] < clearance_m:
+            raise TwinError(
+                f"objects.{item.group}",
+                f"the object at x {disc.x_m:.2f}, y {disc.y_m:.2f} is in the path of the vehicle: its top is at"
+                f" z {top_m:.2f} m, the cameras are at {path[k, 2]:.2f} m",
+                f"objects at least {clearance_m:g} m below the cameras (plan.clearance_m)",
+            )
+
+
+def _path_points(plan: SurveyPlan) -> Array:
+    """Returns points (n, 3) of the planned path, one per frame."""
+    tracks = range(1, plan.n_tracks + 1)
+    return np.concatenate([plan.references(t, plan.frames_of_track(t)[0]).position for t in tracks])
