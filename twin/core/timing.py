@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from collections import defaultdict
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +38,16 @@ class Stopwatch:
     def summary(self) -> dict[str, dict[str, float | int | None]]:
         """Returns count, mean and 95th percentile [ms] and total [s] of every stage."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
+
+
+def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
+    """Returns simulated or recorded time and wall time [s], peak memory [MiB], and the durations of the stages."""
+    return {
+        "wall_s": wall_s,
+        "simulated_s": simulated_s,
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "stages": stopwatch.summary(),
+    }
 
 
 def _summary(durations_s: list[float]) -> dict[str, float | int | None]:

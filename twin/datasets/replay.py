@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
-from twin.core.timing import Stopwatch
+from twin.core.timing import Stopwatch, timing_summary
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset
@@ -27,6 +26,7 @@ from twin.datasets.truth_files import read_truth
 from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
+from twin.estimate.pipeline import finish_in_stage
 from twin.estimate.self_check import check_survey
 from twin.judge import recorded
 from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay
@@ -135,7 +135,7 @@ def replay(
                 _estimate(opened.frames, navigator, progress)
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
             guard.cause = str(error) or "interrupted"
-        result = _finish(navigator, guard)
+        result = finish_in_stage(navigator, guard)
         with stopwatch("map"):
             elevation = guard.attempt(
                 "map", lambda: navigator.build_map(result, None, lambda share: progress("map", share))
@@ -228,17 +228,6 @@ def _estimate(frames: RecordedFrames, navigator: Navigator, progress: Progress) 
         progress("replay", min(1.0, (k + 1) / len(frames)))
 
 
-def _finish(navigator: Navigator, guard: StageGuard) -> SurveyResult:
-    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted."""
-    try:
-        if (result := guard.attempt("alignment", navigator.finish)) is not None:
-            return result
-    except (SurveyAborted, OSError) as error:
-        guard.cause = guard.cause or str(error)
-    navigator.abandon_alignment()
-    return navigator.finish()
-
-
 def _evaluation(
     opened: OpenedDataset,
     options: ReplayOptions,
@@ -300,9 +289,5 @@ def _timing(start_s: float, result: SurveyResult, stopwatch: Stopwatch) -> dict[
         start_s: value of `time.perf_counter` at the start of the replay [s].
     """
     times_s = result.online.times_s
-    return {
-        "wall_s": time.perf_counter() - start_s,
-        "simulated_s": float(times_s[-1] - times_s[0]) if len(times_s) else 0.0,
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "stages": stopwatch.summary(),
-    }
+    recorded_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
+    return timing_summary(recorded_s, time.perf_counter() - start_s, stopwatch)

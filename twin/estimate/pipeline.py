@@ -17,6 +17,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.interrupts import StageGuard
 from twin.core.links import Link
 from twin.core.orthomosaic import OrthoTile
 from twin.core.quality import EstimationQuality
@@ -33,6 +34,7 @@ from twin.core.records import (
 )
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
+from twin.errors import SurveyAborted
 from twin.estimate import disparity_offset
 from twin.estimate.mapping.footprint import footprint_grid
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
@@ -407,3 +409,17 @@ class Navigator:
         last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))
         self.since_node = self.since_node._replace(cov_at_node=node_cov)
+
+
+def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:
+    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted.
+
+    The alignment is the stage "alignment" of the guard, which records why it failed.
+    """
+    try:
+        if (result := guard.attempt("alignment", navigator.finish)) is not None:
+            return result
+    except (SurveyAborted, OSError) as error:
+        guard.cause = guard.cause or str(error)
+    navigator.abandon_alignment()
+    return navigator.finish()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
@@ -11,10 +10,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
-from twin.core.records import SurveyResult
-from twin.core.timing import Stopwatch
-from twin.errors import SurveyAborted
-from twin.estimate.pipeline import Navigator
+from twin.core.timing import Stopwatch, timing_summary
+from twin.estimate.pipeline import Navigator, finish_in_stage
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
 from twin.scenario.idealisations import idealisations
@@ -61,7 +58,7 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     stage.
     """
     mission, world, navigator, stopwatch, guard = flight
-    result = _align(navigator, guard)
+    result = finish_in_stage(navigator, guard)
     for link in navigator.network.history.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
     for alignment in result.alignments:
@@ -82,7 +79,7 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     along, across = planned_overlap(mission)
     plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
     plan |= {"along_median": along, "across_median": across}
-    timing = _timing(len(result.online) / mission.rig.frame_rate_hz, wall_s, stopwatch)
+    timing = timing_summary(len(result.online) / mission.rig.frame_rate_hz, wall_s, stopwatch)
     findings = survey_findings(mission, result, elevation, truth.reference)
     for finding in findings:
         folder.log("finding", **finding._asdict())
@@ -112,17 +109,6 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     return RunResult(metrics["status"], metrics, folder.path)
 
 
-def _align(navigator: Navigator, guard: StageGuard) -> SurveyResult:
-    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted."""
-    try:
-        if (result := guard.attempt("alignment", navigator.finish)) is not None:
-            return result
-    except (SurveyAborted, OSError) as error:
-        guard.cause = guard.cause or str(error)
-    navigator.abandon_alignment()
-    return navigator.finish()
-
-
 def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:
     """Returns the result of a function; None if a file cannot be read or written; the guard records the cause."""
     try:
@@ -130,16 +116,6 @@ def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | No
     except OSError as error:
         guard.cause = guard.cause or str(error)
         return None
-
-
-def _timing(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns simulated and wall time [s], peak memory [MiB], and the durations of the processing stages."""
-    return {
-        "wall_s": wall_s,
-        "simulated_s": simulated_s,
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "stages": stopwatch.summary(),
-    }
 
 
 def _identity(mission: Mission, abort_reason: str, findings: Sequence[Finding]) -> dict[str, Any]:
