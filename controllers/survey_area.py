@@ -47,7 +47,11 @@ class SurveyArea:
         return self.centre_m[0] + (c * u - s * v), self.centre_m[1] + (s * u + c * v)
 
     def at_fractions(self, fractions: Array) -> Array:
-        """Returns scene points (..., 2) [m]; their (u, v) are fractions (..., 2), -0.5 to 0.5, of the area's extent."""
+        """Returns the scene points (..., 2) [m] at fractions of the area's extent along and across the legs.
+
+        Args:
+            fractions: (..., 2) fractions, -0.5 to 0.5; 0 is the middle.
+        """
         u, v = np.moveaxis(fractions * self.size_m, -1, 0)
         return np.stack(self.to_scene(u, v), axis=-1)
 

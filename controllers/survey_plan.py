@@ -256,7 +256,7 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
 
 
 def check_request(request: SurveyRequest) -> None:
-    """Raises TwinError if a requirement is invalid; checks only what does not depend on the survey pattern."""
+    """Raises TwinError if a requirement is invalid; does not check requirements that depend on the survey pattern."""
     positive = {
         "plan.altitude_m": request.altitude_m,
         "plan.speed_mps": request.speed_mps,

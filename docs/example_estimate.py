@@ -1,4 +1,4 @@
-"""The estimators as a library: frames in memory in, a path and an elevation map out; no simulator is loaded.
+"""The estimators as a library: a path and an elevation map from frames in memory; no simulator is loaded.
 
 The frames are windows of one random texture: a stereo pair moves 0.8 m over a flat floor at 2 m distance.
 """

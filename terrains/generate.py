@@ -44,14 +44,49 @@ def generate(
     """
     if kind not in KINDS:
         raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
+    heights = KINDS[kind] if relief_m > 0 else _flat
+
+    def scaled(x_m: NDArray[np.float64], y_m: NDArray[np.float64], rng: np.random.Generator) -> Heights:
+        return scale_to_relief(heights((len(y_m), len(x_m)), grid_m, relief_m, rng), relief_m, base_m)
+
+    return generate_from(scaled, size_m, grid_m, texture, texture.cover or DEFAULT_COVERS[kind], seed)
+
+
+def generate_from(
+    heights: Callable[[NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.floating]],
+    size_m: tuple[float, float],
+    grid_m: float,
+    texture: TextureSource,
+    cover: str,
+    seed: int | np.random.SeedSequence,
+) -> Terrain:
+    """Returns a terrain centred at the origin, with heights from a function and a generated texture.
+
+    Args:
+        heights: function that returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the grid nodes [m], given
+            a random generator.
+        size_m: extent along x and y; rounded up to whole cells.
+        grid_m: distance between grid nodes.
+        texture: side of a texel; its files are not used.
+        cover: cover of the floor.
+        seed: seed of the heights and the texture.
+    Raises:
+        TwinError: the terrain is too large for memory.
+    """
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
     shape = texture_shape((ny, nx), grid_m, texture.texel_m(((nx - 1) * grid_m, (ny - 1) * grid_m)))
     shape_rng, texture_rng = np.random.default_rng(seed).spawn(2)
-    heights = KINDS[kind] if relief_m > 0 else _flat
-    height_m = scale_to_relief(heights((ny, nx), grid_m, relief_m, shape_rng), relief_m, base_m)
+    west_m, south_m = -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2
+    columns, rows = np.arange(nx, dtype=np.float64), np.arange(ny, dtype=np.float64)
+    height_m = np.asarray(heights(west_m + grid_m * columns, south_m + grid_m * rows, shape_rng), np.float32)
     texel_m = (nx - 1) * grid_m / shape[1]
-    texels = generate_texture(texture.cover or DEFAULT_COVERS[kind], height_m, shape, texel_m, texture_rng)
-    return Terrain(height_m, grid_m, -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2, texels, texel_m)
+    texels = generate_texture(cover, height_m, shape, texel_m, texture_rng)
+    return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m)
+
+
+def default_cover(kind: str) -> str:
+    """Returns the cover of a generated terrain of a kind whose cover is not given."""
+    return DEFAULT_COVERS[kind]
 
 
 def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:

@@ -49,7 +49,11 @@ def read_geotiff(
 
 
 def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
-    """Reads an open file; returns the same as `read_geotiff`."""
+    """Returns heights, grid spacing, vertical axis and position of an open file, as `read_geotiff` does.
+
+    Raises:
+        TwinError: the file is an image, has too many heights, or its grid or one of its units is not supported.
+    """
     if source.count != 1 or source.dtypes[0] in ("uint8", "int8"):
         bands = f"{source.count} band(s) of {source.dtypes[0]}"
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {bands}", HEIGHT_FORMATS)

@@ -45,6 +45,8 @@ ROCK = Cover((44, 38, 34), (122, 106, 92), (196, 180, 158), CRACKS, 0.17, 0.6, 1
 ALGAE = Cover((30, 38, 24), (94, 98, 64), (164, 162, 116), GRAINS, 0.03, 0.3, 1.0)
 CORAL = Cover((92, 58, 48), (168, 118, 90), (236, 204, 172), POLYPS, 0.022, 0.6, 0.8)
 SEAGRASS = Cover((22, 34, 18), (66, 86, 46), (142, 154, 98), BLADES, 0.012, 0.8, 0.7)
+FRAGMENTS = Cover((58, 50, 40), (164, 148, 120), (236, 226, 206), STONES, 0.03, 0.8, 0.9)
+CORALLINE = Cover((46, 34, 32), (140, 106, 98), (222, 184, 174), CRACKS, 0.17, 0.6, 1.0)
 MUD = Cover((58, 52, 44), (112, 102, 88), (164, 154, 138), BURROWS, 0.13, 0.7, 1.15)
 
 #: Four materials of each cover, ordered from low and level to high and steep ground.
@@ -53,6 +55,7 @@ COVERS = {
     "rubble": (SAND, RUBBLE, RUBBLE, RUBBLE),
     "rock": (SAND, ROCK, ROCK, ALGAE),
     "reef": (SAND, RUBBLE, ROCK, CORAL),
+    "coral": (SAND, FRAGMENTS, CORALLINE, CORALLINE),
     "seagrass": (SAND, SEAGRASS, SEAGRASS, SEAGRASS),
     "mud": (MUD, MUD, MUD, RUBBLE),
 }

@@ -65,7 +65,7 @@ def load(
     georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
     ny, nx = height_m.shape
     extent_m = ((nx - 1) * spacing_m, (ny - 1) * spacing_m)
-    shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m))
+    shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m) if texture.in_images else spacing_m)
     texel_m = extent_m[0] / shape[1]
     if texture.photo_file is not None:
         texels = texture_from_photo(texture, shape, extent_m)
@@ -126,7 +126,11 @@ def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]
 
 
 def _read_png(file: Path) -> NDArray[np.float64]:
-    """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1."""
+    """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1.
+
+    Raises:
+        TwinError: the file is not a PNG with one band of 16 bits, or has too many pixels.
+    """
     size = image_size(file)
     if size is not None:
         check_height_count(*size, file)
@@ -140,7 +144,11 @@ def _read_png(file: Path) -> NDArray[np.float64]:
 
 
 def _read_npy(file: Path) -> NDArray[np.float64]:
-    """Reads the heights (rows, cols) of a .npy file [m]."""
+    """Reads the heights (rows, cols) of a .npy file [m].
+
+    Raises:
+        TwinError: the file cannot be read, is too large, or is not a two-dimensional array of numbers other than uint8.
+    """
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read
     except (ValueError, OSError, EOFError, OverflowError) as error:

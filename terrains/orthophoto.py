@@ -20,6 +20,8 @@ from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
+_NO_PALETTE = "a GeoTIFF with bands of colour: gdal_translate -expand rgb writes one"
+_COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 _MAX_SHARP = 16  #: an orthophoto may be this many times finer than the texels along each axis
 
 
@@ -77,7 +79,12 @@ def _read(
     shape: tuple[int, ...],
     georeference: Georeference,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of an orthophoto at texels, and whether each texel (rows, cols) is valid."""
+    """Returns the colours (rows, cols, 3) of an orthophoto at texels, and whether each texel (rows, cols) is valid.
+
+    Raises:
+        TwinError: the bands are not those of an orthophoto, the DEM names no CRS although the orthophoto has one, they
+            do not overlap, or the orthophoto is too large.
+    """
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
@@ -88,7 +95,8 @@ def _read(
     _check_resolution(source, file, target, grid)
     with WarpedVRT(
         source, src_crs=source.crs or target, crs=target, transform=grid, width=shape[1], height=shape[0],
-        resampling=Resampling.average if _finer(source, target, grid) > 1.5 else Resampling.bilinear, add_alpha=True,
+        resampling=Resampling.average if _finer(source, target, grid) > 1.5 else Resampling.bilinear,
+        add_alpha=ColorInterp.alpha not in source.colorinterp,
     ) as warped:  # fmt: skip
         values = warped.read(bands)
         covered = warped.dataset_mask() > 0
@@ -99,20 +107,30 @@ def _read(
 
 
 def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
-    """Returns the numbers of the grey band, or of the red, green and blue bands; checks count and type of the bands."""
-    kinds = {source.dtypes[k - 1] for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha}
-    colours = [k for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha]
-    if not kinds <= {"uint8", "uint16"} or len(kinds) != 1 or len(colours) not in (1, 3):
+    """Returns the number of the grey band, or the numbers of the bands of red, green and blue, from 1.
+
+    Three bands that are not marked as red, green and blue are taken to be red, green and blue in the order of the file.
+
+    Raises:
+        TwinError: the bands are indices into a palette, or their count or type is not that of an orthophoto.
+    """
+    if ColorInterp.palette in source.colorinterp:
+        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has a palette in place of colours", _NO_PALETTE)
+    kind_of = {k: interp for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha}
+    kinds = {source.dtypes[k - 1] for k in kind_of}
+    if not kinds <= {"uint8", "uint16"} or len(kinds) != 1 or len(kind_of) not in (1, 3):
         found = f"{source.count} band(s) of {', '.join(sorted(set(source.dtypes)))}"
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is not an orthophoto: {found}", _FORMATS)
-    return colours
+    if set(kind_of.values()) == set(_COLOURS):
+        return sorted(kind_of, key=lambda k: _COLOURS.index(kind_of[k]))
+    return list(kind_of)
 
 
 def _check_overlap(
     source: rasterio.DatasetReader, file: Path, target: CRS, floor: tuple[float, float, float, float]
 ) -> None:
     """Raises TwinError if an orthophoto does not overlap the floor (west, south, east, north) in the target CRS."""
-    west, south, east, north = transform_bounds(source.crs or target, target, *source.bounds)
+    west, south, east, north = _bounds(source, target)
     if west < floor[2] and east > floor[0] and south < floor[3] and north > floor[1]:
         return
     raise TwinError(
@@ -130,8 +148,16 @@ def _check_resolution(source: rasterio.DatasetReader, file: Path, target: CRS, g
 
 def _finer(source: rasterio.DatasetReader, target: CRS, grid: Affine) -> float:
     """Returns the number of pixels of an orthophoto along the side of one texel."""
-    west, _, east, _ = transform_bounds(source.crs or target, target, *source.bounds)
+    west, _, east, _ = _bounds(source, target)
     return grid.a / ((east - west) / source.width)
+
+
+def _bounds(source: rasterio.DatasetReader, target: CRS) -> tuple[float, float, float, float]:
+    """Returns west, south, east and north of an orthophoto in the target CRS; its rows may run either way."""
+    left, bottom, right, top = source.bounds
+    west, east = sorted((left, right))
+    south, north = sorted((bottom, top))
+    return transform_bounds(source.crs or target, target, west, south, east, north)
 
 
 def _name(crs: CRS) -> str:

@@ -15,28 +15,43 @@ BLOCK_FRACTION = 5  #: side of a block: this part of the shorter side of the pho
 OVERLAP_FRACTION = 4  #: overlap of neighbouring blocks: this part of the side of a block
 CANDIDATES = 60  #: random places of the photo that are compared for each block
 TOLERANCE = 1.2  #: places whose difference is at most this factor above the least one are equally likely
+LIGHTING_SAMPLES = 250_000  #: pixels of a photo to which its slow variation of brightness is fitted
+LIGHTING_ROWS = 128  #: rows of a photo that are divided by this variation at a time
 MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 
 
 def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Removes slow variations of brightness from a photo of a floor; its mean brightness remains.
 
-    The photo is divided by a polynomial of degree 2 in row and column, fitted to its brightness by least squares.
+    The photo is divided by a polynomial of degree 2 in row and column, fitted by least squares to its brightness. Of a
+    large photo, about LIGHTING_SAMPLES pixels on a regular grid are fitted. The memory beyond photo and result is that
+    of a few blocks of LIGHTING_ROWS rows.
 
     Args:
         photo: (h, w, 3) uint8 RGB.
     Returns:
         (h, w, 3) uint8.
     """
-    grey = photo.mean(axis=2, dtype=np.float32)
+    step = max(1, round(np.sqrt(photo.shape[0] * photo.shape[1] / LIGHTING_SAMPLES)))
+    v, u = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in photo.shape[:2])
+    grey = photo[::step, ::step].mean(axis=2, dtype=np.float32)
     mean = float(grey.mean())
     if mean == 0.0:
         return photo
-    v, u = np.meshgrid(*(np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in grey.shape), indexing="ij")
-    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-    coefficients = np.linalg.lstsq(terms.reshape(-1, 6), grey.ravel(), rcond=None)[0]
-    gain = mean / np.maximum(terms @ coefficients, 0.05 * mean)
-    return np.clip(np.rint(photo * gain[..., None]), 0, 255).astype(np.uint8)
+    terms = _terms(v[::step, None], u[None, ::step])
+    fit = np.linalg.lstsq(np.stack([np.broadcast_to(t, grey.shape).ravel() for t in terms], axis=1), grey.ravel())[0]
+    even = np.empty_like(photo)
+    for first in range(0, len(photo), LIGHTING_ROWS):
+        rows = slice(first, first + LIGHTING_ROWS)
+        brightness = sum(c * t for c, t in zip(fit.astype(np.float32), _terms(v[rows, None], u[None]), strict=True))
+        gain = np.float32(mean) / np.maximum(brightness, np.float32(0.05 * mean))
+        even[rows] = np.clip(np.rint(photo[rows] * gain[..., None]), 0, 255)
+    return even
+
+
+def _terms(v: NDArray[np.float32], u: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+    """Returns the terms of a polynomial of degree 2 at row positions v (h, 1) and column positions u (1, w)."""
+    return np.ones((1, 1), np.float32), u, v, u * u, u * v, v * v
 
 
 def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:

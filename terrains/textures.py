@@ -32,6 +32,8 @@ class TextureSource:
         orthophoto_file: GeoTIFF that replaces the texture wherever it has valid pixels; None: no orthophoto.
         cover: materials of a generated texture, a key of `ground_cover.COVERS`; None: those of the kind of floor.
         coarsen: whether texels of a large floor are larger than px_m, so that there are not more than COARSEN_TEXELS.
+        in_images: whether the texture is seen in images; if not, the texels of a floor from a file have the side of
+            the cells of its height grid.
     """
 
     px_m: float
@@ -40,6 +42,7 @@ class TextureSource:
     orthophoto_file: str | Path | None = None
     cover: str | None = None
     coarsen: bool = False
+    in_images: bool = True
 
     def texel_m(self, size_m: tuple[float, float]) -> float:
         """Returns the side of the texels of a floor of the given extent along x and y [m]."""
@@ -111,7 +114,10 @@ def read_image(file: Path) -> NDArray[np.uint8]:
 def texture_from_photo(
     source: TextureSource, shape: tuple[int, int], extent_m: tuple[float, float]
 ) -> NDArray[np.uint8]:
-    """Returns the texture (rows, cols, 3) of a floor, made from a photo of a part of it; small photos are repeated.
+    """Returns the texture (rows, cols, 3) uint8 RGB of a floor, made from a photo of a part of it.
+
+    Features keep the size that they have on the floor: the photo is resampled if its pixels and the texels differ in
+    size. A photo that is then smaller than BLOCK_FRACTION * MIN_BLOCK_PX is repeated as tiles.
 
     Args:
         source: source of the texture, with a photo.
@@ -124,7 +130,20 @@ def texture_from_photo(
     photo = read_image(Path(source.photo_file))
     if source.tiling == "repeat" or min(photo.shape[:2]) < BLOCK_FRACTION * MIN_BLOCK_PX:
         return tile_image(photo, source.px_m, shape, extent_m)
-    return quilt(even_lighting(photo), shape, np.random.default_rng(_QUILT_SEED))
+    texel_m = extent_m[0] / shape[1]
+    photo = _scaled(even_lighting(photo), source.px_m / texel_m)
+    if min(photo.shape[:2]) < BLOCK_FRACTION * MIN_BLOCK_PX:
+        return tile_image(photo, texel_m, shape, extent_m)
+    return quilt(photo, shape, np.random.default_rng(_QUILT_SEED))
+
+
+def _scaled(photo: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """Returns a photo (h, w, 3) with rows and columns multiplied by a factor; unchanged if they are the same number."""
+    rows, cols = (max(1, round(n * factor)) for n in photo.shape[:2])
+    if (rows, cols) == photo.shape[:2]:
+        return photo
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(photo, (cols, rows), interpolation=method), np.uint8)
 
 
 def tile_image(

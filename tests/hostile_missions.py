@@ -127,7 +127,7 @@ def fly(name, overrides, seed):
         texts = [text.replace("{folder}", folder) for text in (*SHORT, *overrides)]
         row = {"mission": name, "seed": seed}
         try:
-            scenario = twin.load_scenario("quickstart", [*texts, f"seed={seed}"])
+            scenario = twin.load_scenario("reef", [*texts, f"seed={seed}"])
             metrics = survey.run(scenario, Path(folder) / "run", outputs=None).metrics
         except TwinError as error:
             return row | {"status": "refused", "reason": str(error)[:200]}

@@ -167,9 +167,9 @@ def attempt(file: Path, overrides: list[str]) -> str:
 
     try:
         mission = prepare(load_scenario(file, overrides))
+        summarise(mission)
     except TwinError as error:
         return f"refused: {error}"
-    summarise(mission)
     dump_toml(mission.scenario)
     return "accepted"
 

@@ -17,7 +17,7 @@ from twin.study.flight import row_of
 from twin.study.progress import StudyProgress
 
 STUDY = """
-scenario = "quickstart"
+scenario = "reef"
 show = ["map.le90_m"]
 
 [vary]

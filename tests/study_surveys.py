@@ -8,7 +8,7 @@ from twin.study.study_file import load_study
 from twin.study.worker import describe_exception
 
 STUDY = """
-scenario = "quickstart"
+scenario = "reef"
 seek = "water.turbidity"
 show = ["map.le90_m"]
 

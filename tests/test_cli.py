@@ -110,7 +110,7 @@ def test_options_reach_the_survey(twin_command):
     [
         (["run", "quikstart"], "quikstart: no such scenario (did you mean quickstart?)"),
         (["run", "quickstart", "--set", "plan.overlap_along=1"], "--set: plan.overlap_along: 1: not allowed"),
-        (["plan", "quickstart", "--set", "plan.area_m=[90.0,2.0]"], "--set: plan.area_m: 90 x 2 m is larger"),
+        (["plan", "reef", "--set", "plan.area_m=[90.0,2.0]"], "--set: plan.area_m: 90 x 2 m is larger"),
         (["report", "nowhere"], "nowhere: is not a run folder"),
         (["run", "quickstart", "--out", str(ROOT)], f"--out: {ROOT} is not empty"),
         (["run", "quickstart", "--seed", "-1"], "Invalid value for '--seed'"),
@@ -118,7 +118,7 @@ def test_options_reach_the_survey(twin_command):
         (["fly"], "No such command 'fly'"),
         (["calibrate", "fit_reef", "--out", "x.toml"], "calibrate: renamed to fit-surrogate"),
         (
-            ["plan", "quickstart", "--set", "imaging.calibration=x"],
+            ["plan", "reef", "--set", "imaging.calibration=x"],
             "imaging.calibration: renamed to imaging.error_model",
         ),
     ],
@@ -167,16 +167,16 @@ def test_the_schema_describes_every_section(twin_command):
 
 
 def test_the_plan_is_a_table_and_a_picture(twin_command, tmp_path):
-    done = twin_command("plan", "quickstart", "--set", "terrain.kind=flat", "--out", "plan.png")
+    done = twin_command("plan", "reef", "--set", "terrain.kind=flat", "--out", "plan.png")
     assert done.status == 0 and "frames per keyframe N" in done.out
     assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_the_plan_as_json_is_one_object_and_nothing_else(twin_command, tmp_path):
-    words = ("plan", "quickstart", "--set", "terrain.texture_px_m=0.05", "--set", "plan.tracks=1", "--out", "plan.png")
+    words = ("plan", "reef", "--set", "terrain.texture_px_m=0.05", "--set", "plan.tracks=1", "--out", "plan.png")
     done = twin_command(*words, "--set", 'require={"map.le90_m"=0.0001}', "--json")
     tree = json.loads(done.out)
-    assert (done.status, tree["name"], tree["picture"]) == (0, "quickstart", "plan.png")
+    assert (done.status, tree["name"], tree["picture"]) == (0, "reef", "plan.png")
     assert not tree["require"]["map.le90_m"]["passed"]
     strict = twin_command(*words, "--set", 'require={"map.le90_m"=0.0001}', "--strict")
     assert strict.status == 1 and "Warning: map.le90_m is expected to miss its limit" in strict.err

@@ -59,7 +59,7 @@ def test_a_run_that_compiles_and_one_that_loads_the_cache_write_identical_files(
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "MUJOCO_GL": "egl"}
     small = ["--set", "plan.tracks=1", "--set", "plan.area_m=[2.4, 1.2]"]
     for name in ("compiles", "reads"):
-        line = [sys.executable, "-m", "twin", "run", "quickstart", *small, "--out", str(tmp_path / name)]
+        line = [sys.executable, "-m", "twin", "run", "reef", *small, "--out", str(tmp_path / name)]
         subprocess.run(line, env=environment, check=True, stdout=subprocess.DEVNULL)
     for file in ("trajectory_truth.tum", "trajectory_f2f.tum", "trajectory_final.tum", "dem.tif"):
         assert (tmp_path / "compiles" / file).read_bytes() == (tmp_path / "reads" / file).read_bytes(), file

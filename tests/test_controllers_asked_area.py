@@ -77,7 +77,7 @@ def test_points_of_any_shape_are_accepted():
     ],
 )
 def test_the_grid_of_the_map_contains_the_asked_area(sets):
-    mission = prepare(load_scenario("quickstart", [*sets, "terrain.size_m=[8.0, 8.0]"]))
+    mission = prepare(load_scenario("reef", [*sets, "terrain.size_m=[8.0, 8.0]"]))
     x, y = np.meshgrid(*mission.grid.centres())
     cells = mission.plan.inside_area(x, y)
     assert share_inside(mission.plan, 2.0) == pytest.approx(cells.sum() * mission.grid.cell_m**2, rel=0.02)

@@ -11,7 +11,6 @@ from recorded_datasets import RIG
 
 from twin.core import geometry
 from twin.core.records import Frame
-from twin.datasets import readers
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
@@ -22,6 +21,7 @@ from twin.datasets.rectification import rectification
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
 from twin.exchange.euroc import EurocWriter
+from twin.plugin import loading
 
 RNG = np.random.default_rng(1)
 GRAY = cv2.GaussianBlur(RNG.integers(0, 255, (RIG.height_px, RIG.width_px), np.uint8), (0, 0), 1.5)
@@ -282,7 +282,7 @@ def test_a_link_cannot_lead_out_of_the_folder(tmp_path):
 
 
 def test_a_folder_without_a_data_set_is_one_line(tmp_path):
-    with pytest.raises(TwinError, match="is not a folder"):
+    with pytest.raises(TwinError, match="does not exist"):
         read_dataset(tmp_path / "none")
     with pytest.raises(TwinError, match="is empty"):
         read_dataset(tmp_path)
@@ -317,7 +317,7 @@ class _Listed:
 
 def test_a_reader_of_another_package_is_found(tmp_path, monkeypatch):
     entry = SimpleNamespace(name="listed", value="other:Listed", load=lambda: _Listed)
-    monkeypatch.setattr(readers, "entry_points", lambda group: [entry] if group == "twin.readers" else [])
+    monkeypatch.setattr(loading, "entry_points", lambda group: [entry] if group == "twin.readers" else [])
     (tmp_path / "listed.txt").touch()
     assert read_dataset(tmp_path)[1] == "listed"
 
@@ -329,14 +329,27 @@ def test_a_reader_of_another_package_is_found(tmp_path, monkeypatch):
         read_dataset(tmp_path)
 
 
+def test_a_reader_of_another_package_that_fails_is_named(tmp_path, monkeypatch):
+    entry = SimpleNamespace(name="listed", value="other:Listed", load=lambda: _Listed)
+    monkeypatch.setattr(loading, "entry_points", lambda group: [entry] if group == "twin.readers" else [])
+    (tmp_path / "listed.txt").touch()
+    for read, message in ((lambda self, folder: 1 / 0, "ZeroDivisionError"), (lambda self, folder: 5, "returned int")):
+        monkeypatch.setattr(_Listed, "read", read)
+        with pytest.raises(TwinError, match=f"twin.readers listed: other:Listed.*{message}"):
+            read_dataset(tmp_path)
+    monkeypatch.delattr(_Listed, "recognises")
+    with pytest.raises(TwinError, match="twin.readers listed: other:Listed: AttributeError"):
+        read_dataset(tmp_path)
+
+
 def test_files_of_true_poses_are_told_apart(euroc, tmp_path):
     dataset, _ = read_dataset(euroc)
     truth = recorded.trajectory(recorded.poses(4))
     truth.save(tmp_path / "tum.txt")
     np.savetxt(tmp_path / "kitti.txt", truth.world_from_camera[:, :3].reshape(-1, 12))
-    tum = read_truth(tmp_path / "tum.txt", dataset, dataset.calibration)
+    tum = read_truth(tmp_path / "tum.txt", dataset)
     np.testing.assert_allclose(tum.world_from_camera, truth.world_from_camera, atol=1e-7)
-    kitti = read_truth(tmp_path / "kitti.txt", dataset, dataset.calibration)
+    kitti = read_truth(tmp_path / "kitti.txt", dataset)
     np.testing.assert_allclose(kitti.world_from_camera, truth.world_from_camera @ RIG.body_from_camera, atol=1e-9)
     bad = {
         "": "has no poses",
@@ -347,4 +360,18 @@ def test_files_of_true_poses_are_told_apart(euroc, tmp_path):
     for text, message in bad.items():
         (tmp_path / "bad.txt").write_text(text)
         with pytest.raises(TwinError, match=message):
-            read_truth(tmp_path / "bad.txt", dataset, dataset.calibration)
+            read_truth(tmp_path / "bad.txt", dataset)
+
+
+@pytest.mark.parametrize("missing", ["left", "right"])
+def test_a_pose_per_line_belongs_to_the_frame_of_its_number_also_where_an_image_is_missing(tmp_path, missing):
+    folder = recorded.write_folder(tmp_path / "set", frames_of(4))
+    (folder / missing / "0001.png").unlink()
+    dataset, _ = read_dataset(folder)
+    poses = recorded.poses(4)
+    np.savetxt(tmp_path / "kitti.txt", poses[:, :3].reshape(-1, 12))
+    truth = read_truth(tmp_path / "kitti.txt", dataset)
+    for frame in dataset.images:
+        row = int(np.argmin(np.abs(truth.times_s - frame.time_s)))
+        assert truth.times_s[row] == pytest.approx(frame.time_s, abs=1e-9)
+        np.testing.assert_allclose(truth.world_from_camera[row], poses[int(frame.left.stem)], atol=1e-9)

@@ -1,7 +1,10 @@
 """Kalman filter of the pose and velocity of the camera between keyframes, and the covariance of its poses."""
 
+import itertools
+
 import numpy as np
 import pytest
+import scipy.linalg
 
 from twin.core import geometry
 from twin.core.records import StereoRig
@@ -32,17 +35,39 @@ def test_exact_poses_pass_unchanged():
 
 
 def test_poses_of_few_pixels_are_smoothed_over_many_frames():
-    """Oracle: steady state of the alpha-beta filter for white acceleration (Kalata 1984), for poses as uncertain as in
-    marine snow. At constant velocity, the true error is smaller than the claimed one.
+    """Oracle: the discrete Riccati equation of one axis with white acceleration, for poses as uncertain as in marine
+    snow. At constant velocity, the true error is smaller than the claimed one.
     """
-    sigma, acceleration = 0.02, 2.0
+    sigma, density, t = 0.02, 2.0**2 * INTERVAL_S, INTERVAL_S
+    process_cov = density * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    transition, seen = np.array([[1, t], [0, 1]]), np.array([[1.0, 0.0]])
+    predicted = scipy.linalg.solve_discrete_are(transition.T, seen.T, process_cov, [[sigma**2]])[0, 0]
+    alpha = predicted / (predicted + sigma**2)
     motion_filter, errors, nees = track(np.full(6, sigma), 300, np.random.default_rng(2))
-    index = acceleration * INTERVAL_S**2 / sigma
-    alpha = 1 - ((4 + index - np.sqrt(8 * index + index**2)) / 4) ** 2
     # the 2 % are left for the turn of the axes by 3 mrad per frame
     np.testing.assert_allclose(np.diag(motion_filter.cov), alpha * sigma**2, rtol=0.02)
     assert np.sqrt(np.mean(errors[50:] ** 2)) < np.sqrt(alpha) * sigma
     assert 1 < nees[50:].mean() < 6.5
+
+
+@pytest.mark.parametrize("rate_hz", [5, 10, 15])
+def test_an_exactly_measured_jitter_does_not_build_up_in_the_velocity(rate_hz):
+    """Oracle for exact poses with jitter s, each relative to the last one. The steady gain of the velocity is g = 1.268
+    (in units of one over the interval), the factor of its old error 1 - g. With the differences d of the jitter, the
+    prediction errs by d(k+1) - g d(k) - g (1-g) d(k-1) - ..., of standard deviation
+    s sqrt(1 + (1+g)^2 + g^4 / (1 - (1-g)^2)) = 2.99 s. For accelerations that are constant within an interval, g is 2,
+    and the error grows with the number of frames.
+    """
+    rng, jitter, found = np.random.default_rng(6), 1e-3, []
+    for _ in range(4):
+        motion_filter, poses = MotionFilter(), [geometry.exp(jitter * rng.normal(size=6)) for _ in range(120)]
+        for last, now in itertools.pairwise(poses):
+            motion = geometry.inverse(last) @ now
+            motion_filter.restart()
+            motion_filter.predict(1 / rate_hz)
+            found.append(geometry.log(geometry.inverse(motion_filter.pose) @ motion))
+            assert motion_filter.correct(motion, np.eye(6) * (0.1 * jitter) ** 2)
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(2.99 * jitter, rel=0.06)
 
 
 def test_a_jump_is_rejected_and_the_pose_follows_the_velocity():
@@ -106,7 +131,7 @@ class MeasuredPoses(f2f.FrameToFrame):
         error = self.common + self.sigma * self.rng.normal(size=6)
         measured = geometry.inverse(self.true_reference) @ self.true @ geometry.exp(error)
         motion = Motion(measured, np.eye(6) * 2 * self.sigma**2, 100, 1.0)
-        return f2f._Located(motion, 1.0, self.tracked_share, NO_POINTS)
+        return f2f._Located(motion, 1.0, self.tracked_share, 0.05, NO_POINTS)
 
     def fly(self, n):
         """Tracks n frames and returns the error (6,) of the pose since the start."""

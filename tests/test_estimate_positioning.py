@@ -258,6 +258,32 @@ def test_frame_to_frame_predicts_over_uneven_intervals(diver):
     assert error_m[14.0] < 0.01 < 0.05 < error_m[1.0], error_m
 
 
+def test_frame_to_frame_follows_a_swaying_camera_at_five_frames_a_second(diver):
+    """Accelerations of 1.5 rad/s2 move the image up to 12 px away from where constant velocity predicts it."""
+    pose, interval_s = scene.down_camera(0, 0, ALTITUDE_M), 0.2
+    keyframe, image, _ = diver.keyframe(pose)
+    f2f, estimated, true = FrameToFrame(RIG, PATCH_PX), pose, pose
+    f2f.step(image)
+    f2f.restart(image, keyframe.points)
+    for k in range(1, 16):
+        true = pose @ geometry.exp(np.array([0.0, 0.04 * np.sin(6.1 * interval_s * k), 0.0, 0.0, 0.0, 0.0]))
+        motion, status = f2f.step(matching.normalise(matching.gray(diver.frame(true)[0])), interval_s)
+        estimated = estimated @ motion.a_from_b
+        assert status == "ok"
+        assert np.linalg.norm(error_of(true, estimated)[3:]) < 0.01
+
+
+def test_points_that_move_in_two_ways_are_no_motion(diver):
+    """Both halves of the image are tracked well, but no rigid motion moves them 8 px apart."""
+    keyframe, image, _ = diver.keyframe(scene.down_camera(0, 0, ALTITUDE_M))
+    f2f = FrameToFrame(RIG, PATCH_PX)
+    f2f.step(image)
+    f2f.restart(image, keyframe.points)
+    torn = image.copy()
+    torn[:120], torn[120:] = np.roll(image[:120], 4, axis=1), np.roll(image[120:], -4, axis=1)
+    assert f2f.step(torn)[1] == "too few points agree"
+
+
 def test_registration_with_the_mosaic_is_unbiased_to_a_millimetre_in_six_degrees(diver):
     cell_m = ALTITUDE_M / RIG.focal_px
     mosaic = Mosaic(cell_m, diver.spool.folder / "mosaic")
@@ -392,7 +418,7 @@ def test_errors_that_recur_over_the_floor_are_counted_once_per_footprint():
     is 1 + c s (m - 1) times that of independent errors. 4000 walks: standard error 2 %; the ends of a walk of 100 links
     see fewer patches, m^2 / 300 = 8 % of the growth at most.
     """
-    rng, m, n, share, recurrence = np.random.default_rng(3), 5, 100, 0.6, link_selection._RECURRENCE
+    rng, m, n, share, recurrence = np.random.default_rng(3), 5, 100, 0.6, link_selection.RECURRENCE
     patches = rng.normal(size=(4000, n + m - 1))  # the error of a link is the sum of the m patches in view
     recurring = np.stack([patches[:, k : k + m].sum(axis=1) for k in range(n)], axis=1) / m**0.5
     fresh = rng.normal(size=(4000, n))

@@ -97,8 +97,7 @@ def test_lines_of_keys_are_found_in_a_text_too_long_for_tomlkit():
 def test_a_study_of_too_many_surveys_is_refused(tmp_path):
     file = tmp_path / "big.toml"
     file.write_text(
-        'scenario = "quickstart"\n[vary]\n"plan.altitude_m" = { uniform = [1.0, 2.0] }\n'
-        "[sampling]\nsamples = 10_000_000\n"
+        'scenario = "reef"\n[vary]\n"plan.altitude_m" = { uniform = [1.0, 2.0] }\n[sampling]\nsamples = 10_000_000\n'
     )
     with pytest.raises(ScenarioError, match=r"sampling: 10000000 surveys are too many \(allowed: up to 100000"):
         load_study(file)
@@ -128,9 +127,9 @@ ODD_PATHS = ("file/below", "a\0b", "n" * 300, "d/" * 3000 + "x", "folder", "loop
 @pytest.mark.parametrize(
     "words",
     [
-        ["plan", "quickstart", *SMALL],
-        ["look", "quickstart", *SMALL],
-        ["run", "quickstart"],
+        ["plan", "reef", *SMALL],
+        ["look", "reef", *SMALL],
+        ["run", "reef"],
         ["demo"],
         ["study", "turbidity"],
         ["tune", "overlap"],
@@ -160,17 +159,14 @@ def test_an_output_that_cannot_be_written_is_refused_before_work_begins(command,
             for name in ("report", "view", "plan", "run", "look", "study")
             for path in ("", "a\0b", "n" * 300)
         ),
-        *(
-            ["run", "quickstart", "--set", text]
-            for text in ("", "=", "=1", "a", ".=1", "a..b=1", "plan=", "plan.tracks")
-        ),
-        *(["plan", "quickstart", "--set", f"lamps.{item}.tilt_deg=1"] for item in ("-1", "99", "x", "9" * 50, "")),
-        ["plan", "quickstart", "--set", "seed=" + "9" * 5000],
-        ["plan", "quickstart", "--set", "plan.tracks=1000000000"],
-        ["plan", "quickstart", "--set", "a" + ".a" * 5000 + "=1"],
-        ["plan", "quickstart", "--set", "seed=" + "[" * 5000],
-        *(["run", "quickstart", "--seed", seed] for seed in ("-1", "x", "1e3", "9" * 5000, str(2**32), "")),
-        *(["look", "quickstart", "--at", at] for at in ("", "1,2", "a,b,c", "nan,0,1", "1e400,0,1")),
+        *(["run", "reef", "--set", text] for text in ("", "=", "=1", "a", ".=1", "a..b=1", "plan=", "plan.tracks")),
+        *(["plan", "reef", "--set", f"lamps.{item}.tilt_deg=1"] for item in ("-1", "99", "x", "9" * 50, "")),
+        ["plan", "reef", "--set", "seed=" + "9" * 5000],
+        ["plan", "reef", "--set", "plan.tracks=1000000000"],
+        ["plan", "reef", "--set", "a" + ".a" * 5000 + "=1"],
+        ["plan", "reef", "--set", "seed=" + "[" * 5000],
+        *(["run", "reef", "--seed", seed] for seed in ("-1", "x", "1e3", "9" * 5000, str(2**32), "")),
+        *(["look", "reef", "--at", at] for at in ("", "1,2", "a,b,c", "nan,0,1", "1e400,0,1")),
         *(["study", "turbidity", "--jobs", jobs] for jobs in ("0", "-1", "x", "9" * 30)),
         ["study", "turbidity", "--scheduler", "nowhere"],
     ],
@@ -184,7 +180,7 @@ def test_an_odd_command_line_is_refused(command, words):
 
 @pytest.mark.parametrize("name", ["[/x]", "$\\frac$x_{", "../x", "\0", "\x1b[31m", "é" * 80])
 def test_a_plan_of_any_name_is_printed_and_drawn_literally(command, tmp_path, name):
-    (tmp_path / "odd.toml").write_text(f'extends = "{Path(cli.__file__).parent.parent}/scenes/quickstart.toml"\n')
+    (tmp_path / "odd.toml").write_text(f'extends = "{Path(cli.__file__).parent.parent}/scenes/reef.toml"\n')
     text = json.dumps(name, ensure_ascii=False).replace("\0", "\\u0000").replace("\x1b", "\\u001b")
     status, out, err = command("plan", "odd.toml", *SMALL, "--set", f"name={text}")
     assert status == 0, err
@@ -201,7 +197,7 @@ def test_the_name_of_a_file_contains_no_separator_and_at_most_100_bytes():
 def test_a_bug_still_shows_its_traceback(command, monkeypatch):
     monkeypatch.setattr("twin.app.plan_summary.summarise", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        command("plan", "quickstart", *SMALL, "--out", "x.png")
+        command("plan", "reef", *SMALL, "--out", "x.png")
 
 
 @pytest.fixture(scope="module")

@@ -287,7 +287,7 @@ def test_each_path_of_daylight_has_its_own_absorption(lamps, depth_m, elevation_
     sun = f"sun.depth_m={depth_m}", f"sun.elevation_deg={elevation_deg}", "sun.illuminance_lx=1e5", "sun.sky_share=0"
     rig = f"rig.image_width_px={RIG.width_px}", f"rig.image_height_px={RIG.height_px}"
     water = "water.jerlov=II", "water.turbidity=0", "plan.altitude_m=1.5"
-    scenario = load_scenario("quickstart", [*lamps, *sun, *rig, *water])
+    scenario = load_scenario("reef", [*lamps, *sun, *rig, *water])
     optics = Optics(scenario.believed_rig(), illumination_of(scenario), scenario.lamps)
     path_m = depth_m / direction_to_sun(elevation_deg, 0.0)[2] + 1.5
     left = band_weights(spectrum_of("daylight")) @ np.exp(-water_spectrum("II").absorption_per_m * path_m)

@@ -184,7 +184,7 @@ BAD_LENSES = [
 @pytest.mark.parametrize(("line", "message"), BAD_LENSES)
 def test_an_invalid_lens_is_rejected_with_file_and_line(tmp_path, line, message):
     file = tmp_path / "bad.toml"
-    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n[lens]\n{line}\n')
+    file.write_text(f'extends = "{load_scenario("reef").source.path}"\n[lens]\n{line}\n')
     with pytest.raises(ScenarioError) as error:
         prepare(load_scenario(file))
     assert error.value.lines == [f"{file}:3: {message}"]

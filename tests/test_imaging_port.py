@@ -255,7 +255,7 @@ BAD_PORTS = [
 @pytest.mark.parametrize(("lines", "message"), BAD_PORTS)
 def test_an_invalid_port_is_rejected_with_file_and_line(tmp_path, lines, message):
     file = tmp_path / "bad.toml"
-    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n[port]\n{lines}\n')
+    file.write_text(f'extends = "{load_scenario("reef").source.path}"\n[port]\n{lines}\n')
     with pytest.raises(ScenarioError) as error:
         prepare(load_scenario(file))
     assert error.value.lines == [f"{file}:{2 + len(lines.splitlines())}: {message}"]
@@ -264,4 +264,4 @@ def test_an_invalid_port_is_rejected_with_file_and_line(tmp_path, lines, message
 def test_a_field_of_view_beyond_the_port_is_rejected():
     wide = ["rig.hfov_deg=110.0", "port.kind=flat", "port.calibrated_at_m=2.0"]
     with pytest.raises(ScenarioError, match=r"rig\.hfov_deg: no rays reach the corners of the frame"):
-        prepare(load_scenario("quickstart", wide))
+        prepare(load_scenario("reef", wide))

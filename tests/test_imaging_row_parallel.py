@@ -71,3 +71,38 @@ def test_an_exception_in_any_band_is_raised(monkeypatch, bad_row):
 
     with pytest.raises(ValueError, match=str(bad_row)):
         row_parallel.in_row_bands(work, 500)
+
+
+@pytest.mark.parametrize("processors", [1, 2])
+def test_a_pair_is_computed_without_splitting_images(monkeypatch, processors):
+    """Each image in one band, and images are split again afterwards."""
+    monkeypatch.setattr(row_parallel, "_n_processors", lambda: processors)
+    bands = {"left": [], "right": [], "after": []}
+
+    def image(name):
+        row_parallel.in_row_bands(lambda *band: bands[name].append(band), 500)
+        return name
+
+    assert row_parallel.in_pair(lambda: image("left"), lambda: image("right")) == ("left", "right")
+    image("after")
+    assert bands["left"] == bands["right"] == [(0, 500)]
+    assert len(bands["after"]) == processors
+
+
+@pytest.mark.parametrize("fails", ["left", "right"])
+def test_an_exception_in_an_image_of_a_pair_is_raised(monkeypatch, fails):
+    """The other image is completed first, and images are split again afterwards."""
+    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    completed = []
+
+    def image(name):
+        if name == fails:
+            raise ValueError(name)
+        completed.append(name)
+
+    with pytest.raises(ValueError, match=fails):
+        row_parallel.in_pair(lambda: image("left"), lambda: image("right"))
+    assert len(completed) == 1
+    bands = []
+    row_parallel.in_row_bands(lambda *band: bands.append(band), 500)
+    assert len(bands) == row_parallel.THREADS

@@ -122,6 +122,19 @@ def captures(stereo, sensor=None, twist=AT_REST):
 
 
 @pytest.mark.parametrize("sensor", [None, PHYSICAL])
+def test_stereo_pairs_do_not_depend_on_the_number_of_processors(monkeypatch, sensor):
+    """To the last bit: with two processors, both images are computed at the same time."""
+    pairs = []
+    for processors in (1, 2):
+        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        pairs.append(captures([True] * 5, sensor, MOVING))
+    for one, two in zip(*pairs, strict=True):
+        np.testing.assert_array_equal(one.left, two.left)
+        np.testing.assert_array_equal(one.right, two.right)
+        assert one.exposure == two.exposure
+
+
+@pytest.mark.parametrize("sensor", [None, PHYSICAL])
 def test_left_images_do_not_depend_on_the_use_of_the_right_camera(sensor):
     flags = [False] * 5, [True] * 5, [True, False, False, True, False]
     alone, both, some = (captures(stereo, sensor, MOVING) for stereo in flags)

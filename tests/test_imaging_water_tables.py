@@ -137,12 +137,12 @@ def test_the_effective_absorption_of_a_wide_band_falls_with_the_path():
 
 
 def test_a_scenario_takes_absorption_over_twice_the_altitude_under_its_light():
-    lit = load_scenario("quickstart", ["plan.altitude_m=1.5", "water.jerlov=II"])
-    sunny = load_scenario("quickstart", ["plan.altitude_m=1.5", "water.jerlov=II", "lamps=[]", "sun.illuminance_lx=9"])
+    lit = load_scenario("reef", ["plan.altitude_m=1.5", "water.jerlov=II"])
+    sunny = load_scenario("reef", ["plan.altitude_m=1.5", "water.jerlov=II", "lamps=[]", "sun.illuminance_lx=9"])
     for scenario, light in ((lit, "led"), (sunny, "daylight")):
         want = medium(scenario.water, path_m=3.0, light=light).absorption_per_m
         np.testing.assert_array_equal(illumination_of(scenario).water.absorption_per_m, want)
-    deep = load_scenario("quickstart", ["water.jerlov=II", "sun.illuminance_lx=9", "sun.depth_m=20.0"])
+    deep = load_scenario("reef", ["water.jerlov=II", "sun.illuminance_lx=9", "sun.depth_m=20.0"])
     daylight = illumination_of(deep).daylight
     mean_cosine = daylight.source.mean_cosine
     want = downwelling_per_m(medium(deep.water, path_m=20.0 / mean_cosine, light="daylight"), mean_cosine)
@@ -182,8 +182,8 @@ def test_unknown_waters_are_rejected(name, source, field):
 def test_a_type_that_the_source_does_not_have_is_rejected_when_the_scenario_is_loaded():
     allowed = r"allowed: clear, IB, II, III, 1C, 3C, 5C with source = williamson2022"
     with pytest.raises(ScenarioError, match=rf"water\.jerlov: '7C': not allowed \({allowed}\)"):
-        load_scenario("quickstart", ["water.source=williamson2022", "water.jerlov=7C"])
-    assert load_scenario("quickstart", ["water.source=williamson2022", "water.jerlov=5C"]).water.jerlov == "5C"
+        load_scenario("reef", ["water.source=williamson2022", "water.jerlov=7C"])
+    assert load_scenario("reef", ["water.source=williamson2022", "water.jerlov=5C"]).water.jerlov == "5C"
 
 
 def test_the_tables_load_without_data_frames_and_colour_libraries():

@@ -85,7 +85,7 @@ def room_arrows():
 
 
 def circle(graph):
-    """Returns the nodes of one circle of a graph {node: {node}}; empty where there is none."""
+    """Returns the nodes of one cycle of a directed graph {node: {target}}; empty where there is none."""
     done, path = set(), []
 
     def visit(node):

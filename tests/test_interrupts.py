@@ -73,7 +73,7 @@ STAGES = {
 
 
 def fly(folder, outputs=()):
-    return survey.run(load_scenario("quickstart", SMALL), folder, outputs=outputs)
+    return survey.run(load_scenario("reef", SMALL), folder, outputs=outputs)
 
 
 def checked(folder):
@@ -114,7 +114,7 @@ def test_an_interrupted_flight_and_an_interrupted_map_are_both_named(tmp_path, m
             send()
 
     monkeypatch.setattr(Navigator, "build_map", in_first_call(Navigator.build_map, signal.SIGINT))
-    result = survey.run(load_scenario("quickstart", SMALL), tmp_path / "run", progress, outputs=())
+    result = survey.run(load_scenario("reef", SMALL), tmp_path / "run", progress, outputs=())
     assert checked(tmp_path / "run")["reason"] == result.metrics["reason"] == "interrupted; map skipped"
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05
 
@@ -142,7 +142,7 @@ def command(monkeypatch, tmp_path):
 
     def run(folder):
         words = [word for key in SMALL for word in ("--set", key)]
-        monkeypatch.setattr(sys, "argv", ["twin", "run", "quickstart", *words, "--out", str(folder)])
+        monkeypatch.setattr(sys, "argv", ["twin", "run", "reef", *words, "--out", str(folder)])
         with pytest.raises(SystemExit) as end:
             cli.main()
         return end.value.code

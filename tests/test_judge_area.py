@@ -111,3 +111,21 @@ def test_more_completeness_is_better_and_every_map_statistic_is_reported_with_on
     assert completeness_metric("map.rmse_m") == "map.completeness"
     for name in ("map.completeness", "map.completeness_area", "map.cell_m", "trajectory.final.ate_rmse_m", "risk"):
         assert completeness_metric(name) is None
+
+
+def test_errors_over_objects_and_over_bare_floor_are_separate():
+    """Errors of 1 cm over the floor, 3 cm over objects and 20 cm in a tenth of the cells of objects."""
+    elevation, truth, _ = map_with_holes(0.0)
+    objects = np.zeros((N, N), np.uint16)
+    objects[:20] = 1
+    error = np.where(objects > 0, 0.03, -0.01).astype(np.float32)
+    error[:2] = -0.2
+    elevation = dataclasses.replace(elevation, height_m=error)
+    metrics = map_metrics(elevation, dataclasses.replace(truth, objects=objects))
+    expected = {
+        "median_m": 0.01, "gross_share": 0.02, "floor_median_m": 0.01, "floor_le90_m": 0.01, "floor_gross_share": 0.0,
+        "objects_median_m": 0.03, "objects_gross_share": 0.1,
+    }  # fmt: skip
+    assert {key: metrics[key] for key in expected} == pytest.approx(expected)
+    bare = map_metrics(elevation, truth)
+    assert bare["floor_le90_m"] == bare["le90_m"] and bare["objects_le90_m"] is None

@@ -21,7 +21,7 @@ SMALL = ["rig.image_width_px=128", "rig.image_height_px=96", "terrain.grid_m=0.1
 
 
 def mission(*overrides):
-    return prepare(load_scenario("quickstart", [*SMALL, *overrides]))
+    return prepare(load_scenario("reef", [*SMALL, *overrides]))
 
 
 @pytest.fixture(scope="module")
@@ -141,12 +141,12 @@ def test_the_sheet_is_a_picture(tmp_path, settings):
 def test_the_command_prints_image_quality_and_writes_the_sheet(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     words = [word for setting in SMALL for word in ("--set", setting)]
-    monkeypatch.setattr(sys, "argv", ["twin", "look", "quickstart", *words, "--at", "-0.5,0.2,2", "--json"])
+    monkeypatch.setattr(sys, "argv", ["twin", "look", "reef", *words, "--at", "-0.5,0.2,2", "--json"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     printed = json.loads(capsys.readouterr().out)
     assert end.value.code == 0 and printed["at_m"] == [-0.5, 0.2, 2.0] and (tmp_path / printed["sheet"]).is_file()
-    monkeypatch.setattr(sys, "argv", ["twin", "look", "quickstart", *words, "--at", "0,0,0"])
+    monkeypatch.setattr(sys, "argv", ["twin", "look", "reef", *words, "--at", "0,0,0"])
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert end.value.code == 2 and "is not above the sea floor" in capsys.readouterr().err

@@ -15,10 +15,11 @@ from twin.errors import TwinError
 from twin.estimate.mapping import exposure_balance
 from twin.estimate.mapping import orthomosaic as estimate
 from twin.estimate.mapping.orthomosaic import Views, heights_of, ortho_grid
+from twin.estimate.mapping.orthophoto import footprint
 from twin.exchange.geotiff import OrthomosaicFile
 from twin.imaging.illumination import illumination_of
 from twin.imaging.optics import Optics
-from twin.imaging.restoration import Restoration, linear_signal
+from twin.imaging.restoration import Restoration, estimated_floor, linear_signal
 from twin.judge.colour_difference import ciede2000, lab_of
 from twin.judge.orthomosaic import OrthomosaicJudge
 from twin.report.run_folder import read_mosaic
@@ -177,7 +178,7 @@ def test_saturated_pixels_are_taken_from_another_image():
     first, second = np.full((120, 160, 3), 100, np.uint8), np.full((120, 160, 3), 100, np.uint8)
     first[40:80, 60:100, 2] = 255
     tile = made(views([first, second], [pose(0, 0), pose(0.1, 0)], [(1, 1, 1)] * 2), flat())
-    assert tile.rgba[tile.known].max() <= 101 or tile.rgba[tile.known][:, :3].max() <= 101
+    assert tile.rgba[tile.known][:, :3].max() <= 101
     alone = made(views([first], [pose(0, 0)], [(1, 1, 1)]), flat())
     assert alone.rgba[..., 2].max() == 255 and alone.known.sum() > 5000  # nothing else shows them
 
@@ -193,6 +194,38 @@ def test_alpha_is_zero_where_no_image_or_no_height_is_known():
     assert not tile.rgba[~tile.known].any()
     one = made(views([image_of(POSES[1])], POSES[1:2]), elevation)
     assert one.known.any() and not one.known[0].any()  # outside the image
+
+
+@pytest.mark.parametrize("camera_m", [0.9, 0.3])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.6, 0.0, 0.4), (-0.3, 0.5, -1.0)])
+def test_all_floor_in_an_image_is_within_its_footprint(camera_m, tilt):
+    """Points of the floor between -0.5 and 0.4 m: the footprint holds all that the image shows, and no margin."""
+    camera, rng = pose(0.2, -0.1, camera_m, tilt), np.random.default_rng(5)
+    points = rng.uniform([-4, -4, -0.5], [4, 4, min(0.4, camera_m)], (400_000, 3))
+    # more points near the camera, where the image shows little floor
+    points = np.concatenate([points, camera[:3, 3] + (points - camera[:3, 3]) * rng.uniform(0, 0.3, (len(points), 1))])
+    points = points[(points[:, 2] > -0.5) & (points[:, 2] < 0.4)]
+    in_camera = geometry.transform(geometry.inverse(camera), points)
+    in_camera, points = in_camera[in_camera[:, 2] > 0], points[in_camera[:, 2] > 0]
+    u, v = RIG.project(in_camera).T
+    shown = points[(np.abs(u - 79.5) < 80) & (np.abs(v - 59.5) < 60)]
+    west, south, east, north = footprint(camera, RIG, (-0.5, 0.4))
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    assert len(shown) > 300 and (low[:2] >= [west, south]).all() and (high[:2] <= [east, north]).all()
+    # the points are 0.2 m apart at most at the corners of the frustum
+    assert (np.abs([west - low[0], south - low[1], east - high[0], north - high[1]]) < 0.3).all()
+
+
+def test_a_low_place_elsewhere_takes_no_colour_from_a_tilted_image():
+    """The image shows floor up to 0.2 m from the point below the camera; the lowest floor that it shows is farther."""
+    camera, lower = pose(-0.55, 0.0, 1.0, (0.0, 0.75, 0.0)), flat()
+    lower.height_m[0, -1] = -3.0
+    image = image_of(camera)
+    whole, found = (made(views([image], [camera]), elevation) for elevation in (flat(), lower))
+    assert whole.known.sum() > 3000
+    same = np.ones_like(whole.known)
+    same[:14, -14:] = False  # the low place and its border
+    np.testing.assert_array_equal(found.known[same], whole.known[same])
 
 
 def test_tiles_join_without_a_trace(monkeypatch):
@@ -365,6 +398,25 @@ def test_unrelated_pictures_are_not_matched_and_an_empty_one_has_no_errors():
     metrics = judged(tile, np.ascontiguousarray(true[::-1]))
     assert metrics["matched"] < 0.05
     assert set(OrthomosaicJudge(True).metrics().values()) == {None}
+
+
+def test_the_true_albedo_of_a_grid_with_more_columns_than_opencv_can_resample():
+    texture = np.zeros((4, 5000, 3), np.uint8)
+    texture[:, ::2] = 200
+    floor = terrains.Terrain(np.zeros((2, 2501), np.float32), 0.02, -25.0, -0.01, texture, 0.01)
+    albedo = true_albedo(floor, MapGrid(-25.0, 0.01, 0.00125, 2, 40_000))
+    assert albedo.shape == (2, 40_000, 3) and np.isfinite(albedo).all()
+    stripes = albedo[1, :, 0].reshape(5000, 8)[1:-1]  # bilinear within each texel: symmetric about its centre
+    np.testing.assert_allclose(stripes, stripes[:, ::-1], atol=1)
+    np.testing.assert_allclose(stripes.mean(axis=1), np.resize([50, 150], 4998), atol=1)
+
+
+def test_a_hole_of_the_map_gets_the_height_of_the_nearest_cell():
+    height = np.full((30, 400), np.nan, np.float32)
+    height[:, :100], height[:, 300:] = 1.0, 2.0  # the hole is 200 cells wide
+    grid = MapGrid(0.0, 3.0, 0.1, 30, 400)
+    floor = estimated_floor(ElevationMap(grid, height, np.zeros_like(height), np.zeros((30, 400, 3), np.uint8)))
+    assert (floor.height_m[:, :200] == 1.0).all() and (floor.height_m[:, 200:] == 2.0).all()
 
 
 def test_the_true_albedo_is_the_mean_of_the_texture_in_each_pixel():

@@ -12,9 +12,10 @@ from rerun.chunk import RrdReader
 from twin.core import geometry
 from twin.core.records import Estimate, Frame, MapGrid, Readings
 from twin.errors import TwinError
+from twin.exchange import geotiff
 from twin.report import recording, recording_surfaces
 from twin.report.images import jpeg_bytes
-from twin.report.run_folder import Raster, load_run
+from twin.report.run_folder import Raster, load_run, read_mosaic
 
 PATHS = {f"/world/path/{name}" for name in ("truth", "reference", "f2f", "online", "final")}
 ERRORS = {f"/error/{what}/{name}" for what in ("position", "height", "heading") for name in ("f2f", "online", "final")}
@@ -80,6 +81,30 @@ def test_every_triangle_of_the_map_appears_once_and_none_covers_a_hole(folder):
     whole = surface.points[surface.triangles[(group[surface.triangles] < 2).all(axis=1)]].reshape(-1, 9)
     assert len(shown) == len(whole) > 10_000
     np.testing.assert_array_equal(shown[np.lexsort(shown.T)], whole[np.lexsort(whole.T)])
+
+
+@pytest.mark.parametrize("most_px", [10**6, 5000, 900])
+def test_a_reduced_orthomosaic_colours_the_map_where_the_whole_one_does(tmp_path, monkeypatch, most_px):
+    """A ramp of colours over 20 x 30 cells of 7 x 7 pixels, read at full size, reduced to a third and to a ninth."""
+    cells, pixels = MapGrid(-0.6, 0.5, 0.07, 20, 30), MapGrid(-0.6, 0.5, 0.01, 140, 210)
+    x, y = np.meshgrid(*pixels.centres())
+    ramp = np.stack([200 * (x + 0.6) / 2.1, 200 * (0.5 - y) / 1.4, 0 * x + 50], axis=-1)
+    geotiff.write_mosaic(tmp_path / "mosaic.tif", np.round(ramp).astype(np.uint8), pixels)
+    monkeypatch.setattr("twin.report.run_folder.MAX_MOSAIC_PX", most_px)
+    mosaic = read_mosaic(tmp_path / "mosaic.tif")
+    surface = recording_surfaces.map_surface(Raster(cells, np.zeros((20, 30))), mosaic)
+    at = np.stack([200 * (surface.points[:, 0] + 0.6) / 2.1, 200 * (0.5 - surface.points[:, 1]) / 1.4], axis=-1)
+    # a pixel of the reduced orthomosaic is at most 0.1 m wide: 10 and 14 levels; up to one is missing at the edge
+    error = np.abs(surface.colours[:, :2].astype(float) - at)
+    assert (error.max(axis=0) < 1 + 1.5 * 200 * mosaic.grid.cell_m / np.array([2.1, 1.4])).all()
+    assert (surface.colours[:, 2] == 50).all()
+
+
+def test_an_orthomosaic_of_another_area_does_not_colour_the_map():
+    dem = Raster(MapGrid(0, 0, 0.1, 20, 30), np.zeros((20, 30)))
+    for grid in (MapGrid(0.05, 0, 0.01, 200, 300), MapGrid(0, 0, 0.01, 200, 400)):
+        other = Raster(grid, np.full((grid.rows, grid.cols, 3), 7, np.uint8))
+        assert not (recording_surfaces.map_surface(dem, other).colours == 7).all()
 
 
 def test_triangles_face_upwards():

@@ -151,6 +151,12 @@ def test_metrics_of_older_runs_keep_their_warning():
     assert wording.headline(older, {}) and wording.key_figures(older)
 
 
+def test_a_replay_lists_only_figures_that_it_has():
+    metrics = changed(map=dict.fromkeys(GOOD["map"])) | {"replay": {"dataset": "euroc"}}
+    labels = [figure.label for figure in wording.key_figures(metrics)]
+    assert "Position error, final" in labels and not [label for label in labels if label.startswith("Map")]
+
+
 def test_every_map_statistic_is_reported_with_completeness():
     metrics = changed(map={"completeness": 0.876, "completeness_area": 0.765})
     for figure in wording.key_figures(metrics):
@@ -198,7 +204,7 @@ def test_metrics_that_were_not_evaluated_have_the_same_keys_and_meet_no_requirem
     json.dumps(empty, allow_nan=False)
 
 
-IDEAL = load_scenario("quickstart")
+IDEAL = load_scenario("reef")
 REAL = [
     "calibration_error.baseline_error=0.01", 'port.kind="flat"', "sensor.motion_blur=true", "snow.density_per_m3=10",
     "imaging.shadows=true", "current.velocity_mps=[0.1, 0.0, 0.0]",
@@ -214,12 +220,12 @@ def test_a_default_scenario_names_what_it_idealises():
 
 
 def test_a_scenario_with_every_effect_idealises_nothing():
-    assert idealisations(load_scenario("quickstart", REAL)) == []
+    assert idealisations(load_scenario("reef", REAL)) == []
 
 
 @pytest.mark.parametrize("override", REAL)
 def test_each_effect_removes_its_own_phrase(override):
-    without = idealisations(load_scenario("quickstart", [other for other in REAL if other != override]))
+    without = idealisations(load_scenario("reef", [other for other in REAL if other != override]))
     assert len(without) == 1 and without[0].count("no ") == 1
 
 
@@ -233,14 +239,21 @@ def test_each_effect_removes_its_own_phrase(override):
             "No images were rendered: visual measurements are sampled",
         ),
         ("sun.illuminance_lx=1000", "The light is ideal: no caustics."),
+        ("map.restore=true", "The restored colours are ideal: no error of water, lamps, vignetting and exposure."),
     ],
 )
 def test_further_idealisations_are_named(override, sentence):
-    (found,) = idealisations(load_scenario("quickstart", [*REAL, override]))
+    (found,) = idealisations(load_scenario("reef", [*REAL, override]))
     assert found.startswith(sentence)
+
+
+@pytest.mark.parametrize("override", ['imaging.fidelity="surrogate"', "map.orthomosaic=false"])
+def test_without_an_orthomosaic_of_images_no_colours_are_restored(override):
+    found = idealisations(load_scenario("quickstart", [*REAL, "map.restore=true", override]))
+    assert not any("restored" in sentence for sentence in found)
 
 
 def test_a_kinematic_vehicle_is_ideal():
     calm = [override for override in REAL if not override.startswith("current")]
-    found = idealisations(load_scenario("quickstart", [*calm, 'vehicle.dynamics="kinematic"']))
+    found = idealisations(load_scenario("reef", [*calm, 'vehicle.dynamics="kinematic"']))
     assert found == ["The water is ideal: no current.", "The vehicle is ideal: no forces, no inertia."]

@@ -27,7 +27,7 @@ FEW = Selection(("IB",), (1.0,), ("leds",), PIXELS[:1])
 @pytest.mark.parametrize("lamps", LAMP_ARRANGEMENTS)
 def test_in_water_that_only_absorbs_model_and_reference_agree(lamps):
     """The model's beam table and its normals are coarse: 0.5 %."""
-    scenario = load_scenario("quickstart", ["water.jerlov=II", "water.turbidity=0", *LAMP_ARRANGEMENTS[lamps]])
+    scenario = load_scenario("reef", ["water.jerlov=II", "water.turbidity=0", *LAMP_ARRANGEMENTS[lamps]])
     for pixel in ((160, 120), (250, 30)):
         model = model_light(scenario, 1.5, pixel)
         truth = reference_light(scenario, 1.5, pixel, Effort(64, 2))
@@ -37,7 +37,7 @@ def test_in_water_that_only_absorbs_model_and_reference_agree(lamps):
 
 def test_the_light_scattered_once_is_that_of_single_scattering():
     cell = next(iter(cells(FEW, 640)))
-    single = load_scenario("quickstart", ["water.jerlov=IB", "imaging.scattering=single"])
+    single = load_scenario("reef", ["water.jerlov=IB", "imaging.scattering=single"])
     model = model_light(single, 1.0, cell.pixel)
     assert cell.veil_once.value == pytest.approx(model.veil, rel=0.02)
     assert cell.direct.value == pytest.approx(model.direct, rel=5e-3)

@@ -1,15 +1,19 @@
 """Tables of the paper's mission and budget: every row of the paper, and values against closed forms."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from judge_synthetic import survey
 
+from twin.core.interrupts import StageGuard
 from twin.core.records import Trajectory
 from twin.core.timing import Stopwatch
-from twin.reproduce import paper_sheet
+from twin.errors import SurveyAborted, TwinError
+from twin.reproduce import paper_flight, paper_sheet
 from twin.reproduce.budget import FRAME_MS, KEYFRAME_MS, MODULES, N_FRAMES, budget_table, keyframe_load_ms
+from twin.reproduce.conclusion import finished
 from twin.reproduce.paper import CLAIMS, SHOWN_TRACKS, Flights, exhibit_of_flights, holes, scenarios
 from twin.reproduce.paper_flight import F2fNavigator, Flown
 
@@ -85,9 +89,65 @@ def test_holes_are_the_share_of_the_asked_area_without_a_height(flights):
 
 def test_worse_than_the_paper_is_said_so(flights):
     bad = with_path(flights.coarse, np.full(len(flights.coarse.truth.track), 0.4))
-    rows = exhibit_of_flights(Flights(bad, flights.unaligned, flights.fine), quick=True).table("claims").rows
+    rows = exhibit_of_flights(Flights(bad, flights.unaligned, flights.fine), quick=False).table("claims").rows
     assert rows[1][-1] == "no / yes"
     assert rows[2][2:] == ("-", "-", "- / -")  # two tracks: none after the fifth
+
+
+def test_a_quick_plan_claims_nothing_about_the_paper(flights):
+    whole, quick = (exhibit_of_flights(flights, quick).table("claims").rows for quick in (False, True))
+    assert whole[0][-1] == "better than the paper" and quick == tuple(row[:-1] for row in whole)
+
+
+class NoKeyframes:
+    """A navigator whose alignment fails and that has no map."""
+
+    def __init__(self, *_, elevation=None):
+        self.finished, self.elevation = 0, elevation
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def finish(self):
+        self.finished += 1
+        if self.finished == 1:
+            raise SurveyAborted("global alignment failed: singular matrix")
+        return "result"
+
+    def abandon_alignment(self):
+        pass
+
+    def build_map(self, result, grid):
+        return self.elevation
+
+
+def fly_without_world(monkeypatch, navigator):
+    world = SimpleNamespace(truth=lambda: "truth")
+    monkeypatch.setattr(paper_flight, "open_world", lambda *_: nullcontext(world))
+    monkeypatch.setattr(paper_flight, "fly", lambda *_: None)
+    return paper_flight._fly(SimpleNamespace(grid=None), lambda *_: navigator)
+
+
+def test_a_failed_alignment_leaves_a_map_and_its_reason(monkeypatch):
+    found = fly_without_world(monkeypatch, NoKeyframes(elevation="map"))
+    assert found.elevation == "map" and found.ended == "global alignment failed: singular matrix"
+
+
+def test_a_flight_without_a_keyframe_is_one_line(monkeypatch):
+    with pytest.raises(TwinError, match=r"no stereo pair became a keyframe \(global alignment failed: singular matrix"):
+        fly_without_world(monkeypatch, NoKeyframes())
+
+
+def test_an_interrupted_alignment_ends_the_experiment():
+    def interrupt():
+        raise KeyboardInterrupt
+
+    navigator = SimpleNamespace(finish=interrupt, abandon_alignment=lambda: setattr(navigator, "finish", lambda: None))
+    with pytest.raises(KeyboardInterrupt):
+        finished(navigator, StageGuard())
 
 
 def test_the_figures_are_drawn(flights, tmp_path):

@@ -1,9 +1,14 @@
 """Tank experiments: sizes in a map, closure of loops, path of the rig, bad cells among the uncertain ones."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from twin.core import geometry
 from twin.core.records import SurveyResult, Trajectory
+from twin.reproduce import tank_survey
 from twin.reproduce.tank import TABLES, flagged_share, sizes_table
 from twin.reproduce.tank_path import N_LOOP, STEP_M, lawnmower_path, two_loops_path
 from twin.reproduce.tank_scene import OBJECTS, tank_floor
@@ -81,6 +86,48 @@ def test_the_second_path_has_61_pairs_and_returns_to_its_first_pose_at_frames_31
     for k in path.repeats:
         np.testing.assert_array_equal(path.world_from_camera[k], path.world_from_camera[0])
     assert len(lawnmower_path(130, 1).planned_m) == 130
+
+
+class StartedError(Exception):
+    """Raised instead of starting the estimators."""
+
+
+@pytest.mark.parametrize("name", ["tank1", "tank2"])
+def test_the_estimators_start_at_the_planned_pose_and_not_at_the_true_one(name, tmp_path, monkeypatch):
+    starts = []
+
+    def navigator(rig, settings, start, **_):
+        starts.append(start)
+        raise StartedError
+
+    monkeypatch.setattr(tank_survey, "Navigator", navigator)
+    monkeypatch.setattr(tank_survey, "tank_floor", lambda _: None)
+    monkeypatch.setattr(tank_survey, "image_vision", lambda *_: None)
+    monkeypatch.setattr(tank_survey, "RenderedWorld", lambda *_: nullcontext())
+    with pytest.raises(StartedError):
+        tank_survey.survey_tank(name, tmp_path, tank_survey.QUICK)
+    path = two_loops_path(tank_survey.SEED) if name == "tank2" else lawnmower_path(130, tank_survey.SEED)
+    np.testing.assert_allclose(starts[0], geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, path.planned_m[0]), atol=1e-12)
+    assert np.abs(starts[0] - path.world_from_camera[0]).max() > 5e-4
+
+
+def test_heights_are_compared_as_if_the_first_pose_were_true():
+    """A map of a level floor in axes that are off by a rigid motion: it is tilted, but has no error."""
+    motion, first = geometry.exp(np.array([0.003, -0.002, 0.001, 0.002, 0.001, 0.004])), np.eye(4)
+    first[2, 3] = 1.5
+    x, y = np.meshgrid(*GRID.centres())
+    a, b, c, d = motion[2]
+    height = (-(a * x + b * y + d) / c).astype(np.float32)  # where the moved point has z = 0
+    assert np.abs(height).max() > 0.005
+    survey = SimpleNamespace(
+        result=SimpleNamespace(final=SimpleNamespace(world_from_camera=geometry.inverse(motion)[None] @ first)),
+        truth=SimpleNamespace(trajectory=SimpleNamespace(world_from_camera=first[None]), seen=np.isfinite(height)),
+        elevation=SimpleNamespace(height_m=height),
+        mission=SimpleNamespace(grid=GRID, terrain=SimpleNamespace(height_at=lambda x, _: 0 * x)),
+    )
+    np.testing.assert_allclose(tank_survey.height_errors(survey), 0, atol=1e-8)
+    survey.truth.seen[3, 4] = False
+    assert np.isnan(tank_survey.height_errors(survey)[3, 4])
 
 
 def test_the_floor_has_the_objects_at_their_heights_with_a_saturated_pipe_and_a_shade():

@@ -16,7 +16,7 @@ RANGES_M = np.array([0.5, 1.0, 2.0, 4.0])
 
 
 def contrast_at(turbidity, *settings):
-    scenario = load_scenario("quickstart", [*SETTINGS, f"water.turbidity={turbidity}", *settings])
+    scenario = load_scenario("reef", [*SETTINGS, f"water.turbidity={turbidity}", *settings])
     return relative_contrast(scenario, illumination_of(scenario), RANGES_M)
 
 
@@ -30,7 +30,7 @@ def test_without_backscatter_relative_contrast_is_the_fraction_of_unscattered_li
     """With a mean cosine near one all scattering is forward: C / C0 = exp(-b r)."""
     forward = "water.phase_function=henyey_greenstein", "water.mean_cosine=0.99"
     contrast = contrast_at(1.0, *forward)[:3]  # beyond, red is so dark that the little backscatter matters
-    scattering = illumination_of(load_scenario("quickstart", SETTINGS)).water.scattering_per_m
+    scattering = illumination_of(load_scenario("reef", SETTINGS)).water.scattering_per_m
     # some light is scattered by more than 15 deg, and some is backscatter: both within 3 %
     np.testing.assert_allclose(contrast, np.exp(-scattering * RANGES_M[:3, None]), rtol=0.03)
 

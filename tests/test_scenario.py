@@ -20,8 +20,8 @@ PLAN_KEYS = (
     "overlap_across, overlap_reference, height, tracks, clearance_m"
 )
 TOP_KEYS = (
-    "name, seed, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, snow, "
-    "current, navigation, plan, control, estimate, map, beacons, objects, require"
+    "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "
+    "snow, current, navigation, plan, control, estimate, map, beacons, objects, require"
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
@@ -291,6 +291,11 @@ def test_paths_are_relative_to_the_file_that_contains_them(tmp_path, monkeypatch
         tmp_path, 'extends = "sub/base.toml"\n[terrain]\ntexture_file = "${TWIN_DATA}/gravel.png"', "top.toml"
     )
     monkeypatch.setenv("TWIN_DATA", str(tmp_path / "data"))
+    mesh = 'shape="mesh", mesh_file="${TWIN_DATA}/wreck.ply", position_m=[0, 0]'
+    for override in (f"objects=[{{{mesh}}}]", 'terrain={texture_file="${TWIN_DATA}/wreck.ply"}'):
+        scenario = load_scenario("reef", [override])
+        found = scenario.objects[0].mesh_file if scenario.objects else scenario.terrain.texture_file
+        assert found == str(tmp_path / "data" / "wreck.ply")
     terrain = load_scenario(top).terrain
     assert Path(terrain.height_file) == tmp_path / "sub" / "dem.tif"
     assert Path(terrain.texture_file) == tmp_path / "data" / "gravel.png"

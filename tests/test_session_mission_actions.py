@@ -28,7 +28,7 @@ RATE_HZ = 30.0
 @functools.cache
 def mission():
     short = ["plan.tracks=1", "plan.area_m=[2.0,1.0]", "control.hold_s=0.4", "imaging.fidelity=surrogate"]
-    return prepare(load_scenario("quickstart", short))
+    return prepare(load_scenario("reef", short))
 
 
 def estimate(status, position=(0.0, 0.0, 2.0)):

@@ -21,7 +21,7 @@ from twin.world.mission import prepare
 
 @functools.cache
 def mission(*overrides):
-    return prepare(load_scenario("quickstart", ["imaging.fidelity=surrogate", "plan.tracks=1", *overrides]))
+    return prepare(load_scenario("reef", ["imaging.fidelity=surrogate", "plan.tracks=1", *overrides]))
 
 
 def result_at(positions):

@@ -14,7 +14,7 @@ from twin.study.summary import summary
 from twin.study.surveys import surveys
 
 GATE = """
-scenario = "quickstart"
+scenario = "reef"
 compare = ["map.le90_m", "map.le90_area_m"]
 
 [vary]

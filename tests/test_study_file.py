@@ -42,7 +42,7 @@ TURBIDITY = "water.turbidity = { log_uniform = [1.0, 40.0] }"
         ("probability = 0.8", "", "3: seek: needs a required pass probability (allowed: require.probability)"),
         ('seek = "water.turbidity"', 'seek = "water.jerlov"', "3: seek: 'water.jerlov' is not a varied numeric key"),
         ('show = ["map.le90_m"]', 'show = ["map.beauty"]', "4: show: map.beauty: no such metric"),
-        ('"quickstart"', '"nowhere"', "2: scenario: nowhere: no such scenario"),
+        ('"reef"', '"nowhere"', "2: scenario: nowhere: no such scenario"),
     ],
 )
 def test_an_error_is_reported_with_its_line(tmp_path, old, new, message):
@@ -98,7 +98,7 @@ def test_an_unknown_study_name_is_reported_with_the_known_names():
 
 def test_surveys_have_the_values_that_the_study_sets_varies_and_requires(tmp_path):
     study = study_of(tmp_path, STUDY, ("[vary]", "[set]\nplan.tracks = 2\n[vary]"), ("samples = 12", "samples = 3"))
-    base = load_scenario("quickstart")
+    base = load_scenario("reef")
     for survey in surveys(study, tmp_path):
         varied = survey.values["water.turbidity"], survey.values["plan.altitude_m"]
         assert (survey.scenario.water.turbidity, survey.scenario.plan.altitude_m) == varied
@@ -111,7 +111,7 @@ def test_surveys_have_the_values_that_the_study_sets_varies_and_requires(tmp_pat
 def test_file_names_are_relative_to_the_study_file(tmp_path):
     (tmp_path / "mine.toml").write_text('name = "mine"\n')
     study = study_of(
-        tmp_path, STUDY, ('"quickstart"', '"mine.toml"'), ("[vary]", '[set]\nterrain.height_file = "a.tif"\n[vary]')
+        tmp_path, STUDY, ('"reef"', '"mine.toml"'), ("[vary]", '[set]\nterrain.height_file = "a.tif"\n[vary]')
     )
     survey = next(surveys(study, tmp_path))
     assert survey.scenario.name == "mine"

@@ -13,7 +13,7 @@ from twin.study.results_log import ResultsLog
 from twin.study.surveys import surveys
 
 STUDY = """
-scenario = "quickstart"
+scenario = "reef"
 
 [set]
 imaging.fidelity = "surrogate"

@@ -15,7 +15,7 @@ from twin.study.statistics import wilson_interval
 from twin.study.tuning import tune
 
 TUNING = """
-scenario = "quickstart"
+scenario = "reef"
 
 [vary]
 water.turbidity = { uniform = [4.0, 6.0] }
@@ -92,7 +92,7 @@ def test_the_recommended_scenario_reads_back_with_the_chosen_values(searched):
     assert scenario.model_dump() == result.scenario.model_dump()  # rendered
     assert scenario.plan.altitude_m == result.recommended.values["plan.altitude_m"]
     assert scenario.estimate.node_stride == result.recommended.values["estimate.node_stride"]
-    assert scenario.water == load_scenario("quickstart").water
+    assert scenario.water == load_scenario("reef").water
     page = (folder / "tuning.html").read_text()
     assert page.index("Recommended plan: plan.altitude_m = ") < page.index("<img")
     assert (folder / "pareto.png").stat().st_size > 5000

@@ -18,7 +18,7 @@ from twin.study.progress import StudyProgress
 from twin.study.tuning import tune
 
 TUNING = """
-scenario = "quickstart"
+scenario = "reef"
 
 [set]
 imaging.fidelity = "surrogate"
@@ -45,7 +45,7 @@ probability = 0.9
 "map.le90_m" = 0.01
 """
 TINY = """
-scenario = "quickstart"
+scenario = "reef"
 keep = "none"
 
 [set]

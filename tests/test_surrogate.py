@@ -24,10 +24,10 @@ from twin.session.assembly import navigator_with, open_world
 from twin.surrogate import error_model_file
 from twin.surrogate.error_model import BorderLaw, DepthLaw, ErrorModel, FractionLaw, ScatterLaw, SigmaLaw
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import EDGE_PX, CellErrors, MapModel, roughness_error_px, window_noise
+from twin.surrogate.map_model import EDGE_PX, CellErrors, MapModel, gross_noise, roughness_error_px, window_noise
 from twin.surrogate.matchability import Matchability, bounds_px, lamp_share, unevenness_px
 from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
-from twin.surrogate.vision import corner_count, overlap_inflation
+from twin.surrogate.vision import corner_count, match_sigma_px, overlap_inflation
 from twin.surrogate_fit import fit, rendered_surveys
 from twin.surrogate_fit.comparison import UNIT_PX, ComparisonVision, single_error_models
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
@@ -39,7 +39,7 @@ SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]
 
 @functools.cache
 def mission(*sets):
-    return prepare(load_scenario("quickstart", [*SHORT, *sets]))
+    return prepare(load_scenario("reef", [*SHORT, *sets]))
 
 
 def tilted(x, y, z):
@@ -192,15 +192,87 @@ def test_link_errors_are_consistent_with_their_covariance(reef, bias_fraction):
         match_bias_fraction=bias_fraction,
         match_sigma_px=SigmaLaw(0.05, 0.0),
     )
-    poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
+    poses = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)]
+    assert nees_of_links(reef, model, poses) == pytest.approx(1.0, abs=0.12)
+
+
+def nees_of_links(reef, model, poses):
+    """Returns the NEES per degree of freedom of the link between two poses, the mean over 150 seeds."""
+    at, true, nees = [0], geometry.inverse(poses[0]) @ poses[1], []
     vision = surrogate_vision(reef, model, lambda: poses[at[0]], Stopwatch())
-    true, nees = geometry.inverse(poses[0]) @ poses[1], []
     for seed in range(150):
         observe_keyframes(reseeded(vision, seed), poses, at)
         link = link_of(vision, 0, 1)
         error = geometry.log(geometry.inverse(true) @ link.a_from_b)
         nees.append(error @ np.linalg.solve(link.cov, error) / 6)
-    assert np.mean(nees) == pytest.approx(1.0, abs=0.12)
+    return np.mean(nees)
+
+
+def test_the_errors_of_links_grow_with_distance_as_their_covariance(reef):
+    """The growth multiplies the variance of one of two stereo pairs by 10 here; without it the NEES would be 0.2."""
+    model = ErrorModel(
+        match_error_ratio=1.0, match_covariance_inflation=1.0, match_bias_fraction=0.0, distance_growth=30.0,
+        match_sigma_px=SigmaLaw(0.05, 0.0),
+    )  # fmt: skip
+    assert nees_of_links(reef, model, [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_lamps_scale_errors_and_covariances_of_links_and_daylight_does_not(reef):
+    """Growths of 2 multiply the variances by 1 + 2^2 under lamps alone. The random numbers are the same."""
+    plain = ErrorModel(match_sigma_px=SigmaLaw(0.05, 0.0), common_bias_px=0.0)
+    grown = plain._replace(lamp_error_growth=2.0, lamp_sigma_growth=2.0)
+    poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
+    for flown, factor in ((reef, 5.0), (mission("lamps=[]", "sun.illuminance_lx=2000"), 1.0)):
+        vision, covs, errors = surrogate_vision(flown, plain, lambda: poses[at[0]], Stopwatch()), [], []
+        observe_keyframes(vision, poses, at)
+        for vision.model in (plain, grown):
+            covs.append(link_of(vision, 0, 1).cov)
+            errors.append(error_of_link(vision, 0, 1))
+        # the least squares are linearised at the measured points, hence the tolerances
+        assert np.trace(covs[1]) == pytest.approx(factor * np.trace(covs[0]), rel=0.1)
+        np.testing.assert_allclose(errors[1], np.sqrt(factor) * errors[0], atol=0.1 * np.abs(errors[1]).max())
+
+
+def test_relief_makes_the_matches_of_a_stereo_pair_less_precise():
+    """A floor with an unevenness of u px per unit of baseline / depth has the parallax u baseline / depth in a pair."""
+    rough, at = mission('terrain.kind="fractal"', "terrain.relief_m=1.0"), tilted(0, 0, 2.5)
+    sigmas = []
+    for gain in (0.0, 3.0):
+        model = ErrorModel(match_sigma_px=SigmaLaw(0.02, 0.0), stereo_relief_gain=gain)
+        vision = surrogate_vision(rough, model, lambda: at, Stopwatch())
+        cov = vision.observe_stereo(None, 0).cov
+        sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * vision.raster_fraction))
+    baseline_in_depths = np.mean(vision._latest.points[:, 2])
+    parallax_px = vision._latest.unevenness_px * baseline_in_depths
+    assert parallax_px > 0.01
+    assert sigmas[1] / sigmas[0] == pytest.approx(np.hypot(0.02, 3.0 * parallax_px) / 0.02, rel=1e-6)
+
+
+def test_the_fit_recovers_the_match_sigma_over_relief_and_the_growth_under_lamps():
+    rng = np.random.default_rng(0)
+    bounds, parallax, lamps = rng.uniform(0.005, 0.1, 40), rng.uniform(0, 0.1, 40), rng.uniform(0, 1, 40)
+    true = ErrorModel(match_sigma_px=SigmaLaw(0.015, 1.3), stereo_relief_gain=0.4)
+    sigmas = np.array([match_sigma_px(true, b, p) for b, p in zip(bounds, parallax, strict=True)])
+    law, gain = fit._fit_match_sigma(bounds, parallax, sigmas * np.exp(0.05 * rng.standard_normal(40)))
+    assert (*law, gain) == pytest.approx((0.015, 1.3, 0.4), rel=0.15)
+    ratios = 0.9 * np.hypot(1, 1.2 * lamps) * np.exp(0.05 * rng.standard_normal(40))
+    ratios[::13] *= 5  # surveys near the loss of vision
+    assert fit._fit_lamp_growth(ratios, lamps) == pytest.approx((0.9, 1.2), rel=0.15)
+
+
+def test_the_error_due_to_relief_is_quadratic_for_small_roughness_and_limited_for_large():
+    """With q = gain r / limit, the error is limit q^2 for q << 1 and the limit for q >> 1; at q = 1 limit / sqrt(2)."""
+    gain, limit_px = 1.5, 0.03
+    for q, expected in ((0.1, 0.01 * limit_px), (1.0, limit_px / np.sqrt(2)), (10.0, limit_px)):
+        assert roughness_error_px(q * limit_px / gain, gain, limit_px, 0.0) == pytest.approx(expected, rel=1e-3)
+
+
+def test_gross_noise_has_unit_variance_and_is_zero_in_three_quarters_of_the_cells():
+    noise = gross_noise((2000, 2000), 3, np.random.default_rng(0))
+    assert np.mean(noise == 0) == pytest.approx(0.75, abs=0.01)
+    assert noise.mean() == pytest.approx(0.0, abs=0.02)
+    assert noise.std() == pytest.approx(1.0, abs=0.02)
+    assert np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1] > 0.4  # gross errors come in patches
 
 
 def observe_keyframes(vision, poses, at):
@@ -303,18 +375,18 @@ def test_the_fit_separates_keyframe_bias_from_relief(reef, error_ratio, bias_fra
             statistics[f"link_nees_{name}"] += [e @ np.linalg.solve(cov, e) for e in errors + far]
             statistics[f"consecutive_product_{name}"] += [e @ np.linalg.solve(cov, f) for e, f in pairwise(errors)]
         statistics["link_distance"] += [1.0] * len(errors) + [3.0] * len(far)
-    fitted_ratios, fitted_gain, fitted_bias = fit._fit_link_errors([statistics], compared_gain=10.0)
-    assert fitted_ratios[0] == pytest.approx(error_ratio, rel=0.05)
-    assert fitted_gain == pytest.approx(relief_gain, abs=2.5)
-    assert fitted_bias == pytest.approx(bias_fraction, abs=0.15)
+    found = fit._fit_link_errors([statistics], np.ones(1), np.zeros(1), ErrorModel(relief_gain=10.0))
+    assert found.match_error_ratio == pytest.approx(error_ratio, rel=0.05)
+    assert found.relief_gain == pytest.approx(relief_gain, abs=2.5)
+    assert found.match_bias_fraction == pytest.approx(bias_fraction, abs=0.15)
 
 
 @pytest.fixture
 def no_errors(vision):
     zeros = np.zeros(vision.scene.map_model.seen.shape, np.float32)
     return CellErrors(
-        zeros, zeros, zeros, zeros, 0.0, np.array([1.0, 3.0]), np.zeros(2), np.full(2, 0.01), np.zeros(2), np.ones(2)
-    )
+        *[zeros] * 5, 0.0, np.array([1.0, 3.0]), np.zeros(2), np.full(2, 0.01), np.zeros(2), np.ones(2)
+    )  # fmt: skip
 
 
 def patch_of(model, errors, pose, next_pose=None, estimated=None, seed=0):
@@ -509,7 +581,7 @@ def map_statistics(rng, scatter=0.02):
     """Returns statistics of surveys whose variances follow `TRUE_DEPTH`, with known lateral, relief and edge errors."""
     conditions = (0.02, 0, 0.5), (0.02, 1, 1.5), (0.04, 0, 3), (0.04, 1, 0.7), (0.1, 1, 2), (0.1, 0, 1)
     for bound_px, lamp, step in conditions:
-        survey = {"bound_px": [bound_px], "lamp_share": [lamp], "binning": [1, 1]}
+        survey = {"bound_px": [bound_px], "lamp_share": [lamp], "binning": [1, 1], "metres_per_px": [8e-3**0.5]}
         classes = ("smooth1", 1, 0.0), ("smooth4", 5, 0.0), ("smooth15", 20, 0.0), ("rough9", 11, 0.05)
         for name, views, rough_px in (*classes, ("rougher9", 11, 0.2), ("steep", 5, 0.0), ("edge", 4, 1.0)):
             pose, per_px2 = 1e-7, 8e-3
@@ -626,13 +698,13 @@ def test_the_statistics_of_surveys_come_in_their_order(jobs, monkeypatch):
 
 
 def test_a_survey_in_water_without_matches_is_not_flown(tmp_path):
-    scenario = load_scenario("quickstart", ['water.jerlov="9C"', "water.turbidity=4", "plan.tracks=1"])
+    scenario = load_scenario("reef", ['water.jerlov="9C"', "water.turbidity=4", "plan.tracks=1"])
     assert rendered_surveys.survey_statistics(scenario, tmp_path / "run", ErrorModel()) == {}
     assert not (tmp_path / "run").exists()
 
 
 def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
-    scenario = load_scenario("quickstart", SHORT)
+    scenario = load_scenario("reef", SHORT)
     results = [survey.run(scenario, tmp_path / name, outputs=()) for name in "ab"]
     metrics = results[0].metrics
     assert metrics["status"] == "complete"
@@ -644,7 +716,7 @@ def test_a_surrogate_survey_is_complete_and_reproducible(tmp_path):
 
 def test_water_without_matches_aborts_the_survey_with_a_reason(tmp_path):
     murky = ['water.jerlov="9C"', "water.turbidity=10", "imaging.extrapolate=true"]
-    scenario = load_scenario("quickstart", [*SHORT, *murky])
+    scenario = load_scenario("reef", [*SHORT, *murky])
     metrics = survey.run(scenario, tmp_path, outputs=()).metrics
     assert metrics["status"] == "aborted"
     assert "9C" in metrics["reason"] and "too few points" in metrics["reason"]
@@ -680,8 +752,10 @@ def test_a_few_gross_links_do_not_determine_the_bias_of_keyframes():
         }  # fmt: skip
 
     usual = [links(30, -0.1) for _ in range(20)]
-    _, _, without = fit._fit_link_errors(usual, 0.2)
-    _, _, bias = fit._fit_link_errors([*usual, links(3, -5.0)], 0.2)
+    without, bias = (
+        fit._fit_link_errors(surveys, np.ones(len(surveys)), np.zeros(len(surveys)), ErrorModel()).match_bias_fraction
+        for surveys in (usual, [*usual, links(3, -5.0)])
+    )
     assert without == pytest.approx(0.4, rel=0.01)  # BIAS_FRACTION / 2
     assert bias == pytest.approx(without, rel=0.3)
 
@@ -851,7 +925,7 @@ import sys
 from pathlib import Path
 from twin import survey
 from twin.scenario.file import load_scenario
-result = survey.run(load_scenario("quickstart", {SHORT!r}), Path({str(tmp_path / "run")!r}), outputs=None)
+result = survey.run(load_scenario("reef", {SHORT!r}), Path({str(tmp_path / "run")!r}), outputs=None)
 assert result.status == "complete"
 print(*(name for name in ("mujoco", "OpenGL", "matplotlib", "rerun", "rasterio", "trimesh") if name in sys.modules))
 """

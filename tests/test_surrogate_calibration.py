@@ -38,7 +38,7 @@ ERRORS = {
 
 
 def scenario(*sets):
-    return load_scenario("quickstart", [*SHORT, *sets])
+    return load_scenario("reef", [*SHORT, *sets])
 
 
 def view_of(*sets):

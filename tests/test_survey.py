@@ -30,7 +30,7 @@ TRAJECTORIES = ("truth", "f2f", "online", "final")
 
 def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> survey.RunResult:
     """Flies a small survey; report and recording, which take longer than the flight, are written where asked for."""
-    scenario = scenario_file.load_scenario("quickstart", [*SMALL, *overrides])
+    scenario = scenario_file.load_scenario("reef", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.report.survey_page.surface_picture", lambda _: None)
         return survey.run(scenario, out, progress, outputs=OPTIONAL_OUTPUTS if report else ())
@@ -80,7 +80,7 @@ def test_one_seed_gives_byte_identical_trajectories_and_map(flown, tmp_path):
 
 def first_frame(*overrides):
     """Returns the first keyframe of a survey: images and readings."""
-    mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, *overrides]))
+    mission = prepare(scenario_file.load_scenario("reef", [*SMALL, *overrides]))
     with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
         return world.observe(next(step for step in mission.planned_frames(1) if step.keyframe))
 
@@ -92,7 +92,7 @@ def test_another_seed_gives_another_floor_and_another_noise():
 
 
 class Recorder:
-    """A navigator that notes what passes through the wall."""
+    """A navigator that records the frames and the alignments that it is asked for."""
 
     def __init__(self, navigator):
         self.navigator, self.frames = navigator, []
@@ -108,16 +108,14 @@ class Recorder:
 
 def test_estimates_from_recorded_frames_do_not_depend_on_the_truth(tmp_path):
     """Frames are recorded in one world and replayed with every truth (floor, poses, map) replaced by another."""
-    scenario = scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.3, 0.5]"])
+    scenario = scenario_file.load_scenario("reef", [*SMALL, "plan.area_m=[0.3, 0.5]"])
     mission, stopwatch = prepare(scenario), Stopwatch()
     recorder = Recorder(image_navigator(mission, tmp_path / "first"))
     with rendered_world.RenderedWorld(mission, stopwatch) as world:
         survey.fly(mission, world, recorder, lambda *_: None)
     first = recorder.navigator.finish()
 
-    elsewhere = scenario_file.load_scenario(
-        "quickstart", [*SMALL, "plan.area_m=[0.3, 0.5]", "terrain.kind=flat", "seed=9"]
-    )
+    elsewhere = scenario_file.load_scenario("reef", [*SMALL, "plan.area_m=[0.3, 0.5]", "terrain.kind=flat", "seed=9"])
     other = prepare(elsewhere)
     assert not np.array_equal(other.terrain.height_m, mission.terrain.height_m)
     navigator = image_navigator(other, tmp_path / "second")
@@ -147,7 +145,7 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
         "navigation.usbl_interval_s=0.01",
         "beacons=[{position_m=[0.0, 0.0, 0.8]}]",
     ]
-    mission = prepare(scenario_file.load_scenario("quickstart", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
+    mission = prepare(scenario_file.load_scenario("reef", [*SMALL, "plan.area_m=[0.6, 0.5]", *aids]))
     navigator, estimates = image_navigator(mission, tmp_path), []
     with rendered_world.RenderedWorld(mission, Stopwatch()) as world:
         survey.fly(mission, world, navigator, lambda estimate, _: estimates.append(estimate))

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import struct
+from typing import get_args
 
 import numpy as np
 import pytest
 import trimesh
 
 import terrains
+from terrains.ground_cover import COVERS
 from terrains.objects import mesh_file, placement
 from terrains.objects.mesh_header import face_count
 from terrains.objects.model import model_of
 from terrains.objects.shapes import SHAPES, build_shape
 from twin.errors import TwinError
-from twin.scenario.model import ObjectConfig
+from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
+from twin.world.objects import load_objects
 
 FIELD = "objects.0.mesh_file"
 CUBE = trimesh.creation.box((2.0, 1.0, 0.5))
@@ -38,15 +41,36 @@ def test_a_mesh_file_keeps_its_triangles_and_vertex_colours(suffix, tmp_path):
     np.testing.assert_array_equal(mesh.colours[order[0]], cube.visual.vertex_colors[order[1], :3])
 
 
-def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
-    """A square with a texture that is dark in the west and bright in the east, over 2 m."""
+def test_a_glb_mesh_counts_once_for_each_node_that_places_it(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(CUBE, geom_name="cube")
+    for k in (1, 2):
+        shift = trimesh.transformations.translation_matrix([3 * k, 0, 0])
+        scene.graph.update(frame_to=f"cube {k}", geometry="cube", matrix=shift)
+    scene.export(tmp_path / "cubes.glb")
+    assert face_count(tmp_path / "cubes.glb") == len(read(tmp_path / "cubes.glb").faces) == 36
+
+
+def test_the_triangles_of_a_textured_file_are_limited_however_many_parts_it_has(tmp_path):
+    scene = trimesh.Scene([textured_square(shift_m) for shift_m in (0.0, 3.0, 6.0)])
+    scene.export(tmp_path / "squares.glb")
+    mesh = read(tmp_path / "squares.glb")
+    assert mesh_file.TEXTURED_FACES / 5 < len(mesh.faces) <= mesh_file.TEXTURED_FACES
+
+
+def textured_square(shift_m=0.0):
+    """Returns a square with a texture that is dark in the west and bright in the east, over 2 m."""
     from PIL import Image
 
     ramp = np.repeat(np.linspace(0, 255, 256).astype(np.uint8)[None, :, None], 3, axis=2).repeat(4, axis=0)
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) + [shift_m, 0, 0]
     uv = np.array([[0.001, 0], [0.999, 0], [0.999, 1], [0.001, 1]])
     visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(ramp))
-    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False).export(tmp_path / "square.glb")
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+
+
+def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
+    textured_square().export(tmp_path / "square.glb")
     mesh = read(tmp_path / "square.glb")
     assert mesh_file.TEXTURED_FACES / 4 < len(mesh.faces) <= mesh_file.TEXTURED_FACES
     assert np.abs(mesh.colours[:, 0] - (mesh.vertices_m[:, 0] + 1) / 2 * 255).max() < 2
@@ -143,11 +167,39 @@ def test_scattered_objects_stand_on_their_ground(ground, steep):
         assert (placement.slope_deg(FLOOR, x, y, reach_m)[0] >= placement.STEEP_DEG) == steep
 
 
-def test_placement_is_seeded_and_independent_of_other_entries():
-    first, same, other = scattered(), scattered(), scattered(seed=2)
-    poses = [np.array([item.world_from_object for item in items]) for items in (first, same, other)]
-    np.testing.assert_array_equal(poses[0], poses[1])
-    assert not np.array_equal(poses[0], poses[2])
+def test_placement_is_seeded():
+    first, same, other = (poses_of(items) for items in (scattered(), scattered(), scattered(seed=2)))
+    np.testing.assert_array_equal(first, same)
+    assert not np.array_equal(first, other)
+
+
+def poses_of(items):
+    return np.array([item.world_from_object for item in items])
+
+
+def test_objects_of_an_entry_stand_in_the_same_places_whatever_other_entries_there_are(tmp_path):
+    """Entries stand in two areas that do not overlap; the later entry is changed, and an entry is added after both."""
+    west = {"shape": "crate", "per_m2": 0.5, "size_m": 0.2, "area_m": [2.0, 4.0], "centre_m": [-2.5, 0.0]}
+    east = west | {"shape": "pipe", "centre_m": [2.5, 0.0]}
+
+    def placed(*entries):
+        scenario = Scenario.model_validate({"seed": 5, "objects": entries})
+        return [poses_of([i for i in load_objects(scenario, FLOOR, lambda build: build()) if i.group == k])
+                for k in range(len(entries))]  # fmt: skip
+
+    both, denser = placed(west, east), placed(west, east | {"per_m2": 1.0})
+    more = placed(west, east, east | {"size_m": 0.1})
+    np.testing.assert_array_equal(both[0], denser[0])
+    assert len(denser[1]) == 2 * len(both[1])
+    np.testing.assert_array_equal(both[0], more[0])
+    np.testing.assert_array_equal(both[1], more[1])
+    np.testing.assert_array_equal(placed(west | {"per_m2": 1.0}, east)[1], both[1])
+
+
+def test_the_shapes_and_covers_of_scenarios_are_those_that_can_be_built():
+    assert set(get_args(ObjectConfig.model_fields["shape"].annotation)) == {*SHAPES, "mesh"}
+    covers = get_args(TerrainConfig.model_fields["cover"].annotation)[0]
+    assert set(get_args(covers)) == set(COVERS)
 
 
 def test_objects_are_sunk_and_perpendicular_to_the_floor():

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
+from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
 import terrains
 from terrains.quilting import even_lighting, quilt
-from terrains.textures import tile_image
+from terrains.textures import texture_from_photo, tile_image
 from twin.errors import TwinError
 
 CRS = "EPSG:32755"
@@ -66,6 +69,42 @@ def test_even_lighting_removes_a_gradient(pebbles: np.ndarray) -> None:
     assert np.array_equal(even_lighting(black), black)
 
 
+def test_even_lighting_of_a_large_photo_takes_little_memory_and_removes_its_gradient() -> None:
+    grains = np.random.default_rng(4).integers(0, 40, (1500, 2000, 1), np.uint8)
+    photo = np.repeat(np.linspace(60, 180, 2000).astype(np.uint8)[None, :, None] + grains, 3, axis=2)
+    tracemalloc.start()
+    even = even_lighting(photo)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5 * photo.nbytes  # the result takes once that of the photo; a fit to all pixels takes 31 times
+    assert np.ptp(even.reshape(1500, 8, 250, 3).mean(axis=(0, 2, 3))) < 2.0
+
+
+@pytest.mark.parametrize("size_m", ((2.0, 2.0), (4.0, 4.0)))
+def test_pebbles_of_a_photo_have_the_same_size_on_a_floor_with_coarser_texels(
+    pebbles: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size_m: tuple[float, float]
+) -> None:
+    """The distance at which the autocorrelation falls to one half is that of the photo: 4 mm per pixel."""
+    monkeypatch.setattr("terrains.textures.COARSEN_TEXELS", 250_000)
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), pebbles)
+    source = terrains.TextureSource(0.004, photo, coarsen=True)
+    texel_m = source.texel_m(size_m)
+    assert texel_m == (0.004 if size_m[0] == 2.0 else 0.008)
+    texture = texture_from_photo(source, (round(size_m[1] / texel_m), round(size_m[0] / texel_m)), size_m)
+    expected_m = 0.004 * half_width_px(even_lighting(pebbles))
+    assert texel_m * half_width_px(texture) == pytest.approx(expected_m, rel=0.15)  # averaging over 8 mm adds 10 %
+
+
+def half_width_px(texture: np.ndarray) -> float:
+    """Returns the shift along the rows at which the autocorrelation of the first band falls to one half [px]."""
+    grey = texture[..., 0] - texture[..., 0].mean()
+    correlation = np.fft.irfft2(np.abs(np.fft.rfft2(grey)) ** 2, grey.shape)[0]
+    correlation = correlation / correlation[0]
+    k = int(np.argmax(correlation < 0.5))
+    return k - (0.5 - correlation[k]) / (correlation[k - 1] - correlation[k])
+
+
 def test_the_texture_of_a_photo_is_the_same_for_every_seed(pebbles: np.ndarray, tmp_path: Path) -> None:
     photo, dem = tmp_path / "photo.png", tmp_path / "dem.npy"
     with rasterio.open(photo, "w", driver="PNG", count=3, height=200, width=200, dtype="uint8") as target:
@@ -114,6 +153,58 @@ def test_an_orthophoto_lies_where_its_coordinates_say(dem: Path, tmp_path: Path,
     terrain = terrains.load(dem, terrains.TextureSource(0.02, orthophoto_file=file), 1.0, 1.0, 0)
     assert terrain.orthophoto_share == 1.0
     assert target_position(terrain) == pytest.approx(mark, abs=0.01)
+
+
+def coloured_photo() -> np.ndarray:
+    """Returns bands R, G, B (3, 375, 500) that cover the DEM: each is a ramp or a step of its own."""
+    row, col = np.indices((375, 500))
+    return np.stack([col // 2, row // 2, np.where(row < 100, 250, 10)]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("form", ("rgba", "bgr", "south_up", "east_to_west"))
+def test_alpha_order_of_the_bands_and_direction_of_the_rows_of_an_orthophoto_are_respected(
+    dem: Path, tmp_path: Path, form: str
+) -> None:
+    bands = coloured_photo()
+    plain = write(tmp_path / "plain.tif", bands, WEST, NORTH, 0.02, CRS)
+    grid = Affine(0.02, 0.0, WEST, 0.0, -0.02, NORTH)
+    marks = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
+    if form == "rgba":
+        bands, marks = np.concatenate([bands, np.full_like(bands[:1], 255)]), [*marks, ColorInterp.alpha]
+        bands[3, :, 250:] = 0
+    if form == "bgr":
+        bands, marks = bands[::-1], marks[::-1]
+    if form == "south_up":
+        bands, grid = bands[:, ::-1], Affine(0.02, 0.0, WEST, 0.0, 0.02, NORTH - 375 * 0.02)
+    if form == "east_to_west":
+        bands, grid = bands[:, :, ::-1], Affine(-0.02, 0.0, WEST + 10.0, 0.0, -0.02, NORTH)
+    file = tmp_path / "ortho.tif"
+    with rasterio.open(
+        file, "w", driver="GTiff", count=len(bands), height=375, width=500, dtype="uint8", crs=CRS, transform=grid
+    ) as target:
+        target.write(bands)
+        target.colorinterp = marks
+    found, expected, bare = (
+        terrains.load(dem, terrains.TextureSource(0.02, orthophoto_file=photo), 1.0, 1.0, 0)
+        for photo in (file, plain, None)
+    )
+    if form == "rgba":  # the eastern half of the photo is transparent; its first column lies at the edge
+        west, east = slice(0, 240), slice(260, None)
+        assert np.array_equal(found.texture[:, east], bare.texture[:, east])
+        assert np.array_equal(found.texture[:, west], expected.texture[:, west])
+        assert found.orthophoto_share == pytest.approx(0.5, abs=0.02)
+    else:
+        assert np.array_equal(found.texture, expected.texture)
+
+
+def test_an_orthophoto_with_a_palette_is_rejected(dem: Path, tmp_path: Path) -> None:
+    file = write(tmp_path / "ortho.tif", np.zeros((1, 9, 9), np.uint8), WEST, NORTH, 0.1, CRS)
+    with rasterio.open(file, "r+") as target:
+        target.colorinterp = [ColorInterp.palette]
+        target.write_colormap(1, {0: (200, 100, 50, 255)})
+    with pytest.raises(TwinError, match="palette") as caught:
+        terrains.load(dem, terrains.TextureSource(0.02, orthophoto_file=file), 1.0, 1.0, 0)
+    assert caught.value.field == "terrain.orthophoto_file"
 
 
 def test_texels_beyond_an_orthophoto_keep_the_other_texture(dem: Path, tmp_path: Path) -> None:

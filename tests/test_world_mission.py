@@ -1,10 +1,12 @@
 """Errors of a scenario that depend on its floor are reported by line, before anything is flown."""
 
+import numpy as np
 import pytest
 
-from twin.errors import ScenarioError
+from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import load_scenario
-from twin.world.mission import prepare
+from twin.surrogate import matchability
+from twin.world.mission import load_terrain, prepare
 
 BAD_BEACONS = [
     (
@@ -46,10 +48,36 @@ BAD_SENSORS = [
 ]
 
 
+@pytest.mark.parametrize(
+    ("overrides", "error"),
+    [
+        (["terrain.texture_tiling=repeat"], "terrain.texture_tiling: has no effect without a photo"),
+        (
+            ["terrain.kind=file", "terrain.height_file=x.npy", "terrain.texture_file=y.png", "terrain.cover=sand"],
+            "terrain.cover: has no effect on a floor with terrain.texture_file",
+        ),
+    ],
+)
+def test_texture_keys_without_effect_are_rejected(overrides, error):
+    with pytest.raises(TwinError, match=error):
+        load_terrain(load_scenario("quickstart", overrides))
+
+
+@pytest.mark.parametrize("fidelity", ["surrogate", "rendered"])
+def test_a_floor_without_photo_is_painted_in_full_only_for_images(tmp_path, fidelity):
+    np.save(tmp_path / "dem.npy", np.random.default_rng(1).random((50, 60)))
+    overrides = [f"imaging.fidelity={fidelity}", "terrain.kind=file", f"terrain.height_file={tmp_path}/dem.npy"]
+    scenario = load_scenario("quickstart", [*overrides, "terrain.height_spacing_m=0.05", "terrain.texture_px_m=0.005"])
+    terrain = load_terrain(scenario)
+    assert terrain.texture.shape[:2] == ((490, 590) if fidelity == "rendered" else (49, 59))
+    texture, texel_m = matchability._texture(scenario, terrain, 1.0)  # the surrogate paints what an image shows
+    assert texture.shape == (200, 200, 3) and texel_m == 0.005
+
+
 @pytest.mark.parametrize(("text", "errors"), BAD_SENSORS)
 def test_invalid_sensors_are_reported_by_line_all_at_once(tmp_path, text, errors):
     file = tmp_path / "sensor.toml"
-    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
+    file.write_text(f'extends = "{load_scenario("reef").source.path}"\n{text}\n')
     with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file))
     assert caught.value.lines == [f"{file}:{error}" for error in errors]
@@ -58,7 +86,7 @@ def test_invalid_sensors_are_reported_by_line_all_at_once(tmp_path, text, errors
 @pytest.mark.parametrize(("text", "errors"), BAD_BEACONS)
 def test_invalid_beacons_are_reported_by_line_all_at_once(tmp_path, text, errors):
     file = tmp_path / "beacons.toml"
-    file.write_text(f'extends = "{load_scenario("quickstart").source.path}"\n{text}\n')
+    file.write_text(f'extends = "{load_scenario("reef").source.path}"\n{text}\n')
     flat = ["terrain.kind=flat", "terrain.relief_m=0.0", "terrain.base_m=0.5"]
     with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file, flat))

@@ -55,26 +55,26 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
 )
 def test_invalid_light_is_reported(overrides, fault):
     with pytest.raises(ScenarioError, match=fault) as raised:
-        prepare(load_scenario("quickstart", [*SMALL, *overrides]))
+        prepare(load_scenario("reef", [*SMALL, *overrides]))
     assert len(raised.value.lines) == 1
 
 
 def test_a_lamp_below_the_floor_is_accepted_at_the_allowed_height():
     with pytest.raises(ScenarioError) as raised:
-        prepare(load_scenario("quickstart", [*SMALL, "lamps.0.position_m=[0.25, 0.35, -2.0]"]))
+        prepare(load_scenario("reef", [*SMALL, "lamps.0.position_m=[0.25, 0.35, -2.0]"]))
     height_m = float(raised.value.lines[0].rpartition("allowed: ")[2].split()[0])
-    prepare(load_scenario("quickstart", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
+    prepare(load_scenario("reef", [*SMALL, f"lamps.0.position_m=[0.25, 0.35, {height_m + 0.01}]"]))
 
 
 def test_water_lamps_and_sun_survive_a_round_trip_with_a_relative_spectrum_file(tmp_path):
     (tmp_path / "lake.csv").write_text("400, 0.1, 0.2\n700, 0.3, 0.2\n")
     file = tmp_path / "lake.toml"
     file.write_text(
-        'extends = "quickstart.toml"\n[water]\nspectrum_file = "lake.csv"\nphase_function = "petzold"\n'
+        'extends = "reef.toml"\n[water]\nspectrum_file = "lake.csv"\nphase_function = "petzold"\n'
         "[sun]\nilluminance_lx = 500.0\ndepth_m = 9.0\ncaustics = 0.7\n"
         "[[lamps]]\nposition_m = [0.2, 0.3, 0.0]\nbeam = [[0, 1], [30.5, 0.25]]\ncolour_temperature_k = 4000.0\n"
     )
-    (tmp_path / "quickstart.toml").write_text(dump_toml(load_scenario("quickstart")))
+    (tmp_path / "reef.toml").write_text(dump_toml(load_scenario("reef")))
     scenario = load_scenario(file)
     assert scenario.water.spectrum_file == str(tmp_path / "lake.csv")
     assert scenario.water.label == "lake.csv, turbidity 1"

@@ -32,7 +32,7 @@ def flown(settings, folder, outputs):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.report.survey_page.draw_all", lambda _: {"tracks": "data:,"})
         patch.setattr("twin.report.survey_page.surface_picture", lambda _: None)
-        return survey.run(load_scenario("quickstart", settings), folder, outputs=outputs)
+        return survey.run(load_scenario("reef", settings), folder, outputs=outputs)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_loops_are_flown_and_mapped_by_vision(looped):
 
 
 def test_a_loop_is_linked_with_its_own_start_and_with_the_loop_before(looped):
-    mission = prepare(load_scenario("quickstart", LOOPS))
+    mission = prepare(load_scenario("reef", LOOPS))
     n_first = sum(step.keyframe for step in mission.planned_frames(1))
     i, j = edges(looped.folder).T
     assert ((j < n_first) & (j > n_first - 4) & (i < 4)).any()  # closure
@@ -113,14 +113,14 @@ def test_a_kinematic_vehicle_has_the_commanded_horizontal_velocity():
 )
 def test_an_impossible_plan_is_rejected_with_its_key(overrides, message):
     with pytest.raises(ScenarioError) as refused:
-        prepare(load_scenario("quickstart", [*LOOPS, *overrides]))
+        prepare(load_scenario("reef", [*LOOPS, *overrides]))
     assert message in str(refused.value)
 
 
 def test_the_speed_limit_is_that_of_the_bow_and_a_kinematic_vehicle_has_none():
     lawnmower = [*SMALL, "plan.area_m=[2.0, 1.0]"]
-    prepare(load_scenario("quickstart", [*lawnmower, "plan.speed_mps=0.7"]))
-    prepare(load_scenario("quickstart", [*lawnmower, "plan.speed_mps=1.0", "vehicle.dynamics=kinematic"]))
+    prepare(load_scenario("reef", [*lawnmower, "plan.speed_mps=0.7"]))
+    prepare(load_scenario("reef", [*lawnmower, "plan.speed_mps=1.0", "vehicle.dynamics=kinematic"]))
 
 
 @pytest.mark.parametrize("file", SCENES, ids=lambda file: file.stem)

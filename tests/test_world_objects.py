@@ -65,7 +65,7 @@ def test_floor_below_an_overhang_is_not_observed():
     assert bare.seen[40:60, 50:70].all()
 
 
-SCENE = """extends = "quickstart.toml"
+SCENE = """extends = "reef.toml"
 [[objects]]
 shape = "boulder"
 position_m = [0.5, 0.2]
@@ -79,7 +79,7 @@ size_m = 0.4
 def prepared(text, folder, name="scene.toml"):
     from twin.scenario.file import find_scene
 
-    scene = SCENE.replace("quickstart.toml", str(find_scene("quickstart"))).format(text)
+    scene = SCENE.replace("reef.toml", str(find_scene("reef"))).format(text)
     (folder / name).write_text(scene)
     return prepare(load_scenario(folder / name, ["plan.area_m=[1.0, 0.5]", "terrain.texture_px_m=0.04"]))
 

@@ -45,7 +45,7 @@ def dem(tmp_path):
         file.set_band_description(1, "depth")
     scenario = tmp_path / "site.toml"
     scenario.write_text(
-        f'extends = "{load_scenario("quickstart").source.path}"\n[imaging]\nfidelity = "surrogate"\n'
+        f'extends = "{load_scenario("reef").source.path}"\n[imaging]\nfidelity = "surrogate"\n'
         '[terrain]\nkind = "file"\nheight_file = "dem.tif"\ntexture_px_m = 0.02\n[control]\nhold_s = 0.5\n'
         "[plan]\narea_m = [1.2, 0.8]\n"
     )
@@ -103,7 +103,7 @@ def test_a_polygon_that_is_no_list_of_corners_gives_one_error(tmp_path, value):
 
 def test_a_generated_floor_has_no_coordinates():
     with pytest.raises(ScenarioError, match="plan.centre_crs: the terrain has no coordinates"):
-        mission("quickstart", "plan.centre_crs=[1.0, 2.0]", "terrain.texture_px_m=0.2")
+        mission("reef", "plan.centre_crs=[1.0, 2.0]", "terrain.texture_px_m=0.2")
 
 
 CORNERS = np.array([[-1.0, -0.5], [1.0, -0.5], [0.5, 0.8], [-1.0, -0.5]])
@@ -180,7 +180,7 @@ def test_a_survey_over_a_dem_returns_its_maps_in_the_coordinates_of_the_dem(dem,
 def test_a_survey_with_the_bow_first_is_as_accurate_as_one_that_flies_backwards(tmp_path):
     small = ['imaging.fidelity="surrogate"', "plan.tracks=1", "plan.area_m=[1.2, 0.8]", "control.hold_s=0.5"]
     runs = {
-        turns: survey.run(load_scenario("quickstart", [*small, f"plan.turns={turns}"]), tmp_path / turns, outputs=())
+        turns: survey.run(load_scenario("reef", [*small, f"plan.turns={turns}"]), tmp_path / turns, outputs=())
         for turns in ("reverse", "bow_first")
     }
     reverse, bow_first = (runs[turns].metrics for turns in ("reverse", "bow_first"))

@@ -24,7 +24,7 @@ SMALL = ["terrain.texture_px_m=0.2", "plan.area_m=[3.0, 1.6]", "plan.altitude_m=
 
 
 def scenario(*overrides):
-    return load_scenario("quickstart", [*SMALL, *overrides])
+    return load_scenario("reef", [*SMALL, *overrides])
 
 
 def floor(height_at, spacing_m=0.05):

@@ -5,18 +5,28 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from twin.datasets.replay import ReplayOptions, ReplayResult
     from twin.scenario.model import Scenario
     from twin.session.conclusion import RunResult
+    from twin.session.stepped_world import SteppedWorld as World
 
-__all__ = ["load_scenario", "replay", "run"]
+__all__ = ["World", "load_scenario", "replay", "run"]
 
 # OpenBLAS reads this variable when numpy is imported. Multithreading slows down operations on small matrices: with two
 # threads, the final alignment of 25 tracks takes more than twice as long.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def __getattr__(name: str) -> Any:
+    """Returns `twin.World`, which is imported at its first use because it needs the simulator."""
+    if name == "World":
+        from twin.session.stepped_world import SteppedWorld
+
+        return SteppedWorld
+    raise AttributeError(f"module 'twin' has no attribute {name!r}")
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
@@ -57,7 +67,7 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
     """Runs the estimators on a recorded stereo data set and writes a run folder; see docs/replay.md.
 
     Args:
-        dataset: folder of the data set.
+        dataset: folder or ROS 2 bag of the data set.
         out: run folder to write.
         options: calibration, truth, alignment and settings (`twin.datasets.replay.ReplayOptions`).
 
@@ -65,7 +75,8 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
         Status, metrics and run folder of the replay, the trajectories and the map.
 
     Raises:
-        TwinError: the data set or one of its files cannot be used; nothing was written.
+        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder cannot be
+            written.
     """
     from twin.datasets import replay as recorded
 

@@ -39,6 +39,8 @@ SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")
 ]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
+RunsArgument = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of two to eight runs.")]
+PageOption = Annotated[Path, typer.Option("--out", help="HTML page to write.")]
 SetOption = Annotated[
     list[str],
     typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the scenario, as in plan.tracks=2; repeatable."),
@@ -129,7 +131,9 @@ ExtrapolateOption = Annotated[
 LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
 DatasetArgument = Annotated[
     Path,
-    typer.Argument(metavar="DATASET", help="Folder of a stereo data set: EuRoC/ASL, KITTI, or left/ and right/."),
+    typer.Argument(
+        metavar="DATASET", help="Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3)."
+    ),
 ]
 CalibrationOption = Annotated[
     Path | None,
@@ -137,7 +141,15 @@ CalibrationOption = Annotated[
 ]
 TruthOption = Annotated[
     Path | None,
-    typer.Option("--truth", metavar="FILE", help="True poses, only for the comparison: TUM, KITTI or EuRoC."),
+    typer.Option(
+        "--truth",
+        metavar="FILE|TOPIC",
+        help="True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
+    ),
+]
+TopicsOption = Annotated[
+    str | None,
+    typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
 ]
 AlignOption = Annotated[
     str,
@@ -152,11 +164,26 @@ PreviewOption = Annotated[
 ReplayOutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")
 ]
+KindArgument = Annotated[str, typer.Argument(metavar="KIND", help="controller, estimator, terrain or reader.")]
+PluginFolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="New folder; names the package.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
 PlanJsonOption = Annotated[bool, typer.Option("--json", help="Print only the predicted properties, as JSON.")]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Exit with status 1 if a requirement is expected to be missed.")
 ]
+OptionalRunArgument = Annotated[Path | None, typer.Argument(metavar="RUN", help="Folder of a run.")]
+FormatOption = Annotated[
+    list[str], typer.Option("--to", metavar="FORMAT", help="Format to write; repeatable, or separated by commas.")
+]
+ExportOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: RUN/export.")]
+CrsOption = Annotated[str | None, typer.Option("--crs", help="CRS of the exported coordinates, as in EPSG:32633.")]
+OriginOption = Annotated[
+    str | None, typer.Option("--origin", metavar="E,N,H", help="Scene origin in --crs; H is its elevation [m].")
+]
+JpegOption = Annotated[
+    int | None, typer.Option("--jpeg", metavar="QUALITY", help="Write images as JPEG of this quality, 1 to 100.")
+]
+ListOption = Annotated[bool, typer.Option("--list", help="List the formats.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics, as JSON.")]
 
 
@@ -446,13 +473,15 @@ def replay(
     bayer: BayerOption = None,
     out: ReplayOutOption = None,
     preview: PreviewOption = False,
+    topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
     from twin.datasets import preview as previewing
     from twin.datasets import replay as recorded
 
-    options = recorded.ReplayOptions(calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer))
+    alignment, pattern = recorded.alignment_name(align), recorded.bayer_pattern(bayer)
+    options = recorded.ReplayOptions(calibration, truth, alignment, pattern, topics=recorded.image_topics(topics))
     name = outputs.file_stem(dataset.resolve().name)
     if preview:
         file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))
@@ -483,12 +512,68 @@ def report(folder: RunArgument) -> None:
 
 
 @app.command()
+def compare(folders: RunsArgument, out: PageOption = Path("runs/compare.html"), as_json: SummaryOption = False) -> None:
+    """Compare runs: a table of metrics with differences from the first run, overlaid curves, one HTML page."""
+    from twin.report import comparison
+
+    runs = comparison.load_runs(folders)
+    file = outputs.output_file(out)
+    with outputs.writing(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(comparison.render(runs), encoding="utf-8")
+    if as_json:
+        print(json.dumps(comparison.as_json(runs), indent=1))
+    else:
+        console.print_table("Comparison", comparison.text_rows(runs))
+        print(f"Page: {file}")
+
+
+@app.command()
 def view(folder: RunArgument) -> None:
     """Open the recording of a run in Rerun."""
     from twin.report.recording import open_viewer
 
     with outputs.writing(folder, "RUN"):
         raise typer.Exit(open_viewer(folder))
+
+
+@app.command("new-plugin")
+def new_plugin(kind: KindArgument, folder: PluginFolderArgument) -> None:
+    """Write a package with a working plug-in (controller, estimator, terrain or reader) and its test."""
+    from twin.plugin import skeleton
+
+    chosen = skeleton.plugin_kind(kind)
+    with outputs.writing(outputs.new_folder(folder, "DIR"), "DIR"):
+        written = skeleton.write(chosen, folder)
+    for file in written:
+        print(file)
+    print(f"Next: pip install -e {folder}; pytest {folder / 'tests'}")
+
+
+@app.command()
+def export(
+    folder: OptionalRunArgument = None,
+    to: FormatOption = [],  # noqa: B006 (typer copies it)
+    out: ExportOutOption = None,
+    crs: CrsOption = None,
+    origin: OriginOption = None,
+    jpeg: JpegOption = None,
+    show_list: ListOption = False,
+) -> None:
+    """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
+    from twin.app import export_command
+
+    if show_list:
+        console.print_table("Formats of twin export", export_command.format_rows())
+        return
+    if folder is None:
+        raise TwinError("RUN", "is missing", "the folder of a run, or --list")
+    target = folder / "export" if out is None else out
+    options = export_command.ExportOptions(crs, origin, jpeg)
+    with console.replay_bar() as progress, outputs.writing(target):
+        written = export_command.export(folder, to, target, options, progress)
+    for name, paths in written.items():
+        print(f"{name}: {', '.join(map(str, paths))}")
 
 
 @app.command()

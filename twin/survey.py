@@ -10,13 +10,15 @@ from twin.core.records import Estimate, Frame
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
+from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
-from twin.session.conclusion import Flight, RunResult, conclude
+from twin.session.conclusion import FlownSurvey, RunResult, conclude
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
-from twin.world.mission import FrameSequence, Mission, prepare
+from twin.world.flight import Flight
+from twin.world.mission import Mission, prepare
 from twin.world.pace import FULL
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
@@ -59,13 +61,22 @@ def run(
         for warning in world.warnings:
             folder.log("warning", text=warning)
         monitor = SurveyMonitor(mission, folder, progress, live)
+        images = scenario.imaging.fidelity == "rendered" and outputs is not None
         with make_navigator(mission, world, out, stopwatch) as navigator:
             try:
-                with guard.stage():
-                    fly(mission, world, navigator, monitor, monitor.actions)
+                with guard.stage(), FrameRecorder(out, scenario.record if images else "none") as recorder:
+
+                    def observe(estimate: Estimate, frame: Frame) -> None:
+                        recorder.add(frame, world.world_from_camera, world.vehicle.twist_body)
+                        monitor(estimate, frame)
+
+                    fly(mission, world, navigator, observe, monitor.actions)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
-            return conclude(Flight(mission, world, navigator, stopwatch, guard), folder, monitor)
+            result = conclude(FlownSurvey(mission, world, navigator, stopwatch, guard), folder, monitor)
+    if scenario.record == "none" and images:
+        remove_keyframe_images(out)
+    return result
 
 
 def fly(
@@ -88,30 +99,14 @@ def fly(
         actions: chooses the pace along the path; None: the vehicle always flies at the planned speed.
     """
     pilot = make_pilot(mission)
-    fast_forward = world.fast_forward(navigator, pilot)
-
-    def follow(sequence: FrameSequence, track: int) -> None:
-        k = 0
-        world.start_sequence(sequence, track)
-        while k < len(sequence):
-            frame = world.observe(sequence[k])
-            estimate = navigator.update(frame, track)
-            observe(estimate, frame)
-            reference = sequence[k].reference
-            world.act(pilot(without_feedback(estimate, reference, frame.readings), reference))
-            pace = FULL if actions is None else actions(estimate)
-            k += 1
-            if sequence.holding or (pace == FULL and sequence.rate == 1):
-                first, k = k, fast_forward(sequence, k)
-                if actions is not None:
-                    actions.add_measured_frames(k - first)
-            else:
-                world.end_sequence(k)
-                sequence, k = mission.next_frames(track, sequence.path_times_s[k - 1], pace), 0
-                world.start_sequence(sequence, track)
-
-    for track in mission.tracks:
-        follow(mission.planned_frames(track), track)
-        follow(mission.station_keeping_frames(track), track)
-        navigator.align_track(track)  # during station keeping
-        follow(mission.station_keeping_frames(track), track)
+    flight = Flight(mission, world, world.fast_forward(navigator, pilot))
+    frame = flight.start()
+    while frame is not None:
+        if flight.aligns:
+            navigator.align_track(flight.track)
+        estimate = navigator.update(frame, flight.track)
+        observe(estimate, frame)
+        command = pilot(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
+        frame = flight.step(command, FULL if actions is None else actions(estimate))
+        if actions is not None:
+            actions.add_measured_frames(flight.n_skipped)

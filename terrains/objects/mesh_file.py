@@ -15,7 +15,7 @@ from twin.errors import TwinError
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
 MAX_BYTES = 500_000_000  #: largest file that is read
-TEXTURED_FACES = 200_000  #: triangles into which a textured mesh is divided, so that vertices sample its texture
+TEXTURED_FACES = 200_000  #: triangles into which the parts of a file are divided, so that vertices sample textures
 LARGEST_M = 1000.0
 
 Array = NDArray[np.float64]
@@ -39,7 +39,8 @@ def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: 
         raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
     _check_size(file, field)
     try:
-        parts = [_coloured(part, albedo) for part in _parts(_loaded(file))]
+        loaded = _parts(_loaded(file))
+        parts = [_coloured(part, albedo, TEXTURED_FACES // len(loaded)) for part in loaded]
     except MemoryError:
         raise
     except Exception as error:  # trimesh raises any of many types for a damaged file
@@ -83,13 +84,16 @@ def _parts(loaded: Any) -> list[Any]:
     return [part for part in parts if isinstance(part, trimesh.Trimesh)]
 
 
-def _coloured(part: Any, albedo: tuple[float, float, float]) -> Mesh:
-    """Returns a mesh with the texture or vertex colours of a trimesh mesh; with `albedo` if it has neither."""
+def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) -> Mesh:
+    """Returns a mesh with the texture or vertex colours of a trimesh mesh; with `albedo` if it has neither.
+
+    A textured mesh is divided into at most `most_faces` triangles, or not at all.
+    """
     from trimesh.visual import TextureVisuals
 
     colours = np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3))
     if isinstance(part.visual, TextureVisuals):
-        textured = _textured(part)
+        textured = _textured(part, most_faces)
         if textured is not None:
             return textured
     elif part.visual.defined:
@@ -105,10 +109,10 @@ def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
     )
 
 
-def _textured(part: Any) -> Mesh | None:
+def _textured(part: Any, most_faces: int) -> Mesh | None:
     """Returns a trimesh mesh with the colours of its texture at its vertices.
 
-    All triangles are divided into four as long as there are at most TEXTURED_FACES. Returns None if the mesh has no
+    All triangles are divided into four as long as there are at most `most_faces`. Returns None if the mesh has no
     texture image or no texture coordinates.
     """
     import trimesh
@@ -118,7 +122,7 @@ def _textured(part: Any) -> Mesh | None:
     if image is None or uv is None or len(uv) != len(part.vertices):
         return None
     divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
-    while 0 < len(divided[1]) * 4 <= TEXTURED_FACES:
+    while 0 < len(divided[1]) * 4 <= most_faces:
         divided = trimesh.remesh.subdivide(*divided[:2], vertex_attributes=divided[2])
     vertices, faces, attributes = divided
     return _mesh(vertices, faces, _sampled(np.asarray(image.convert("RGB")), attributes["uv"]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections import Counter
 from pathlib import Path
 
 FORMATS = "a PLY, OBJ or GLB file with triangles"
@@ -25,7 +26,7 @@ def face_count(file: Path) -> int:
 
 
 def _ply_faces(file: Path) -> int:
-    """Returns the number of faces in a PLY header."""
+    """Returns the number of faces in a PLY header; raises ValueError if there is no header or no face."""
     with file.open("rb") as stream:
         header = stream.read(_LONGEST_HEADER)
     if not header.startswith(b"ply") or b"end_header" not in header:
@@ -48,7 +49,14 @@ def _obj_faces(file: Path) -> int:
 
 
 def _glb_faces(file: Path) -> int:
-    """Returns the number of triangles of a binary glTF file, from the accessors of its meshes."""
+    """Returns the number of triangles of a binary glTF file, from the accessors of its meshes.
+
+    A mesh counts once for each node that places it; a mesh that no node places counts once, because
+    it is loaded, too.
+
+    Raises:
+        ValueError: the file has no GLB header, or its description is too long or invalid.
+    """
     with file.open("rb") as stream:
         start = stream.read(20)
         if len(start) < 20 or start[:4] != b"glTF" or start[16:] != b"JSON":
@@ -60,8 +68,11 @@ def _glb_faces(file: Path) -> int:
     try:
         tree = json.loads(text)
         accessors = tree.get("accessors", [])
-        parts = [part for mesh in tree.get("meshes", []) for part in mesh["primitives"]]
-        used = [part.get("indices", part.get("attributes", {}).get("POSITION")) for part in parts]
-        return sum(int(accessors[k]["count"]) // 3 for k in used)
+        instances = Counter(node.get("mesh") for node in tree.get("nodes", []))
+        count = 0
+        for number, mesh in enumerate(tree.get("meshes", [])):
+            parts = [part.get("indices", part.get("attributes", {}).get("POSITION")) for part in mesh["primitives"]]
+            count += max(1, instances[number]) * sum(int(accessors[k]["count"]) // 3 for k in parts)
+        return count
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         raise ValueError(f"has an invalid description: {error}") from error

@@ -99,7 +99,11 @@ def _scattered(
     number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
     rng: np.random.Generator,
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
+    """Returns objects at random positions that do not overlap each other or the objects in `taken`.
+
+    Raises:
+        TwinError: they do not fit into the area without overlap.
+    """
     field = f"objects.{number}.per_m2"
     low, high = _region(group, terrain)
     n = _count(group, terrain, low, high, field)

@@ -1,1 +1,1 @@
-"""Commands of `twin` (doctor, plan, look, study, tune, fit-surrogate) and their terminal output."""
+"""Commands of `twin` (doctor, plan, look, study, tune, fit-surrogate, export) and their terminal output."""

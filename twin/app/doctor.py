@@ -29,7 +29,7 @@ class Check(NamedTuple):
     """Result of one check.
 
     Args:
-        name: what was checked.
+        name: subject of the check.
         ok: whether the check passed.
         found: version, size or error message.
         remedy: command or action that fixes a failure.

@@ -16,7 +16,10 @@ from twin.study.worker import SINGLE_THREADED
 from twin.surrogate import error_model_file
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
 
-DEFAULT_STUDIES = ("fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper", "fit_murky")
+DEFAULT_STUDIES = (
+    "fit_range", "fit_edges", "fit_rough", "fit_across", "fit_reef", "fit_sun", "fit_paper", "fit_murky", "fit_binned",
+    "fit_floors",
+)  # fmt: skip
 
 
 def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> int:
@@ -29,7 +32,7 @@ def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) ->
         jobs: number of processes that fly surveys; None for one per core.
 
     Returns:
-        The exit status.
+        The exit status, 0.
 
     Raises:
         TwinError: a study is invalid, or too few surveys are complete.

@@ -43,7 +43,10 @@ def draw(summary: PlanSummary, file: Path) -> Path:
 
 
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
-    """Draws the overlap of each image pair midway between its two camera positions; rings mark insufficient ones."""
+    """Draws the overlap of each image pair midway between its two camera positions.
+
+    Outlined markers show overlaps below the required one.
+    """
     floor, required = summary.floor, required_overlaps(summary.mission)
     t = summary.mission.terrain
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))

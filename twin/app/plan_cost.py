@@ -1,9 +1,9 @@
 """Computing cost of a survey: time, memory and disk, estimated from its plan.
 
-The coefficients are fitted to four rendered surveys of `quickstart` (area 1.2 m x 0.8 m, one track, 413 frames; images
+The coefficients are fitted to four rendered surveys of `reef` (area 1.2 m x 0.8 m, one track, 413 frames; images
 of 320 x 240 and 640 x 480 px, 19 and 51 keyframes) on a 2-core x86-64 machine without GPU: 30, 39, 47 and 71 s of
 processor time, 485, 502, 585 and 657 MB of memory, 11, 22, 28 and 65 MB of disk. The machine was fully loaded, so
-the time coefficients are multiplied by 0.6; they then reproduce the 46 s of processor time of `quickstart` on an idle
+the time coefficients are multiplied by 0.6; they then reproduce the 46 s of processor time of `reef` on an idle
 machine. The coefficients of the surrogate are fitted to `horseshoe` with 50 and 362 keyframes (16 and 22 s on the
 loaded machine). Times on other machines can differ by a factor of two.
 """

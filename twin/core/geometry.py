@@ -64,7 +64,7 @@ def inverse(a_from_b: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def compose(a_from_b: Array, b_from_c: Array) -> Array:
-    """Returns a_from_c (4, 4), in a third of the time of a BLAS matrix product."""
+    """Returns a_from_c (4, 4), the product a_from_b @ b_from_c, in a third of the time of a BLAS matrix product."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(4):

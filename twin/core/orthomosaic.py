@@ -17,8 +17,8 @@ class OrthoTile(NamedTuple):
     """Rectangular part of an orthomosaic.
 
     Args:
-        grid: grid of the pixels of the tile.
-        row, col: position of the first pixel of the tile in the orthomosaic.
+        grid: grid of the pixels of the whole orthomosaic.
+        row, col: row and column of the first pixel of the tile in that grid.
         rgba: (rows, cols, 4) uint8; the last band is 255 where the orthomosaic has a colour, otherwise 0.
     """
 

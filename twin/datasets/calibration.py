@@ -43,14 +43,12 @@ class StereoCalibration:
         left, right: the two cameras.
         right_from_left: (4, 4) pose of the left camera in the axes of the right one.
         file: file of the calibration, for messages.
-        body_from_left: (4, 4) pose of the left camera in the body that a recorded truth refers to.
     """
 
     left: RecordedCamera
     right: RecordedCamera
     right_from_left: Array
     file: Path
-    body_from_left: Array | None = None
 
     @property
     def baseline_m(self) -> float:
@@ -87,11 +85,16 @@ def checked(calibration: StereoCalibration) -> StereoCalibration:
     for name, camera in (("left", calibration.left), ("right", calibration.right)):
         _check_camera(file, name, camera)
     pose = calibration.right_from_left
-    deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
-    if not deviation < _ORTHONORMAL or np.linalg.det(pose[:3, :3]) < 0:
+    if not is_rigid(pose):
         raise TwinError(file, "the rotation between the cameras is not a rotation matrix")
     _check_baseline(file, calibration)
     return replace(calibration, right_from_left=geometry.nearest_rigid(pose))
+
+
+def is_rigid(pose: Array) -> bool:
+    """Returns whether the rotation of a pose (4, 4) is a rotation matrix, up to the rounding of calibration files."""
+    deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
+    return bool(deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0)
 
 
 def _check_baseline(file: str, calibration: StereoCalibration) -> None:

@@ -73,7 +73,7 @@ def camera_from_kalibr(table: Any, file: Path) -> RecordedCamera:
     coefficients = table.get("distortion_coeffs", table.get("distortion_coefficients"))
     fx, fy, cx, cy = _numbers(table.get("intrinsics"), file, "intrinsics", (4,))
     distortion = _numbers([] if coefficients is None else coefficients, file, "distortion_coeffs").ravel()
-    kind = _kind(table.get("distortion_model", "radtan"), file)
+    kind = distortion_kind(table.get("distortion_model", "radtan"), file)
     return RecordedCamera(_size(table.get("resolution"), file), _matrix(fx, fy, cx, cy), distortion, kind)
 
 
@@ -89,7 +89,11 @@ def pose_of(table: Any, key: str, file: Path) -> Array:
 
 
 def _kalibr(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of a Kalibr camchain: cam0 is the left camera, cam1 the right one."""
+    """Returns the calibration of a Kalibr camchain: cam0 is the left camera, cam1 the right one.
+
+    Raises:
+        TwinError: cam1 is missing, or a camera or T_cn_cnm1 is not valid.
+    """
     if "cam1" not in tree:
         raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
     left, right = (camera_from_kalibr(tree[name], file) for name in ("cam0", "cam1"))
@@ -97,12 +101,18 @@ def _kalibr(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 
 
 def _opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of an OpenCV file: M1, D1, M2, D2, R, T and the image size."""
+    """Returns the calibration of an OpenCV file: M1, D1, M2, D2, R, T and the image size.
+
+    R may be a rotation matrix or a rotation vector; without R, the cameras are parallel.
+
+    Raises:
+        TwinError: T is missing, or a value is not of the expected form.
+    """
     keys = {str(key).lower().replace("_", ""): value for key, value in tree.items()}
     size = next((keys[key] for key in _SIZE_KEYS if key in keys), None)
     if size is None and {"imagewidth", "imageheight"} <= keys.keys():
         size = [keys["imagewidth"], keys["imageheight"]]
-    kind = _kind(keys.get("distortionmodel", "radtan"), file)
+    kind = distortion_kind(keys.get("distortionmodel", "radtan"), file)
     cameras = []
     for matrix_names, distortion_names in zip(_MATRIX_KEYS, _DISTORTION_KEYS, strict=True):
         matrix = next((keys[key] for key in matrix_names if key in keys), None)
@@ -126,7 +136,11 @@ def _opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 
 
 def _colmap(file: Path) -> StereoCalibration:
-    """Returns the calibration of a COLMAP cameras.txt; the pose of the second camera is in rigs.txt in its folder."""
+    """Returns the calibration of a COLMAP cameras.txt; the pose of the second camera is in rigs.txt in its folder.
+
+    Raises:
+        TwinError: there are fewer than two cameras or no rigs.txt, or a line of either file is not valid.
+    """
     cameras = dict(_colmap_camera(file, number, parts) for number, parts in text_rows(file))
     rigs = file.with_name("rigs.txt")
     if len(cameras) < 2 or not rigs.is_file():
@@ -146,6 +160,9 @@ def _colmap_camera(file: Path, number: int, parts: list[str]) -> tuple[int, Reco
     """Returns identifier and camera of a line of cameras.txt.
 
     COLMAP has the corner of the first pixel at (0, 0); in the returned camera, its centre is at (0, 0).
+
+    Raises:
+        TwinError: the line is not a camera, or its lens model is not supported.
     """
     model = parts[1] if len(parts) > 1 else ""
     if model not in _COLMAP:
@@ -156,7 +173,7 @@ def _colmap_camera(file: Path, number: int, parts: list[str]) -> tuple[int, Reco
         fx, fy, cx, cy = (values[k] for k in focal)
         distortion = np.array([0.0 if k is None else values[k] for k in distorted])
         size = _size([int(parts[2]), int(parts[3])], file)
-        camera = RecordedCamera(size, _matrix(fx, fy, cx - 0.5, cy - 0.5), distortion, _kind(kind, file))
+        camera = RecordedCamera(size, _matrix(fx, fy, cx - 0.5, cy - 0.5), distortion, distortion_kind(kind, file))
         return int(parts[0]), camera
     except (ValueError, IndexError):
         raise TwinError(f"{file}:{number}", "is not a camera", "CAMERA_ID MODEL WIDTH HEIGHT PARAMS") from None
@@ -187,15 +204,23 @@ def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = N
 
 
 def _size(value: Any, file: Path) -> tuple[int, int] | None:
-    """Returns an image size given as a list as (width, height) [px]; None for None."""
+    """Returns an image size [width, height] as a tuple [px]; None if the value is None."""
     if value is None:
         return None
     width, height = _numbers(value, file, "the image size", (2,))
     return int(width), int(height)
 
 
-def _kind(name: Any, file: Path) -> Any:
-    """Returns the kind of distortion that a calibration file names: "radtan" or "fisheye"."""
+def distortion_kind(name: Any, file: Path) -> Any:
+    """Returns the kind of distortion that a calibration names: "radtan" or "fisheye".
+
+    Args:
+        name: name of the lens model, for example "plumb_bob".
+        file: file or topic of the calibration, for messages.
+
+    Raises:
+        TwinError: the lens model is not supported.
+    """
     text = str(name).lower()
     if text in _FISHEYE or text in _RADTAN:
         return "fisheye" if text in _FISHEYE else "radtan"

@@ -2,40 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core.geometry import Array
+from twin.core.nearest import nearest_index
 from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration
+from twin.datasets.image_files import ImageSource
+from twin.errors import TwinError
 
 #: Largest time between the two images of a stereo pair, as a fraction of the median interval between left images [s].
 _PAIR_SHARE, _PAIR_MOST_S = 0.25, 0.01
+T = TypeVar("T")
 
 
 class ImageTime(NamedTuple):
-    """An image file and the time of its exposure [s], in the clock of the data set."""
+    """An image and the time of its exposure [s], in the clock of the data set."""
 
     time_s: float
-    file: Path
+    file: ImageSource
 
 
 class StereoImages(NamedTuple):
-    """Image files of one frame; `right` is None if no right image belongs to the left one.
+    """Images of one frame; `right` is None if no right image belongs to the left one.
 
     Args:
         time_s: time of the left image [s], in the clock of the data set.
-        left, right: image files.
+        left, right: image files, or images that are stored in another way.
     """
 
     time_s: float
-    left: Path
-    right: Path | None
+    left: ImageSource
+    right: ImageSource | None
 
 
 @dataclass(frozen=True)
@@ -43,21 +46,28 @@ class Dataset:
     """A recorded stereo data set.
 
     Args:
-        folder: folder of the data set; all images lie in it.
+        folder: folder or file of the data set; all images lie in it.
         images: frames in the order of the data set.
-        calibration: calibration of the cameras; None if the data set has none.
+        calibration: calibration of the cameras; None if the data set has none; a TwinError if it has one that cannot be
+            used, which is raised unless the user gives another calibration.
         truth: recorded poses of the left camera (before rectification), in the clock of the data set; None if the data
-            set has none. It is never given to the estimators.
+            set has none; a TwinError if it cannot be read, which is raised unless the user gives another truth. The
+            truth is never given to the estimators.
         n_right_only: number of right images without a left image.
         notes: sentences on the assumptions that the reader made.
+        frame_times_s: (n,) times of all frames, with or without a left image [s], in the clock of the data set; None:
+            the times of `images`.
+        body_from_left: (4, 4) pose of the left camera in the body that recorded poses refer to; None if unknown.
     """
 
     folder: Path
     images: Sequence[StereoImages]
-    calibration: StereoCalibration | None
-    truth: Trajectory | None = None
+    calibration: StereoCalibration | TwinError | None
+    truth: Trajectory | TwinError | None = None
     n_right_only: int = 0
     notes: tuple[str, ...] = ()
+    frame_times_s: Array | None = None
+    body_from_left: Array | None = None
 
 
 class Reader(Protocol):
@@ -71,20 +81,27 @@ class Reader(Protocol):
     name: str
     layout: str
 
-    name: str
-    layout: str
-
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder has this layout."""
+        """Returns whether a folder, or a file, has this layout."""
         ...
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; image files are not opened.
+        """Returns the data set in a folder or file; images are not decoded.
+
+        An error in the calibration or in the truth is returned in `Dataset`, not raised: the user may replace them.
 
         Raises:
-            TwinError: a file of the data set is missing or damaged.
+            TwinError: another file of the data set is missing or damaged.
         """
         ...
+
+
+def value_or_error(read: Callable[[], T]) -> T | TwinError:
+    """Returns the value that `read` returns, or the TwinError that it raises."""
+    try:
+        return read()
+    except TwinError as error:
+        return error
 
 
 def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple[list[StereoImages], int]:
@@ -106,11 +123,3 @@ def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple
         for one, k, ok in zip(left, nearest, paired, strict=True)
     ]
     return frames, len(right) - len(set(nearest[paired].tolist()))
-
-
-def nearest_index(sorted_s: Array, times_s: Array) -> NDArray[np.int64]:
-    """Returns the index (n,) of the element of the sorted times (m,) that is nearest to each of the times (n,)."""
-    after = np.clip(np.searchsorted(sorted_s, times_s), 1, max(len(sorted_s) - 1, 1))
-    last = len(sorted_s) - 1
-    low, high = np.minimum(after - 1, last), np.minimum(after, last)
-    return np.where(np.abs(sorted_s[high] - times_s) < np.abs(sorted_s[low] - times_s), high, low)

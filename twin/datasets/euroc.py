@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.records import Trajectory
-from twin.datasets.calibration import StereoCalibration, checked
+from twin.datasets.calibration import StereoCalibration, checked, is_rigid
 from twin.datasets.calibration_files import camera_from_kalibr, pose_of
-from twin.datasets.dataset import Dataset, ImageTime, pair_by_time
+from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
@@ -28,15 +29,21 @@ class EurocReader:
         return all((_root(folder) / camera / "data.csv").is_file() for camera in ("cam0", "cam1"))
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if one of its files is damaged."""
+        """Returns the data set in a folder; raises TwinError if a list of its images is damaged."""
         root = _root(folder)
-        frames, n_right_only = pair_by_time(*(_image_times(root / camera) for camera in ("cam0", "cam1")))
-        calibration = _calibration(root)
-        truth = None
+        left, right = (_image_times(root / camera) for camera in ("cam0", "cam1"))
+        frames, n_right_only = pair_by_time(left, right)
+        calibration = value_or_error(lambda: _calibration(root))
+        body = value_or_error(lambda: _body_from_left(root))
+        body_from_left = None if isinstance(body, TwinError) else body
+        truth, notes = None, ()
         file = next((root / name / "data.csv" for name in _TRUTH if (root / name / "data.csv").is_file()), None)
-        if file is not None and calibration is not None and calibration.body_from_left is not None:
-            truth = camera_truth(file, calibration.body_from_left)
-        return Dataset(folder, frames, calibration, truth, n_right_only)
+        if file is not None and body_from_left is not None:
+            truth = value_or_error(lambda: camera_truth(file, body_from_left))
+        elif file is not None:
+            notes = (f"The true poses ({file.parent.name}) are not used: the pose of cam0 in the body is unknown.",)
+        times_s = np.array([image.time_s for image in left])
+        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left)
 
 
 def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
@@ -64,7 +71,11 @@ def _root(folder: Path) -> Path:
 
 
 def _image_times(camera: Path) -> list[ImageTime]:
-    """Returns the times and files of the images of a camera, in the order of data.csv."""
+    """Returns the times and files of the images of a camera, in the order of data.csv.
+
+    Raises:
+        TwinError: a line is not a time and a file name, or the file is not in the folder of the camera.
+    """
     images, source = [], camera / "data.csv"
     for number, parts in text_rows(source):
         if len(parts) < 2 or not parts[0].strip().isdigit():
@@ -82,4 +93,19 @@ def _calibration(root: Path) -> StereoCalibration | None:
     left, right = (camera_from_kalibr(tree, file) for tree, file in zip(trees, files, strict=True))
     body_from_left, body_from_right = (pose_of(tree, "T_BS", file) for tree, file in zip(trees, files, strict=True))
     right_from_left = geometry.inverse(body_from_right) @ body_from_left
-    return checked(StereoCalibration(left, right, right_from_left, files[1], body_from_left))
+    return checked(StereoCalibration(left, right, right_from_left, files[1]))
+
+
+def _body_from_left(root: Path) -> Array | None:
+    """Returns the pose (4, 4) of cam0 in the body; None without its sensor.yaml.
+
+    Raises:
+        TwinError: the file is damaged, or the pose is not a rigid motion.
+    """
+    file = root / "cam0" / "sensor.yaml"
+    if not file.is_file():
+        return None
+    pose = pose_of(read_yaml(file), "T_BS", file)
+    if not is_rigid(pose):
+        raise TwinError(str(file), "T_BS is not a rigid motion", "a rotation matrix and a translation [m]")
+    return geometry.nearest_rigid(pose)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from twin.core.records import Frame, Image
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset
-from twin.datasets.image_files import Bayer, UnreadableImage, image_format, image_size, read_rgb
+from twin.datasets.image_files import Bayer, ImageSource, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.rectification import Rectification, rectification
 from twin.errors import TwinError
 
@@ -72,12 +71,12 @@ class RecordedFrames:
             )
             index += 1
 
-    def _read(self, file: Path | None, side: str) -> Image | None:
+    def _read(self, image: ImageSource | None, side: str) -> Image | None:
         """Returns an image; if it cannot be used, counts the reason in `skipped` and returns None."""
         try:
-            if file is None:
+            if image is None:
                 raise UnreadableImage("missing")
-            return read_rgb(file, self.size_px, self._format)
+            return read_rgb(image, self.size_px, self._format)
         except UnreadableImage as error:
             self.skipped[f"{side} image: {error}"] += 1
             return None

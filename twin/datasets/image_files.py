@@ -6,7 +6,7 @@ import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -40,27 +40,68 @@ class ImageFormat(NamedTuple):
     bayer: Bayer | None = None
 
 
-def image_size(file: Path) -> tuple[int, int]:
-    """Returns (width, height) of an image file [px], from its header.
+class StoredImage(Protocol):
+    """Image that is not a file of its own, for example a message of a bag."""
+
+    @property
+    def name(self) -> str:
+        """Returns a short name of the image, for messages."""
+        ...
+
+    def size_px(self) -> tuple[int, int]:
+        """Returns (width, height) [px].
+
+        Raises:
+            UnreadableImage: the image is damaged or of an unknown encoding.
+        """
+        ...
+
+    def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
+        """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR, uint8 or uint16.
+
+        Args:
+            size_px: (width, height) that the image must have.
+
+        Raises:
+            UnreadableImage: the image is damaged, of an unknown encoding or of another size.
+        """
+        ...
+
+
+#: An image of a data set: a PNG, JPEG or TIFF file, or an image that is stored in another way.
+ImageSource = Path | StoredImage
+
+
+def image_size(image: ImageSource) -> tuple[int, int]:
+    """Returns (width, height) of an image [px], from its header.
 
     Raises:
         UnreadableImage: the file is missing, too large or no image.
     """
-    return _header(_contents(file))[:2]
+    return encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
 
 
-def read_rgb(file: Path, size_px: tuple[int, int], form: ImageFormat) -> Image:
-    """Returns the image in a file as 8-bit RGB (H, W, 3).
+def encoded_size(data: bytes) -> tuple[int, int]:
+    """Returns (width, height) [px] of the contents of a PNG, JPEG or TIFF file, from its header.
+
+    Raises:
+        UnreadableImage: the data are no image.
+    """
+    return _header(data)[:2]
+
+
+def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) -> Image:
+    """Returns an image as 8-bit RGB (H, W, 3).
 
     Args:
-        file: PNG, JPEG or TIFF file.
+        image: PNG, JPEG or TIFF file, or an image that is stored in another way.
         size_px: (width, height) that the image must have.
         form: number of bits and Bayer pattern.
 
     Raises:
         UnreadableImage: the file is missing, truncated, no image, or has another size.
     """
-    pixels = _pixels(file, size_px)
+    pixels = _pixels(image, size_px)
     if pixels.dtype == np.uint16:
         pixels = np.clip(pixels.astype(np.float32) * (255 / (2**form.bits - 1)) + 0.5, 0, 255).astype(np.uint8)
     if form.bayer is not None and pixels.ndim == 2:
@@ -69,7 +110,7 @@ def read_rgb(file: Path, size_px: tuple[int, int], form: ImageFormat) -> Image:
     return np.asarray(cv2.cvtColor(pixels, codes[2 if pixels.ndim == 2 else pixels.shape[2]]), np.uint8)
 
 
-def image_format(files: Sequence[Path], size_px: tuple[int, int], bayer: Bayer | None) -> ImageFormat:
+def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer: Bayer | None) -> ImageFormat:
     """Returns the format of the images of a data set, from a sample of them.
 
     Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
@@ -77,9 +118,9 @@ def image_format(files: Sequence[Path], size_px: tuple[int, int], bayer: Bayer |
     data set, so that grey levels stay comparable.
     """
     largest = 0
-    for k in np.unique(np.linspace(0, len(files) - 1, _N_SAMPLES).astype(int)):
+    for k in np.unique(np.linspace(0, len(images) - 1, _N_SAMPLES).astype(int)):
         try:
-            pixels = _pixels(files[k], size_px)
+            pixels = _pixels(images[k], size_px)
         except UnreadableImage:
             continue
         if pixels.dtype == np.uint16:
@@ -88,7 +129,7 @@ def image_format(files: Sequence[Path], size_px: tuple[int, int], bayer: Bayer |
 
 
 def _contents(file: Path) -> bytes:
-    """Returns the bytes of a file."""
+    """Returns the bytes of a file; raises UnreadableImage if it is missing, too large or unreadable."""
     try:
         if not file.is_file():
             raise UnreadableImage("missing")
@@ -100,7 +141,11 @@ def _contents(file: Path) -> bytes:
 
 
 def _header(data: bytes) -> tuple[int, int, str]:
-    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it."""
+    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it.
+
+    Raises:
+        UnreadableImage: the data are no PNG, JPEG or TIFF image.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on damaged metadata, which are not used
@@ -110,9 +155,24 @@ def _header(data: bytes) -> tuple[int, int, str]:
         raise UnreadableImage("no image" if data else "empty file") from None
 
 
-def _pixels(file: Path, size_px: tuple[int, int]) -> NDArray[Any]:
+def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
     """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR, uint8 or uint16."""
-    data = _contents(file)
+    return decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
+
+
+def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
+    """Returns the values of the contents of a PNG, JPEG or TIFF file.
+
+    Args:
+        data: contents of the file.
+        size_px: (width, height) that the image must have.
+
+    Returns:
+        (H, W) or (H, W, channels) in the order BGR, uint8 or uint16.
+
+    Raises:
+        UnreadableImage: the data are truncated, no image, or have another size.
+    """
     width, height, kind = _header(data)
     if (width, height) != size_px or width * height > _MOST_PIXELS:
         raise UnreadableImage("another size")

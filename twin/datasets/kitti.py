@@ -10,7 +10,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
-from twin.datasets.dataset import Dataset, StereoImages
+from twin.datasets.dataset import Dataset, StereoImages, value_or_error
 from twin.datasets.plain_folder import image_files
 from twin.datasets.text_files import read_table, text_rows
 from twin.errors import TwinError
@@ -27,10 +27,15 @@ class KittiReader:
         return (folder / "calib.txt").is_file() and any((folder / f"image_{k}").is_dir() for k in (0, 2))
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if one of its files is damaged."""
+        """Returns the data set in a folder.
+
+        Raises:
+            TwinError: the list of times is damaged, or an image has no time in it.
+        """
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))
-        calibration = _calibration(folder / "calib.txt", number)
+        found = value_or_error(lambda: _calibration(folder / "calib.txt", number))
+        calibration, body_from_left = (found, None) if isinstance(found, TwinError) else found
         times_s = read_table(folder / "times.txt", 1)[:, 0]
         names = sorted(left.keys() | right.keys())
         if not all(name.isdigit() and int(name) < len(times_s) for name in names):
@@ -40,8 +45,13 @@ class KittiReader:
             StereoImages(float(times_s[int(name)]), left[name], right.get(name)) for name in names if name in left
         ]
         file = folder.parent.parent / "poses" / f"{folder.name}.txt"
-        truth = camera_poses(file, times_s, calibration.body_from_left) if file.is_file() else None
-        return Dataset(folder, frames, calibration, truth, len(right.keys() - left.keys()))
+        truth, notes = None, ()
+        if file.is_file() and body_from_left is not None:
+            truth = value_or_error(lambda: camera_poses(file, times_s, body_from_left))
+        elif file.is_file():
+            notes = (f"The true poses ({file.name}) are not used: the calibration of camera {number} is damaged.",)
+        n_right_only = len(right.keys() - left.keys())
+        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left)
 
 
 def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Trajectory:
@@ -66,8 +76,14 @@ def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Tr
     return Trajectory(times_s[: len(rows)], poses if body_from_left is None else poses @ body_from_left)
 
 
-def _calibration(file: Path, number: int) -> StereoCalibration:
-    """Returns the calibration of the cameras `number` and `number` + 1 from their projection matrices (3, 4)."""
+def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
+    """Returns the calibration of the cameras `number` and `number` + 1, and the pose (4, 4) of the first in camera 0.
+
+    Both follow from the projection matrices (3, 4) of the cameras.
+
+    Raises:
+        TwinError: the file has no such matrices, or their values are impossible.
+    """
     projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
     try:
         left, right = (np.array(projections[f"P{k}"], float).reshape(3, 4) for k in (number, number + 1))
@@ -77,6 +93,5 @@ def _calibration(file: Path, number: int) -> StereoCalibration:
         raise TwinError(str(file), "has no projection matrices of these cameras", allowed) from None
     left_camera, right_camera = (RecordedCamera(None, p[:, :3] / p[2, 2], np.zeros(0)) for p in (left, right))
     right_from_left = geometry.pose(np.eye(3), in_right - in_left)
-    return checked(
-        StereoCalibration(left_camera, right_camera, right_from_left, file, geometry.pose(np.eye(3), -in_left))
-    )
+    calibration = checked(StereoCalibration(left_camera, right_camera, right_from_left, file))
+    return calibration, geometry.pose(np.eye(3), -in_left)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
+from twin.datasets.calibration import StereoCalibration
 from twin.datasets.calibration_files import find_calibration, read_calibration
-from twin.datasets.dataset import Dataset, StereoImages
+from twin.datasets.dataset import Dataset, StereoImages, value_or_error
 from twin.datasets.text_files import inside, read_table
 from twin.errors import TwinError
 
@@ -26,7 +29,7 @@ class PlainFolderReader:
         return (folder / "left").is_dir() and (folder / "right").is_dir()
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if its calibration or its times are damaged."""
+        """Returns the data set in a folder; raises TwinError if its times are damaged."""
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
         times_s, notes = _times(folder / "times.txt", names)
@@ -35,9 +38,19 @@ class PlainFolderReader:
             for name, time_s in zip(names, times_s, strict=True)
             if name in left
         ]
-        file = find_calibration(folder)
-        calibration = None if file is None else read_calibration(file)
-        return Dataset(folder, frames, calibration, None, len(right.keys() - left.keys()), notes)
+        calibration = value_or_error(lambda: _calibration(folder))
+        n_right_only = len(right.keys() - left.keys())
+        return Dataset(folder, frames, calibration, None, n_right_only, notes, np.array(times_s))
+
+
+def _calibration(folder: Path) -> StereoCalibration | None:
+    """Returns the calibration of a folder; None if it has no calibration file.
+
+    Raises:
+        TwinError: the calibration file is damaged, or the folder has several (`find_calibration`).
+    """
+    file = find_calibration(folder)
+    return None if file is None else read_calibration(file)
 
 
 def image_files(folder: Path) -> dict[str, Path]:

@@ -2,50 +2,96 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+from twin.datasets.bag_reader import BagReader, BagTopics
 from twin.datasets.dataset import Dataset, Reader
 from twin.datasets.euroc import EurocReader
 from twin.datasets.kitti import KittiReader
 from twin.datasets.plain_folder import PlainFolderReader
 from twin.errors import TwinError
-
-#: Group of entry points under which another package registers a reader: a class without arguments (`dataset.Reader`).
-ENTRY_POINTS = "twin.readers"
+from twin.plugin import loading
 
 
-def all_readers() -> list[Reader]:
+def all_readers(topics: BagTopics | None = None) -> list[Reader]:
     """Returns the readers that other packages register, then those of this package.
+
+    Args:
+        topics: topics of a ROS 2 bag that the user names.
 
     Raises:
         TwinError: a registered reader cannot be imported.
     """
-    return [*_registered(), EurocReader(), KittiReader(), PlainFolderReader()]
+    return [*_registered(), BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
 
 
 def _registered() -> list[Reader]:
     """Returns the readers that other packages register."""
-    found: list[Reader] = []
-    for entry in entry_points(group=ENTRY_POINTS):
+    return [_created(plugin) for plugin in loading.registered(loading.READERS)]
+
+
+def _created(plugin: loading.Registered) -> Reader:
+    """Returns a reader of another package; raises TwinError if its class fails or it lacks a member of `Reader`."""
+    return loading.attempt(
+        f"{loading.READERS} {plugin.name}", plugin.target, lambda: _ForeignReader(plugin.create(), plugin.target)
+    )
+
+
+class _ForeignReader:
+    """Reader of another package; errors of the reader become a TwinError that names it.
+
+    Args:
+        reader: the reader.
+        value: module and class of the reader, for messages.
+
+    Raises:
+        AttributeError: the reader has no name, layout, recognises or read.
+    """
+
+    def __init__(self, reader: Reader, value: str):
+        self.name, self.layout, self._value = str(reader.name), str(reader.layout), value
+        self._recognises, self._read = reader.recognises, reader.read
+
+    def recognises(self, folder: Path) -> bool:
+        """Returns whether a folder or file has the layout of the reader."""
+        return bool(self._call(self._recognises, folder))
+
+    def read(self, folder: Path) -> Dataset:
+        """Returns the data set; raises TwinError if the reader fails or returns a value that is not a `Dataset`."""
+        found = self._call(self._read, folder)
+        if not isinstance(found, Dataset):
+            problem = f"{self._value} returned {type(found).__name__}"
+            raise TwinError(f"{loading.READERS} {self.name}", problem, "twin.datasets.dataset.Dataset")
+        return found
+
+    def _call(self, function: Callable[[Path], Any], folder: Path) -> Any:
+        """Returns the result of a function of the reader; converts any error of the function to TwinError."""
         try:
-            found.append(entry.load()())
+            return function(folder)
+        except TwinError:
+            raise
         except Exception as error:  # any error of code that is not ours
-            raise TwinError(f"{ENTRY_POINTS} {entry.name}", f"{entry.value}: {error!r}", "a reader") from None
-    return found
+            problem = f"{self._value}: {' '.join(repr(error).split())[:200]}"
+            raise TwinError(f"{loading.READERS} {self.name}", problem, "a reader that raises TwinError") from None
 
 
-def read_dataset(folder: Path) -> tuple[Dataset, str]:
-    """Returns the data set in a folder and the name of its reader.
+def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset, str]:
+    """Returns the data set in a folder or file, and the name of its reader.
+
+    Args:
+        folder: folder of the data set, or its file (a bag).
+        topics: topics of a ROS 2 bag that the user names.
 
     Raises:
         TwinError: the folder is empty or has no known layout, or a file of the data set is damaged.
     """
-    if not folder.is_dir():
-        raise TwinError(str(folder), "is not a folder", "the folder of a data set")
-    if not any(folder.iterdir()):
+    if not folder.exists():
+        raise TwinError(str(folder), "does not exist", "the folder or the bag of a data set")
+    if folder.is_dir() and not any(folder.iterdir()):
         raise TwinError(str(folder), "is empty", "the folder of a data set")
-    readers = all_readers()
+    readers = all_readers(topics)
     for reader in readers:
         if reader.recognises(folder):
             dataset = reader.read(folder)

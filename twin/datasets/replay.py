@@ -13,10 +13,12 @@ import numpy as np
 
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
+from twin.core.paths import is_file
 from twin.core.records import ElevationMap, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import Stopwatch, timing_summary
-from twin.datasets.calibration import StereoCalibration
+from twin.datasets.bag import is_bag
+from twin.datasets.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset
 from twin.datasets.frames import RecordedFrames
@@ -29,7 +31,7 @@ from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, in
 from twin.estimate.pipeline import finish_in_stage
 from twin.estimate.self_check import check_survey
 from twin.judge import recorded
-from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay
+from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay, unevaluated_replay
 from twin.report.replay_description import describe_replay
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder, SurveyRecord
 
@@ -46,13 +48,14 @@ class ReplayOptions:
 
     Args:
         calibration: calibration file; None: that of the data set.
-        truth: file of true poses; None: that of the data set, if it has one.
+        truth: file of true poses, or for a ROS 2 bag the topic of true poses; None: that of the data set.
         alignment: how the estimates are moved to the truth before the comparison.
         bayer: pattern of raw images; None: grey or colour images.
         settings: settings of the estimators; None: the defaults.
         start: (4, 4) pose world_from_camera of the left camera at the first frame; None: the plane z = 0 of the world
             is fitted to the floor in the first pair.
         outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
+        topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
     """
 
     calibration: Path | None = None
@@ -62,6 +65,7 @@ class ReplayOptions:
     settings: EstimatorSettings | None = None
     start: Array | None = None
     outputs: Collection[str] = OPTIONAL_OUTPUTS
+    topics: tuple[str, str] | None = None
 
 
 class ReplayResult(NamedTuple):
@@ -110,7 +114,7 @@ def replay(
     An interrupt (Ctrl-C) ends the current stage; the other stages are completed.
 
     Args:
-        folder: folder of the data set.
+        folder: folder of the data set, or a ROS 2 bag.
         out: run folder to write.
         options: options of the replay.
         progress: called with the stage ("replay", "map" or "report") and its completed fraction.
@@ -142,7 +146,8 @@ def replay(
             )
         progress("report", 0.0)
         evaluation = _evaluation(opened, chosen, result, elevation, guard)
-        metrics = evaluate_replay(replace(evaluation, timing=_timing(start_s, result, stopwatch)))
+        evaluation = replace(evaluation, timing=_timing(start_s, result, stopwatch))
+        metrics = guard.attempt("evaluation", lambda: evaluate_replay(evaluation)) or unevaluated_replay(evaluation)
         record = SurveyRecord(
             result, elevation, None, None, stopwatch, metrics, recorded_truth=_truth_of_frames(opened, chosen, result)
         )
@@ -159,11 +164,29 @@ def alignment_name(name: str) -> AlignmentName:
 
 
 def bayer_pattern(name: str | None) -> Bayer | None:
-    """Returns the Bayer pattern of this name, None for None; raises TwinError if there is none."""
+    """Returns the Bayer pattern of a name; None if `name` is None.
+
+    Raises:
+        TwinError: no pattern has this name.
+    """
     for allowed in (None, *BAYER):
         if name == allowed:
             return allowed
     raise TwinError("--bayer", f"{str(name)[:40]!r} is not a Bayer pattern", ", ".join(BAYER))
+
+
+def image_topics(text: str | None) -> tuple[str, str] | None:
+    """Returns the topics of the left and the right images from the text `LEFT,RIGHT`; None if `text` is None.
+
+    Raises:
+        TwinError: the text is not two different topics.
+    """
+    if text is None:
+        return None
+    topics = [part.strip() for part in text.split(",")]
+    if len(topics) != 2 or not all(topics) or topics[0] == topics[1]:
+        raise TwinError("--topics", f"{text[:100]!r} is not two topics", "LEFT,RIGHT")
+    return topics[0], topics[1]
 
 
 def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
@@ -173,14 +196,16 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
         TwinError: there is no calibration or no usable pair, the cameras are swapped, the calibration or the truth does
             not fit the images, or a file is damaged.
     """
-    dataset, reader = read_dataset(folder)
+    in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
+    left, right = options.topics or (None, None)
+    dataset, reader = read_dataset(folder, BagTopics(left, right, str(options.truth) if in_bag else None))
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
+    if isinstance(calibration, TwinError):
+        raise calibration
     if calibration is None:
         raise TwinError(str(folder), "has no calibration", "--calibration FILE (OpenCV, Kalibr or COLMAP)")
-    if options.calibration is not None and dataset.calibration is not None:
-        calibration = replace(calibration, body_from_left=dataset.calibration.body_from_left)
     frames = RecordedFrames(dataset, calibration, options.bayer)
-    truth = _truth(dataset, calibration, frames, options.truth)
+    truth = _truth(dataset, frames, None if in_bag else options.truth)
     first = frames.first_pair()
     pair = inspect_pair(first, frames.rectification.rig, options.settings)
     if pair.swapped:
@@ -193,15 +218,15 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane)
 
 
-def _truth(
-    dataset: Dataset, calibration: StereoCalibration, frames: RecordedFrames, file: Path | None
-) -> Trajectory | None:
+def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
     """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
 
     Raises:
         TwinError: the file of the truth is damaged or its times do not fit those of the frames.
     """
-    truth = dataset.truth if file is None else read_truth(file, dataset, calibration)
+    truth = dataset.truth if file is None else read_truth(file, dataset)
+    if isinstance(truth, TwinError):
+        raise truth
     if truth is None:
         return None
     moved = Trajectory(

@@ -25,7 +25,11 @@ class _CalibrationLoader(yaml.SafeLoader):
 
 
 def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows."""
+    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows.
+
+    Raises:
+        YAMLError: the number of values is not rows times columns, or is too large.
+    """
     assert isinstance(node, yaml.MappingNode)
     matrix = loader.construct_mapping(node, deep=True)
     data, rows, cols = matrix["data"], int(matrix["rows"]), int(matrix["cols"])
@@ -35,7 +39,11 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
 
 
 def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list."""
+    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list.
+
+    Raises:
+        YAMLError: the array is empty or too large.
+    """
     assert isinstance(node, yaml.MappingNode)
     array = loader.construct_mapping(node, deep=True)
     if not 0 < len(array["data"]) <= _MOST_ELEMENTS:
@@ -106,7 +114,10 @@ def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[flo
 
 
 def text_rows(file: Path) -> list[tuple[int, list[str]]]:
-    """Returns line number and columns of each line of a text file that is not empty and does not begin with #."""
+    """Returns the line number and the columns of each line of a text file, without blank lines and comments (#).
+
+    Columns are separated by commas or white space.
+    """
     lines = read_text(file).splitlines()
     return [
         (number, next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split())

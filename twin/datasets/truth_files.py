@@ -8,7 +8,6 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.records import Trajectory
-from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset
 from twin.datasets.euroc import camera_truth
 from twin.datasets.kitti import camera_poses
@@ -18,14 +17,15 @@ from twin.errors import TwinError
 _ALLOWED = "TUM (8 columns), KITTI (12 columns) or EuRoC (timestamp in ns and 7 or more columns, by commas)"
 
 
-def read_truth(file: Path, dataset: Dataset, calibration: StereoCalibration) -> Trajectory:
+def read_truth(file: Path, dataset: Dataset) -> Trajectory:
     """Returns the true poses of the left camera, in the clock of the data set.
 
     Args:
         file: EuRoC/ASL data.csv (poses of the body), KITTI poses (camera 0, one line per frame), or TUM (poses of the
             left camera: time x y z qx qy qz qw).
-        dataset: data set, for the times of a KITTI file.
-        calibration: calibration, for the pose of the left camera in the body.
+        dataset: data set, for the times of a KITTI file (those of all frames, also of frames without a left image) and
+            for the pose of the left camera in the body or in camera 0. If this pose is unknown, the left camera is
+            taken to coincide with the body or with camera 0.
 
     Raises:
         TwinError: the file cannot be read or is of another kind.
@@ -35,16 +35,23 @@ def read_truth(file: Path, dataset: Dataset, calibration: StereoCalibration) -> 
         raise TwinError(str(file), "has no poses", _ALLOWED)
     columns, first = len(rows[0][1]), rows[0][1][0].strip()
     if columns == 12:
-        return camera_poses(file, np.array([frame.time_s for frame in dataset.images]), calibration.body_from_left)
+        times_s = dataset.frame_times_s
+        if times_s is None:
+            times_s = np.array([frame.time_s for frame in dataset.images])
+        return camera_poses(file, times_s, dataset.body_from_left)
     if columns >= 8 and first.isdigit() and len(first) >= 16:
-        return camera_truth(file, np.eye(4) if calibration.body_from_left is None else calibration.body_from_left)
+        return camera_truth(file, np.eye(4) if dataset.body_from_left is None else dataset.body_from_left)
     if columns == 8:
         return _tum(file)
     raise TwinError(str(file), f"has {columns} columns", _ALLOWED)
 
 
 def _tum(file: Path) -> Trajectory:
-    """Returns the poses in a TUM trajectory file."""
+    """Returns the poses in a TUM trajectory file.
+
+    Raises:
+        TwinError: the file cannot be read, or a quaternion is not of unit length.
+    """
     values = read_table(file, 8)
     if not (np.abs(np.linalg.norm(values[:, 4:], axis=1) - 1) < 0.01).all():
         raise TwinError(str(file), "has quaternions that are not of unit length", "time x y z qx qy qz qw")

@@ -20,7 +20,7 @@ _LARGEST_OVERLAP = 0.95  # larger overlaps occur where the vehicle keeps station
 #: Sum of the covariances between the errors of a patch in different links, as a fraction of the sum for errors that are
 #: equal in all links over the patch: 0.15 to 0.32 in eight surveys at five places of a reef (`horseshoe`), measured
 #: against the truth.
-_RECURRENCE = 0.25
+RECURRENCE = 0.25
 #: Standard error of `Motion.residual` times the root of the number of points: 1 / (2 f(m) m), with f the density of the
 #: chi distribution with three degrees of freedom and m its median.
 _RESIDUAL_STANDARD_ERROR = 0.562
@@ -114,10 +114,10 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     common. The variance of the summed error is then that of independent errors times
     1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), with l < m. In fact the shifts are only partly the same, because not
     all corners are selected again and M changes with the viewing direction. The covariance is therefore also multiplied
-    by 1 + c s (m - 1), with c = `_RECURRENCE`. Links that span several nodes have the same m, because one such link
+    by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because one such link
     starts at every node.
     """
-    growth = _RECURRENCE * (_links_over_a_footprint(links) - 1)
+    growth = RECURRENCE * (_links_over_a_footprint(links) - 1)
     factors = [len(links) * (1 + growth * link.floor_share) for link in links]
     return [link._replace(cov=link.cov * k, shared_by=k) for link, k in zip(links, factors, strict=True)]
 

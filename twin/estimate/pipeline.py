@@ -261,6 +261,9 @@ class Navigator:
         history = self.network.history
         residuals = np.array(history.link_residuals)
         failed = np.isnan(residuals)
+        nodes = self.network.nodes
+        poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
+        n_views = disparity_offset.mean_views(poses, depth_m, self.rig)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
             nodes_bridged=history.nodes_bridged,
@@ -271,7 +274,7 @@ class Navigator:
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
             disparity_offset=disparity_offset.combine(
-                history.disparity_offsets, len(self.network.nodes) - 1, self.rig.focal_px
+                history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
             ),
         )
 

@@ -1,4 +1,4 @@
-"""Checks of a survey without the truth: reasons why its result must not be trusted.
+"""Checks of a survey that need no truth; a failed check is a reason not to trust the result.
 
 Each check compares a quantity that the estimators measure with a limit. The limits lie between the values of ordinary
 surveys, whose errors agree with their covariances (generated and photographed floors, Jerlov types I to 3C), and the

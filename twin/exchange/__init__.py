@@ -1,1 +1,1 @@
-"""File formats shared with other tools: GeoTIFF, GLB, and g2o and TORO pose graphs."""
+"""Files of other programs: maps, meshes and point clouds, pose graphs, data sets, calibrations and ROS 2 bags."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,8 @@ import yaml
 
 from twin.core import geometry
 from twin.core.records import Frame, StereoRig, Trajectory
+from twin.exchange.image_copy import copy_image
+from twin.exchange.run_contents import RecordedFrame, RunContents
 
 _FIRST_NS = 1_000_000_000  # time of a frame at 0 s: EuRoC has no times of zero
 
@@ -35,7 +38,11 @@ class EurocWriter:
             (self.root / camera / "data.csv").write_text("#timestamp [ns],filename\n", encoding="utf-8")
 
     def add(self, frame: Frame) -> None:
-        """Writes the images of a frame; the right one may be missing."""
+        """Writes the images of a frame; the right one may be missing.
+
+        Raises:
+            OSError: an image cannot be written.
+        """
         for camera, image in (("cam0", frame.left), ("cam1", frame.right)):
             if image is not None:
                 name = f"{timestamp_ns(frame.time_s)}{self._suffix}"
@@ -44,6 +51,19 @@ class EurocWriter:
                     raise OSError(f"{name} cannot be written")
                 with (self.root / camera / "data.csv").open("a", encoding="utf-8") as file:
                     file.write(f"{timestamp_ns(frame.time_s)},{name}\n")
+
+    def add_recorded(self, frame: RecordedFrame) -> None:
+        """Adds the image files of a recorded frame; the right one may be missing.
+
+        Raises:
+            OSError: an image cannot be read or written.
+        """
+        for camera, file in (("cam0", frame.left), ("cam1", frame.right)):
+            if file is not None:
+                stamp = timestamp_ns(frame.time_s)
+                name = copy_image(file, self.root / camera / "data" / str(stamp), self._quality).name
+                with (self.root / camera / "data.csv").open("a", encoding="utf-8") as lines:
+                    lines.write(f"{stamp},{name}\n")
 
     def add_truth(self, truth: Trajectory) -> None:
         """Writes the true poses of the left camera as poses of the body."""
@@ -71,6 +91,43 @@ class EurocWriter:
         }
         text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
         (self.root / camera / "sensor.yaml").write_text(text, encoding="utf-8")
+
+
+def export(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes images, calibration, sensor readings and the truth, if known, into `folder`/mav0; returns that path.
+
+    The readings are those of the pressure sensor, AHRS, DVL and USBL that were recorded. The truth consists of the
+    poses of the body at all frames of the survey, including those without a recorded image.
+    """
+    writer = EurocWriter(folder, contents.rig, contents.jpeg_quality)
+    for k, frame in enumerate(contents.frames):
+        writer.add_recorded(frame)
+        contents.progress((k + 1) / len(contents.frames))
+    if "truth" in contents.trajectories:
+        writer.add_truth(contents.trajectories["truth"])
+    _write_readings(writer.root, contents.frames)
+    return [writer.root]
+
+
+def _write_readings(root: Path, frames: Sequence[RecordedFrame]) -> None:
+    """Writes the readings of each sensor that was recorded: pressure0, ahrs0, dvl0, usbl0, each with data.csv."""
+    sensors = {
+        "pressure0": ("height of the left camera above z = 0 [m]", lambda r: r.pressure_z_m),
+        "ahrs0": ("roll [rad],pitch [rad],yaw [rad]", lambda r: r.ahrs_rpy_rad),
+        "dvl0": ("forward [m s^-1],left [m s^-1],up [m s^-1]", lambda r: r.dvl_mps),
+        "usbl0": ("x [m],y [m],z [m]", lambda r: r.usbl_m),
+    }
+    for name, (columns, reading) in sensors.items():
+        rows = [(frame.time_s, reading(frame.readings)) for frame in frames]
+        lines = [
+            ",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in np.atleast_1d(values))])
+            for time_s, values in rows
+            if values is not None
+        ]
+        if lines:
+            (root / name).mkdir(exist_ok=True)
+            text = "\n".join([f"#timestamp [ns],{columns}", *lines, ""])
+            (root / name / "data.csv").write_text(text, encoding="utf-8")
 
 
 def timestamp_ns(time_s: float) -> int:

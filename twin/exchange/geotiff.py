@@ -20,6 +20,7 @@ from rasterio.transform import Affine
 from twin.core.georeference import Georeference
 from twin.core.orthomosaic import OrthoTile
 from twin.core.records import ElevationMap, Image, MapGrid
+from twin.errors import TwinError
 
 Layer = NDArray[np.float32]
 
@@ -57,10 +58,10 @@ def write_elevations(
     if georeference is None:
         return write_layer(path, height_m, grid, description)
     elevations = height_m.astype(np.float64) + georeference.elevation_m
-    with rasterio.open(path, "w", **_profile(grid, 1, "float64", georeference), nodata=np.nan, predictor=3) as file:
+    with rasterio.open(path, "w", **profile(grid, 1, "float64", georeference), nodata=np.nan, predictor=3) as file:
         file.write(elevations, 1)
         file.set_band_description(1, description)
-        file.update_tags(**_tags(georeference))
+        file.update_tags(**placement_tags(georeference))
         file.update_tags(1, **_ELEVATION_TAG)
 
 
@@ -68,29 +69,29 @@ def write_layer(
     path: Path, values: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
     """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
-    with rasterio.open(path, "w", **_profile(grid, 1, "float32", georeference), nodata=np.nan, predictor=3) as file:
+    with rasterio.open(path, "w", **profile(grid, 1, "float32", georeference), nodata=np.nan, predictor=3) as file:
         file.write(values.astype(np.float32), 1)
         file.set_band_description(1, description)
-        file.update_tags(**_tags(georeference))
+        file.update_tags(**placement_tags(georeference))
 
 
 def write_masks(
     path: Path, masks: dict[str, NDArray[Any]], grid: MapGrid, georeference: Georeference | None = None
 ) -> None:
     """Writes layers (rows, cols) of integers or flags as uint16, one band each; the keys describe the bands."""
-    with rasterio.open(path, "w", **_profile(grid, len(masks), "uint16", georeference)) as file:
+    with rasterio.open(path, "w", **profile(grid, len(masks), "uint16", georeference)) as file:
         for band, (description, values) in enumerate(masks.items(), start=1):
             file.write(values.astype(np.uint16), band)
             file.set_band_description(band, description)
-        file.update_tags(**_tags(georeference))
+        file.update_tags(**placement_tags(georeference))
 
 
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
     """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
-    profile = _profile(grid, 3, "uint8", georeference)
-    with rasterio.open(path, "w", **profile, nodata=0, photometric="RGB") as file:
+    layout = profile(grid, 3, "uint8", georeference)
+    with rasterio.open(path, "w", **layout, nodata=0, photometric="RGB") as file:
         file.write(np.moveaxis(mosaic, 2, 0))
-        file.update_tags(**_tags(georeference))
+        file.update_tags(**placement_tags(georeference))
 
 
 class OrthomosaicFile:
@@ -106,10 +107,10 @@ class OrthomosaicFile:
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
         self._path = path
-        profile = _profile(grid, 4, "uint8", georeference) | {"tiled": True, "blockxsize": 256, "blockysize": 256}
-        self._file = rasterio.open(path, "w", **profile, photometric="RGB", alpha="unspecified")
+        layout = profile(grid, 4, "uint8", georeference) | {"tiled": True, "blockxsize": 256, "blockysize": 256}
+        self._file = rasterio.open(path, "w", **layout, photometric="RGB", alpha="unspecified")
         self._file.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-        self._file.update_tags(**_tags(georeference))
+        self._file.update_tags(**placement_tags(georeference))
 
     def __enter__(self) -> OrthomosaicFile:
         return self
@@ -129,7 +130,8 @@ class OrthomosaicFile:
 def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     """Returns the grid of an open raster in scene coordinates, and the offset to subtract from its values [m].
 
-    The offset is the elevation of the scene origin if the raster holds elevations in a vertical datum, otherwise 0.
+    The offset is the elevation of the scene origin if the tags of the raster state that its values include it,
+    otherwise 0.
 
     Raises:
         ValueError: the raster is rotated or its cells are not square.
@@ -147,7 +149,50 @@ def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     return MapGrid(west, north, cell_m, source.height, source.width), origin.elevation_m if elevations else 0.0
 
 
-def _profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
+def read_georeference(path: Path) -> Georeference | None:
+    """Returns the position of the scene in the CRS of a map file; None if the file is in local coordinates.
+
+    Raises:
+        TwinError: the file cannot be read, or its tags are damaged.
+    """
+    try:
+        with rasterio.open(path) as source:
+            tags, crs = source.tags(), source.crs
+        if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
+            return None
+        easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
+        unit_m, datum = float(tags[_UNIT_TAG]), tags.get("VERTICAL_DATUM", "")
+    except (OSError, ValueError) as error:
+        raise TwinError(str(path), f"cannot be read: {error}", "a map file, written by `twin run`") from None
+    return Georeference(easting, northing, elevation_m, None if crs is None else crs.to_wkt(), unit_m, datum)
+
+
+def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeference:
+    """Returns the georeference of a scene whose origin lies at given coordinates of a projected CRS.
+
+    Args:
+        crs: CRS as `EPSG:CODE`, WKT or PROJ text, with metres or another unit of length.
+        origin: easting and northing in the unit of the CRS, and elevation [m] of the scene origin.
+
+    Raises:
+        TwinError: the CRS is unknown or not projected.
+    """
+    try:
+        known = CRS.from_user_input(crs)
+    except ValueError as error:
+        raise TwinError("--crs", f"{crs[:60]!r} is not a CRS: {error}", "such as EPSG:32633") from None
+    if not known.is_projected:
+        raise TwinError("--crs", f"{crs[:60]!r} is not a projected CRS", "a CRS with eastings and northings")
+    return Georeference(*origin, crs_wkt=known.to_wkt(), metres_per_unit=float(known.linear_units_factor[1]))
+
+
+def crs_of(georeference: Georeference | None) -> CRS:
+    """Returns the CRS of a georeference; `LOCAL_METRES` if there is no georeference or it does not name a CRS."""
+    wkt = None if georeference is None else georeference.crs_wkt
+    return LOCAL_METRES if wkt is None else CRS.from_wkt(wkt)
+
+
+def profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
     """Returns the rasterio profile of a GeoTIFF file on `grid`."""
     origin = georeference or Georeference(0.0, 0.0)
     west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))
@@ -158,13 +203,13 @@ def _profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference |
         "height": grid.rows,
         "count": bands,
         "dtype": dtype,
-        "crs": LOCAL_METRES if origin.crs_wkt is None else CRS.from_wkt(origin.crs_wkt),
+        "crs": crs_of(origin),
         "transform": Affine(cell, 0, west, 0, -cell, north),
         "compress": "deflate",
     }
 
 
-def _tags(georeference: Georeference | None) -> dict[str, str]:
+def placement_tags(georeference: Georeference | None) -> dict[str, str]:
     """Returns the tags that hold the scene origin, the unit and the vertical datum; empty without a georeference."""
     if georeference is None:
         return {}

@@ -166,7 +166,7 @@ def _check_definite(path: Path, part: Rows, information: Array) -> None:
 
 
 class _Problem(NamedTuple):
-    """A problem in some lines: mask (n,) of the lines, description ("" = no problem), and what is allowed."""
+    """A problem in some lines: mask (n,) of the lines, description ("" = no problem), and allowed values."""
 
     rows: NDArray[np.bool_]
     text: str

@@ -109,7 +109,7 @@ def _rays(rig: StereoRig, down_px: Array, across_px: Array) -> Array:
 
 
 def table_range_m() -> Array:
-    """Returns the ranges of the table (RANGES + 1,) [m]; the last one is infinite."""
+    """Returns the ranges (RANGES + 1,) at which the backscatter is tabulated [m]; the last one is infinite."""
     x = np.arange(RANGES) / RANGES
     return np.append(RANGE_SCALE_M * x / (1 - x), np.inf)
 

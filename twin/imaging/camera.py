@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,8 +14,10 @@ from twin.core.records import Exposure, Image
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
 from twin.imaging.lens_psf import LensPsf
+from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.photo_sensor import PhotoSensor, Sensor, sensor_of
 from twin.imaging.pixels import Raw
+from twin.imaging.row_parallel import in_pair
 from twin.imaging.sensor import ExposureSetting, Radiance
 from twin.imaging.shutter import ExposureMotion, integrate
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
@@ -56,6 +59,7 @@ class DecomposedImage(NamedTuple):
         raw: digital numbers of the physical sensor, including the noise that the next capture will have; (H, W) with a
             Bayer filter, otherwise (H, W, 3); None for the plain sensor.
         linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
+        objects: normals and labels (H, W) of the objects in the image; None without objects.
     """
 
     albedo: Image
@@ -65,11 +69,25 @@ class DecomposedImage(NamedTuple):
     noise_free: Image
     raw: Raw | None
     linear: bool
+    objects: ObjectView | None = None
 
     @property
     def gain(self) -> float:
         """Image signal per unit of radiance on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
         return self.setting.gain
+
+
+class _View(NamedTuple):
+    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and the objects in view, None without objects.
+
+    `pose` is that of the left camera, with the time.
+    """
+
+    pose: StampedPose
+    camera: int
+    albedo: Image
+    depth: Depth
+    objects: ObjectView | None
 
 
 class StereoCamera:
@@ -120,27 +138,59 @@ class StereoCamera:
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
         self._n_captures += 1
-        left, depth_left, setting = self._expose(pose, 0, twist_body, None)
+        cameras = (0, 1) if stereo else (0,)
+        views = [self._render(pose, camera) for camera in cameras]
+        with self._stopwatch("optics"):
+            if stereo:
+                metered, right_floor = in_pair(lambda: self._metered(views[0]), lambda: self._floor(views[1]))
+            else:
+                metered, right_floor = self._metered(views[0]), None
+            floor, at_rest, setting = metered
+            expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
+            if right_floor is None:
+                left, right = expose(views[0], floor, at_rest), None
+            else:
+                left, right = in_pair(
+                    lambda: expose(views[0], floor, at_rest), lambda: expose(views[1], right_floor, None)
+                )
+            depths = [self._cameras.crop(view.depth) for view in views]
         exposure = self._sensor.signal_per_cd(setting)
-        if not stereo:
-            return StereoCapture(left, None, depth_left, None, exposure)
-        right, depth_right, _ = self._expose(pose, 1, twist_body, setting)
-        return StereoCapture(left, right, depth_left, depth_right, exposure)
+        return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
+
+    def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
+        """Returns the left and the right image at the time of the last capture; has no effect on later captures.
+
+        The noise is that of the next capture.
+
+        Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        """
+        kept = self._sensor, self._rngs, self._n_captures
+        self._sensor, self._rngs = copy.deepcopy(kept[:2])
+        self._n_captures = max(self._n_captures - 1, 0)
+        try:
+            captured = self.capture(world_from_left, True, twist_body)
+        finally:
+            self._sensor, self._rngs, self._n_captures = kept
+        assert captured.right is not None
+        return captured.left, captured.right
 
     def twist_of_camera(self, camera: int, twist_body: Array) -> Array:
         """Returns the [angular, linear] velocity (6,) of a camera (0 left, 1 right) in its own axes [rad/s, m/s]."""
         return self._camera_from_body_twist[camera] @ twist_body
 
-    def decompose(self, world_from_left: Array, twist_body: Array = AT_REST) -> DecomposedImage:
-        """Returns the left image at a pose and time 0 with intermediate results; has no effect on later captures.
+    def decompose(self, world_from_left: Array, twist_body: Array = AT_REST, time_s: float = 0.0) -> DecomposedImage:
+        """Returns the left image at a pose and time with intermediate results; has no effect on later captures.
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
             twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
                 image and the digital numbers, not the components.
+            time_s: time since the start of the survey, at which snow, waves and swaying plants are drawn.
         """
         albedo, depth = self._renderer.render(world_from_left)
-        pose = StampedPose(world_from_left, 0.0)
+        pose = StampedPose(world_from_left, time_s)
         objects = self._image_formation.draw_objects(albedo, depth, 0, pose)
         components = self._image_formation.components(albedo, depth, 0, pose, objects)
         cameras = self._cameras
@@ -154,28 +204,38 @@ class StereoCamera:
         raw = sensor.raw(light, setting, next_rng) if isinstance(sensor, PhotoSensor) else None
         cropped = {name: cameras.crop(part) for name, part in components._asdict().items() if part is not None}
         components = components._replace(**cropped)
+        shown = None if objects is None else ObjectView(*(cameras.crop(layer) for layer in objects))
         return DecomposedImage(
-            cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw, self._linear
+            cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw, self._linear, shown
         )
 
-    def _expose(
-        self, pose: StampedPose, camera: int, twist_body: Array, setting: ExposureSetting | None
-    ) -> tuple[Image, Depth, ExposureSetting]:
-        """Returns image, true depth and exposure of one camera; meters the exposure if `setting` is None."""
+    def _render(self, pose: StampedPose, camera: int) -> _View:
+        """Returns the rendered view of a camera, with the objects."""
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
         with self._stopwatch("render"):
             albedo, depth = self._renderer.render(world_from_camera)
             objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
-        with self._stopwatch("optics"):
-            floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
-            at_rest = None
-            if setting is None:
-                at_rest = self._with_snow(floor, depth, pose)
-                setting = self._meter(self._sensor, at_rest, depth)
-            motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
-            raw = self._through_lens(floor, depth, camera, pose, motion, at_rest)
-            image = self._cameras.rectify(self._sensor.image(raw, setting, self._rngs[camera]))
-            return image, self._cameras.crop(depth), setting
+        return _View(pose, camera, albedo, depth, objects)
+
+    def _floor(self, view: _View) -> Radiance:
+        """Returns the light (H, W, 3) of floor and water in a view [cd/m2]."""
+        pose, camera, albedo, depth, objects = view
+        return self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
+
+    def _metered(self, view: _View) -> tuple[Radiance, Radiance, ExposureSetting]:
+        """Returns the light of floor and water in the left view, this light with marine snow, and the exposure."""
+        floor = self._floor(view)
+        at_rest = self._with_snow(floor, view.depth, view.pose)
+        return floor, at_rest, self._meter(self._sensor, at_rest, view.depth)
+
+    def _expose(
+        self, view: _View, floor: Radiance, at_rest: Radiance | None, twist_body: Array, setting: ExposureSetting
+    ) -> Image:
+        """Returns the image of one camera; the arguments are those of `_through_lens` and `capture`."""
+        pose, camera, _, depth, _ = view
+        motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
+        raw = self._through_lens(floor, depth, camera, pose, motion, at_rest)
+        return self._cameras.rectify(self._sensor.image(raw, setting, self._rngs[camera]))
 
     def _with_snow(self, floor: Radiance, depth: Depth, pose: StampedPose) -> Radiance:
         """Returns the light in the left camera without motion blur: `floor`, or a copy of it with marine snow."""

@@ -17,6 +17,8 @@ the depth, so a camera below the surface rarely sees the pattern repeated.
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -72,6 +74,7 @@ class Caustics:
         self._blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest)).astype(np.float32)
         self._share = np.float32(daylight.focused_share)
         self._cached: tuple[float, NDArray[np.float32]] | None = None
+        self._computing = threading.Lock()
 
     @property
     def cells_per_m(self) -> float:
@@ -79,13 +82,18 @@ class Caustics:
         return CELLS / self.tile_m
 
     def pattern(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west.
+        """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west."""
+        return self.closed_pattern(time_s)[:-1, :-1]
 
-        The latest pattern is cached, because both cameras use it.
+    def closed_pattern(self, time_s: float) -> NDArray[np.float32]:
+        """Returns `pattern` with its first row and its first column repeated at the end: (CELLS + 1, CELLS + 1).
+
+        The latest pattern is cached, because both cameras use it; they may do so at the same time.
         """
-        if self._cached is None or self._cached[0] != time_s:
-            self._cached = time_s, self._compute(time_s)
-        return self._cached[1]
+        with self._computing:
+            if self._cached is None or self._cached[0] != time_s:
+                self._cached = time_s, np.pad(self._compute(time_s), (0, 1), mode="wrap")
+            return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS)."""
@@ -96,7 +104,7 @@ class Caustics:
         return east, north
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
-        """Returns `pattern` without the cache."""
+        """Computes the illuminance (CELLS, CELLS) divided by its mean, see `pattern`."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
         blurred = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))

@@ -196,6 +196,6 @@ def _in_clear_water(source: SunSky) -> LightField:
 
 @lru_cache(maxsize=64)
 def _field(band: Absorbed, source: SunSky, modes: int) -> LightField:
-    """Returns the light field of a band, cached, with `modes` terms of the series in azimuth."""
+    """Returns the light field of a band, with `modes` terms of its Fourier series in azimuth; the result is cached."""
     optics = BandOptics(band.absorption_per_m, band.scattering_per_m, table_of(band.scatterer))
     return LightField(optics, source, modes)

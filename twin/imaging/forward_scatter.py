@@ -22,6 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
+from twin.imaging.pixel_sum import sum_of_entries
 from twin.imaging.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.spread import NODES_M, Absorbed, camera_mixture, over_path
 from twin.imaging.water import Medium
@@ -81,8 +82,7 @@ class ForwardScatter:
         unscattered = np.exp(-water.scattering_per_m * range_m[:, None])
         weights = level_weights(water.bands, rig.focal_px, levels, range_m)
         self._core = weights[0]
-        self._weights = weights[1:].astype(np.float32)
-        self._moved = _moved(weights[1:], rig.focal_px).astype(np.float32)
+        self._tables = _tables(weights[1:], _moved(weights[1:], rig.focal_px))
         self.kept = np.zeros((SHARE_STEPS + 1, 4), np.float32)
         self.kept[:, :3] = unscattered + weights[0]
         v, u = (np.arange(0.0, n, PLANE_STEP_PX) - (n - 1) / 2 for n in (rig.height_px, rig.width_px))
@@ -103,7 +103,9 @@ class ForwardScatter:
         return np.where(found > 1 / FAR_M, 1 / found, np.inf).reshape(self.surroundings.shape).astype(np.float32)
 
     def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
-        """Adds the blurred light of the floor to `light` in place, without the core of the kernel, which is in `kept`.
+        """Adds the blurred light of the floor to `light` in place.
+
+        The core of the kernel is left out: `kept` includes it in the share that arrives without blur.
 
         Args:
             floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
@@ -114,7 +116,7 @@ class ForwardScatter:
         grid = self.surroundings
         images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
         places: list[Place] = [place]
-        while len(images) < len(self._weights):
+        while len(images) < len(self._tables):
             if len(images) == grid.level:
                 inner = np.s_[grid.pad : grid.pad + len(images[-1]), grid.pad : grid.pad + images[-1].shape[1]]
                 outer, outer_place = around
@@ -122,7 +124,7 @@ class ForwardScatter:
                 images[-1], places[-1] = outer, outer_place
             images.append(np.asarray(cv2.pyrDown(images[-1]), np.float32))
             places.append(np.asarray(cv2.pyrDown(places[-1]), np.float32))
-        tables = tuple(zip(self._weights, self._moved, self._widening, strict=True))
+        tables = tuple(zip(self._tables, self._widening, strict=True))
         _weigh(images[-1], places[-1], *tables[-1], np.zeros_like(images[-1]))
         for k in reversed(range(len(images) - 1)):
             height, width = places[k].shape
@@ -239,6 +241,13 @@ def _moved(weights: Array, focal_px: float) -> Array:
     return np.concatenate([np.zeros_like(weights[:1]), leaving[:-1]]) - leaving
 
 
+def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
+    """Returns the weights (levels, n, 3) and their changes (levels, n, 3) as the tables (levels, n, 8) of `_weigh`."""
+    tables = np.zeros((*weights.shape[:2], 8), np.float32)
+    tables[..., :3], tables[..., 4:7] = weights, moved
+    return tables
+
+
 def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
     """Returns the share of the light that moves to the next level, (rows, cols) for each level of the pyramid.
 
@@ -257,26 +266,31 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
     return [np.ascontiguousarray(np.clip(WIDENING * np.log2(one), 0.0, 1.0), np.float32) for one in secants]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(image, place, weights, moved, widening, wider):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _weigh(image, place, table, widening, wider):
     """Multiplies one level by its weights and adds the wider levels, in place.
 
     Args:
         image: (rows, cols, 3) light of the floor at this level.
-        place: (rows, cols) fractional row of `weights` and `moved` for each pixel.
-        weights: (n, 3) weights of this level.
-        moved: (n, 3) change of the weights if the light of each level moves to the next one.
+        place: (rows, cols) fractional row of `table` for each pixel.
+        table: (n, 8) weights of this level for R, G, B and a zero, then their change if the light of each level moves
+            to the next one, and a zero.
         widening: (rows, cols) share of the light that moves, for each pixel.
         wider: (rows, cols, 3) weighted light of the wider levels.
     """
-    last = weights.shape[0] - 2
+    last, one = np.int32(table.shape[0] - 2), np.float32(1.0)
+    flat, cols = table.reshape(-1), place.shape[1]
+    cell, part = np.empty(cols, np.int32), np.empty(cols, np.float32)
     for v in range(place.shape[0]):
-        for u in range(place.shape[1]):
-            at = place[v, u]
-            k = min(int(at), last)
-            w = at - np.float32(k)
-            s = widening[v, u]
-            for c in range(3):
-                near = weights[k, c] + s * moved[k, c]
-                weight = near + w * (weights[k + 1, c] + s * moved[k + 1, c] - near)
-                image[v, u, c] = image[v, u, c] * weight + wider[v, u, c]
+        at, moves, filled, added = place[v], widening[v], image[v].reshape(-1), wider[v].reshape(-1)
+        for u in range(cols):
+            k = min(np.int32(at[u]), last)
+            cell[u], part[u] = np.int32(8) * k, at[u] - np.float32(k)
+        for u in range(cols):
+            i, w, s = np.uint32(cell[u]), part[u], moves[u]
+            places = i, i + np.uint32(8), i + np.uint32(4), i + np.uint32(12)
+            shares = one - w, w, s * (one - w), s * w
+            red, green, blue = sum_of_entries(flat, places, shares)  # pyright: ignore
+            filled[3 * u] = filled[3 * u] * red + added[3 * u]
+            filled[3 * u + 1] = filled[3 * u + 1] * green + added[3 * u + 1]
+            filled[3 * u + 2] = filled[3 * u + 2] * blue + added[3 * u + 2]

@@ -16,7 +16,7 @@ from twin.imaging.materials import material_of
 from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.object_shadows import ObjectShadows
 from twin.imaging.object_view import ObjectRenderer, Objects
-from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface
+from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface, calm_surface
 from twin.imaging.shadows import Shadows
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.snow import MarineSnow
@@ -42,8 +42,8 @@ class RadianceComponents(NamedTuple):
         forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless
             `imaging.scattering` is full.
         backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
-        snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than what they hide;
-            None if marine snow is disabled.
+        snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than the light that
+            they hide; None if marine snow is disabled.
         total: sum of direct, forward, backscatter and snow [cd/m2].
     """
 
@@ -93,8 +93,8 @@ class ImageFormation:
         positions_m = [source.position_m for source in sources]
         shaded = floor if imaging.shadows else None
         self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
-        shading = objects is not None and imaging.shadows
-        self._object_shadows = ObjectShadows(objects, rig, positions_m, to_sun) if objects and shading else None
+        casting = objects if imaging.shadows else None
+        self._object_shadows = None if casting is None else ObjectShadows(casting, rig, positions_m, to_sun)
         snows = snow.density_per_m3 > 0
         particles = snow, current_mps, rig, water, self._optics.lamp_light, snow_rng
         self._snow = MarineSnow(*particles, defocus_of(scenario, rig)) if snows else None
@@ -181,13 +181,11 @@ class ImageFormation:
         """Returns the water surface above a camera; None without daylight."""
         if not self._daylight_on:
             return None
-        east, north, up = self._world_from_camera(camera, pose)[:3]
-        from_camera = np.array([east, north, -up])
-        from_camera[2, 3] += self._reference_depth_m
+        calm = calm_surface(self._world_from_camera(camera, pose), self._reference_depth_m)
         if self._caustics is None:
-            return WaterSurface(None, from_camera)
-        from_camera[:2] *= self._caustics.cells_per_m
-        return WaterSurface(np.pad(self._caustics.pattern(pose.time_s), (0, 1), mode="wrap"), from_camera)
+            return calm
+        calm.from_camera[:2] *= self._caustics.cells_per_m
+        return calm._replace(caustics=self._caustics.closed_pattern(pose.time_s))
 
     def _world_from_camera(self, camera: int, pose: StampedPose) -> Array:
         return pose.world_from_left @ (self._rig.left_from_right if camera else np.eye(4))

@@ -39,6 +39,7 @@ Depth = NDArray[np.float32]
 REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels a side; an even number
 GRID = 64  # samples of the MTF from which the kernel is computed
 MTF_ERROR = 5e-3  # separable terms of the kernel are added until the MTF is within this of the closed form
+PATTERN_PX = 64  # pixels for which the weights of a row, which repeat for R, G, B, are stored
 NEAREST_FOCUS_M = 0.05  # nearest depth in focus
 SMALL_PX = 3.0  # largest circle of confusion for the 3 x 3 kernel
 NEGLIGIBLE_PX = 0.1  # circles of confusion up to this diameter are ignored: their variance is below 0.001 px^2
@@ -160,9 +161,10 @@ def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
 
 
 def _separable(kernel: Array) -> list[tuple[float, Array]]:
-    """Returns the largest eigenvalues and eigenvectors of a symmetric kernel, of which the outer products add up to it.
+    """Returns the largest eigenvalues and their eigenvectors of a symmetric kernel.
 
-    The sum is normalised to 1. The number of terms follows from `MTF_ERROR`.
+    The sum of eigenvalue times outer product of the eigenvector approximates the kernel within `MTF_ERROR` of its
+    transform. The eigenvalues are scaled so that all elements of this sum add up to 1.
     """
     values, vectors = np.linalg.eigh(kernel)
     order, n = np.argsort(-np.abs(values)), 1
@@ -180,34 +182,52 @@ class _Magnified:
     def __init__(self, lens: LensConfig, rig: StereoRig):
         red, blue = lens.lateral_colour
         scales = 1 + np.array([red, 0.0, blue])
-        source, weights = _positions(rig.width_px, rig.cx_px, scales)
-        in_row = (3 * source + np.arange(3)[:, None, None]).astype(np.uint32)  # indices in a row of R, G, B
-        self._columns = in_row, weights
-        self._rows = _positions(rig.height_px, rig.cy_px, scales)
+        first, across = _taps_of(rig.width_px, rig.cx_px, scales)
+        starts = np.flatnonzero(np.diff(first, prepend=first[0] - 1))  # runs of pixels with the same taps
+        runs = np.column_stack([starts, np.append(starts[1:], rig.width_px), first[starts]])
+        lines, down = _taps_of(rig.height_px, rig.cy_px, scales)
+        self._tables = runs, np.ascontiguousarray(across.swapaxes(0, 1).reshape(len(across[0]), -1)), lines, down
 
     def apply(self, light: Radiance) -> Radiance:
         """Returns the radiance (H, W, 3) with the magnified red and blue bands."""
-        out, tables = np.empty_like(light), (*self._columns, *self._rows)
-        in_row_bands(lambda first, end: _magnify(light, *tables, out, first, end), len(light))
+        out, tables = np.empty_like(light), self._tables
+        flat, filled = np.ascontiguousarray(light).reshape(len(light), -1), out.reshape(len(light), -1)
+        in_row_bands(lambda first, end: _magnify(flat, *tables, filled, first, end), len(light))
         return out
 
 
-def _positions(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Returns, for each band and pixel of an axis, the four source pixels and their weights (3, n, 4) (Keys 1981)."""
+def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981).
+
+    Args:
+        n: number of pixels.
+        middle_px: pixel that all bands share.
+        scales: (3,) magnification of the bands.
+
+    Returns:
+        First tap of each pixel (n,) relative to it [px]; weights (n, taps, 3) of consecutive pixels for R, G, B.
+    """
     at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
-    first = np.floor(at)
-    t = (at - first)[..., None]
-    weights = np.concatenate(
-        [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2],
-        axis=-1,
+    whole = np.floor(at)
+    t = at - whole
+    cubic = np.array(
+        [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2]
     )
-    source = np.clip(first[..., None].astype(np.int64) + [-1, 0, 1, 2], 0, n - 1)
-    return source, weights.astype(np.float32)
+    offset = whole.astype(np.int64) - 1 - np.arange(n)  # of the first of the four taps of each band
+    first = offset.min(axis=0)
+    weights = np.zeros((n, int((offset - first).max()) + 4, 3))
+    for band in range(3):
+        for i in range(4):
+            weights[np.arange(n), offset[band] - first + i, band] = cubic[i, band]
+    return first, weights.astype(np.float32)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) with the sum of separable convolutions of `light`."""
+    """Fills rows `first` to `end` of `out` (H, 3 W) with the sum of separable convolutions of `light` (H, 3 W).
+
+    `down` and `across` (terms, taps, 3 W) are the weights of `_taps` along columns and rows.
+    """
     terms, n_taps, n = down.shape
     rows, reach = light.shape[0], n_taps - 1
     wide = np.empty(n + 6 * reach, np.float32)
@@ -243,35 +263,65 @@ def _add_pairs(before, after, weight, earlier, later, other_weight, out):
         out[k] += weight[k] * (before[k] + after[k]) + other_weight[k] * (earlier[k] + later[k])
 
 
-@njit(cache=True, nogil=True)
-def _magnify(light, columns, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` of `out`; see `_positions` for the tables of columns and rows."""
-    rows, width, _ = light.shape
-    flat, between = light.reshape(rows, -1), np.empty(3 * width, np.float32)
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _magnify(light, runs, across, lines, down, out, first, end):
+    """Fills rows `first` to `end` of `out` (H, 3 W) with the magnified bands of `light`; see `_taps_of` for the taps.
+
+    Args:
+        light: (H, 3 W) radiance.
+        runs: (k, 3) first and end column of each run of pixels with the same taps, and their first tap.
+        across: (taps, 3 W) weights along the rows.
+        lines: (H,) first tap of each row.
+        down: (H, taps, 3) weights along the columns.
+        out: (H, 3 W) array to fill.
+        first, end: rows to fill.
+    """
+    rows, n = light.shape
+    pad = 3 * max(-runs[:, 2].min(), runs[:, 2].max() + across.shape[0] - 1, 0)
+    wide, pattern = np.empty(n + 2 * pad, np.float32), np.empty(3 * PATTERN_PX, np.float32)
     for v in range(first, end):
-        filled = out[v].reshape(-1)
-        filled[:] = flat[v]
-        for band in (0, 2):
-            line, w = lines[band, v], down[band, v]
-            _mix_rows(flat[line[0]], flat[line[1]], flat[line[2]], flat[line[3]], w[0], w[1], w[2], w[3], between)
-            at, share = columns[band].reshape(-1), across[band].reshape(-1)
-            for u in range(width):
-                k = 4 * u
-                total = share[k] * between[at[k]] + share[k + 1] * between[at[k + 1]]
-                total += share[k + 2] * between[at[k + 2]] + share[k + 3] * between[at[k + 3]]
-                filled[3 * u + band] = max(total, np.float32(0.0))
+        between = wide[pad : pad + n]
+        for i in range(down.shape[1]):
+            red, green, blue = down[v, i, 0], down[v, i, 1], down[v, i, 2]
+            for u in range(PATTERN_PX):
+                pattern[3 * u], pattern[3 * u + 1], pattern[3 * u + 2] = red, green, blue
+            line = light[min(max(v + lines[v] + i, 0), rows - 1)]
+            for start in range(0, n, pattern.size):
+                stop = min(start + pattern.size, n)
+                _add_weighted(line[start:stop], pattern, between[start:stop], i == 0)
+        for k in range(pad):
+            wide[k], wide[pad + n + k] = between[k % 3], between[n - 3 + k % 3]
+        for r in range(runs.shape[0]):
+            start, stop = 3 * runs[r, 0], 3 * runs[r, 1]
+            filled = out[v, start:stop]
+            for i in range(across.shape[0]):
+                shift = pad + 3 * (runs[r, 2] + i)
+                _add_weighted(wide[shift + start : shift + stop], across[i, start:stop], filled, i == 0)
+            for k in range(filled.size):
+                filled[k] = max(filled[k], np.float32(0.0))
 
 
-@njit(cache=True, nogil=True)
-def _mix_rows(a, b, c, d, p, q, r, s, out):
-    """Fills `out` (3 W,) with the sum of the image rows a, b, c, d (3 W,), weighted by p, q, r, s."""
-    for k in range(out.size):
-        out[k] = p * a[k] + q * b[k] + r * c[k] + s * d[k]
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _add_weighted(values, weights, out, is_first):
+    """Adds `values` times `weights` (at least n,) to `out` (n,), or replaces it if `is_first`."""
+    if is_first:
+        for k in range(out.size):
+            out[k] = weights[k] * values[k]
+    else:
+        for k in range(out.size):
+            out[k] += weights[k] * values[k]
 
 
 @njit(cache=True, nogil=True)
 def _defocus(light, near, scale, focus, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W); `near` (H, W) is the inverse depth, `scale` = aperture times f."""
+    """Fills rows `first` to `end` of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
+
+    Args:
+        near: (H, W) inverse depth [1/m].
+        scale: diameter of the aperture times the focal length [px m]; this times the difference between the inverse
+            depth and `focus` is the diameter of the disc [px].
+        focus: inverse of the depth in focus [1/m].
+    """
     rows, width = near.shape
     wide = np.empty(3 * width, np.float32)
     for v in range(first, end):

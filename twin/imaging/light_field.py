@@ -309,7 +309,11 @@ def _legendre(order: Array | int, m: int, cosine: Array) -> Array:
 
 
 def _cosine_moment(order: int) -> float:
-    """Returns the Legendre moment of Lambert's cosine for an order: pi, 2 pi / 3, pi / 4, 0, -pi / 24, ..."""
+    """Returns the Legendre moment of Lambert's cosine for order 1 or an even order.
+
+    These are 2 pi / 3 for order 1, and pi, pi / 4, -pi / 24, ... for the orders 0, 2, 4, ...; the moments of the other
+    odd orders are 0.
+    """
     if order == 1:
         return 2 * np.pi / 3
     half = order // 2

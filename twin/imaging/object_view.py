@@ -13,7 +13,7 @@ from terrains.objects.model import PlacedObject
 from twin.core import geometry
 from twin.core.records import Image, StereoRig
 from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
-from twin.imaging.sway import swayed
+from twin.imaging.sway import largest_displacement_m, swayed
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -42,7 +42,7 @@ class Objects:
         self.placed = tuple(placed)
         self._current_mps = np.zeros(3) if current_mps is None else current_mps
         self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
-        self._radii_m = np.array([item.radius_m for item in placed])
+        self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
     def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> Iterator[DrawnMesh]:
         """Yields the meshes of the objects in view, nearest first.

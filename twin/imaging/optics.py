@@ -21,6 +21,7 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,6 +65,19 @@ class WaterSurface(NamedTuple):
     from_camera: Array
 
 
+def calm_surface(world_from_camera: Array, reference_depth_m: float) -> WaterSurface:
+    """Returns the water surface above a camera without caustics, with columns and rows in metres east and north.
+
+    Args:
+        world_from_camera: (4, 4) pose of the camera.
+        reference_depth_m: depth below the surface of the plane z = 0 of the world.
+    """
+    east, north, up = world_from_camera[:3]
+    from_camera = np.array([east, north, -up])
+    from_camera[2, 3] += reference_depth_m
+    return WaterSurface(None, from_camera)
+
+
 class FloorView(NamedTuple):
     """Properties of the floor that the shading of a camera needs besides its depth.
 
@@ -99,11 +113,12 @@ class WhiteFloor(NamedTuple):
     """Light of an image of a white floor, from which the light of a floor of any albedo follows.
 
     Args:
-        floor: (H, W, 3) light of the white floor, attenuated by absorption alone with multiple scattering, else by
-            absorption and scattering [cd/m2].
+        floor: (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the
+            camera attenuates it by absorption alone; with single scattering, by absorption and scattering.
         backscatter: (H, W, 3) light that the water scatters into the camera [cd/m2].
-        unscattered: (H, W, 3) share of `floor` that is not scattered; 1 with single scattering.
-        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel.
+        unscattered: (H, W, 3) share of `floor` that is not scattered; ones (3,) with single scattering.
+        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) with single
+            scattering.
         spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
             alone, and its albedo, of which the mean is that of the floor around the image; None with single scattering.
     """
@@ -167,8 +182,8 @@ class Optics:
         # computed on demand, as some callers need one camera only
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
-        self._floor = np.empty((rig.height_px, rig.width_px, 3), np.float32) if scatters else None
-        self._place = np.empty(((rig.height_px + 1) // 2, (rig.width_px + 1) // 2), np.float32)
+        # working memory of each camera, as both images may be computed at the same time
+        self._memory = cache(lambda camera: _working_memory(rig))
         self._floor_daylight, self._daylight_loss_per_m = floor_daylight(daylight), daylight.camera_loss_per_m
         level = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
         self._calm_surface = WaterSurface(None, level)
@@ -193,12 +208,12 @@ class Optics:
                 altitude, with east on its right.
         """
         out = np.empty(albedo.shape, np.float32)
-        if self._forward is None or self._floor is None:
+        if self._forward is None:
             self._run((albedo, depth), camera, floor, surface, _Output(out))
         else:
-            target = _Output(self._floor, out, self._forward.kept, self._place)
-            self._run((albedo, depth), camera, floor, surface, target)
-            self._forward.add(self._floor, self._place, self.around(albedo, depth, camera, surface), out)
+            light, place = self._memory(camera)
+            self._run((albedo, depth), camera, floor, surface, _Output(light, out, self._forward.kept, place))
+            self._forward.add(light, place, self.around(albedo, depth, camera, surface), out)
         return out
 
     def parts(
@@ -258,7 +273,8 @@ class Optics:
         assert self._forward is not None
         grid, plane = self._forward.surroundings, self._forward.plane(depth)
         light = np.empty((*grid.shape, 3), np.float32)
-        mean = albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX].mean((0, 1)).round().astype(np.uint8)
+        some = np.ascontiguousarray(albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX])
+        mean = np.round(cv2.mean(some)[:3]).astype(np.uint8)
         uniform = np.broadcast_to(mean, light.shape)
         self._run((uniform, plane), camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
         return light, place_of(plane * self._forward.range_per_depth)
@@ -311,6 +327,12 @@ class Optics:
             return of_lamps
         rays = grid_rays(self._rig, grid_of(self.light_sources[camera].beam)) @ _world_axes(surface)
         return of_lamps + with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
+
+
+def _working_memory(rig: StereoRig) -> tuple[Radiance, Place]:
+    """Returns arrays for the light of the floor (H, W, 3), and for the argument `place` of `ForwardScatter.add`."""
+    shape = rig.height_px, rig.width_px
+    return np.empty((*shape, 3), np.float32), np.empty(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.float32)
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:

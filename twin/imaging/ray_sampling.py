@@ -88,7 +88,7 @@ def sample_rays(
 
 
 def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[float, float]] | None:
-    """Returns the motion in the form that the compiled kernels take."""
+    """Returns the motion as a tuple of its fields, for the compiled kernels; None if `motion` is None."""
     if motion is None:
         return None
     return np.ascontiguousarray(motion.twist, np.float64), motion.readout_s, motion.focal_px, motion.principal_px
@@ -118,8 +118,8 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
-    Rows 2 to 5 are vanishing point and parallax of the rays, row 6 the inverse depth, at first that of the rays of the
-    previous row, and row 7 working memory; so is `cells` (w,) int32.
+    Rows 2 and 3 are the vanishing points of the rays, rows 4 and 5 their parallax, and row 6 the inverse depth,
+    initially that of the rays of the previous row. Row 7 is not used; `cells` (w,) int32 is working memory.
     """
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
@@ -188,7 +188,10 @@ def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_
 
 @njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath={"contract"})
 def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
-    """Replaces `inverse` by the inverse depth at the positions of the rays; returns the largest shift [px]."""
+    """Replaces `inverse` by the inverse depth at the positions of the rays.
+
+    Returns the largest change of a position that the change of the inverse depth causes [px].
+    """
     longest = np.float32(0.0)
     for u in range(cells.size):
         k, s, t = np.uint32(cells[u]), part_x[u], part_y[u]

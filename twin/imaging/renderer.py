@@ -103,7 +103,11 @@ class Renderer:
 
 
 def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
-    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded."""
+    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded.
+
+    Raises:
+        TwinError: OpenGL is not available.
+    """
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
 from twin.imaging.pixel_sum import sum_of_pixels
 from twin.imaging.row_parallel import in_row_bands
@@ -112,14 +113,9 @@ def sum_row(source, x, y, weights, cells, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
 def _spline_weights(at, before, here, after, last):
-    """Computes the B-spline weights (w,) of the pixels at -1, 0, 1, 2 from the pixel that contains `at` (w,)."""
-    one, sixth, four, three = np.float32(1.0), np.float32(1 / 6), np.float32(4.0), np.float32(3.0)
+    """Computes the B-spline weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):
-        t = at[u] - np.floor(at[u])
-        s = one - t
-        a, d = s * s * s * sixth, t * t * t * sixth
-        b = (four + three * t * t * (t - np.float32(2.0))) * sixth
-        before[u], here[u], after[u], last[u] = a, b, one - a - b - d, d
+        before[u], here[u], after[u], last[u] = bspline_weights(at[u] - np.floor(at[u]))
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ is
     L = rho W u + F(rho W) + B.
 
 A floor of uniform albedo gives the first estimate rho = (L - B) / (W u + F(W)). Then the blurred light of this estimate
-is subtracted, and what remains is light without blur:
+is subtracted, and the rest is light without blur:
 
     rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
 
@@ -24,12 +24,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.load import fill_holes
 from twin.core import floor_rays, geometry
 from twin.core.records import ElevationMap, Exposure, Image, StereoRig
 from twin.errors import TwinError
 from twin.imaging.facets import Facets
 from twin.imaging.illumination import Illumination
-from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface
+from twin.imaging.optics import Depth, FloorView, Optics, Radiance, calm_surface
 from twin.imaging.photons import vignetting
 from twin.imaging.shadows import Shadows
 from twin.imaging.tone import linear_of
@@ -39,7 +40,6 @@ Array = NDArray[np.float64]
 
 DEPTH_STEP_PX = 4  # spacing of the pixels whose depth is computed; light depends on depth smoothly
 STEPS = 2  # number of corrections of the blur
-_NEAR_ENOUGH = 0.02  # least weight of the mapped cells around a hole that is filled from them
 _DARK = 1e-6  # least light of a white floor, relative to the brightest pixel, that is divided by
 
 
@@ -99,7 +99,9 @@ class Restoration:
         """Returns the albedo (H, W, 3), 1 = white, of a floor at this depth (H, W) [m] in an image of this radiance."""
         lit = None if self._shadows is None else self._shadows.lit(depth, map_from_camera, 0)
         floor = FloorView(self._facets.seen_from(map_from_camera), lit)
-        surface = self._surface(map_from_camera) if self._sunny else None
+        surface = None
+        if self._sunny:
+            surface = calm_surface(self._world_from_map @ map_from_camera, self._reference_depth_m)
         white = self._optics.white_floor(depth, 0, floor, surface)
         light = np.maximum(radiance - white.backscatter, 0)
         dark = white.floor < _DARK * white.floor.max()
@@ -130,31 +132,16 @@ class Restoration:
         coarse = per_m.reshape(-1, columns).astype(np.float32)
         return 1 / cv2.resize(coarse, (rig.width_px, rig.height_px), interpolation=cv2.INTER_LINEAR)
 
-    def _surface(self, map_from_camera: Array) -> WaterSurface:
-        """Returns the calm water surface above a camera."""
-        east, north, up = (self._world_from_map @ map_from_camera)[:3]
-        from_camera = np.array([east, north, -up])
-        from_camera[2, 3] += self._reference_depth_m
-        return WaterSurface(None, from_camera)
-
 
 def estimated_floor(elevation: ElevationMap) -> EstimatedFloor:
-    """Returns the heights of a map, with holes filled by a weighted mean of the heights around them.
+    """Returns the heights of a map, with the height of the nearest cell in each hole; all NaN if the map is empty.
 
     The nodes are the centres of the cells. The heights are not smoothed: smoothing tilts the facets at every edge,
     where the light depends on them most.
     """
     grid, height = elevation.grid, elevation.height_m.astype(np.float64)
-    known = np.isfinite(height)
-    weight, value, scale = known.astype(np.float64), np.where(known, height, 0.0), 1.0
-    while known.any() and np.isnan(height).any():
-        total = cv2.GaussianBlur(weight, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
-        blurred = cv2.GaussianBlur(value, (0, 0), scale, borderType=cv2.BORDER_REPLICATE)
-        near = np.isnan(height) & (total > _NEAR_ENOUGH)
-        height[near] = blurred[near] / total[near]
-        scale *= 2
-        if scale > max(height.shape):
-            height[np.isnan(height)] = np.nanmean(height)
+    if np.isfinite(height).any():
+        height, _ = fill_holes(height)
     south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
     upwards = np.ascontiguousarray(height[::-1], np.float32)
     return EstimatedFloor(upwards, grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)

@@ -95,7 +95,10 @@ class PlainSensor:
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
     def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
-        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames."""
+        """Returns this frame's exposure, and meters `light` for the later frames; `every_px` is not used.
+
+        The exposure is metered on the previous frames, that of the first frame on `light`.
+        """
         return ExposureSetting(self._exposure.gain(light))
 
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:

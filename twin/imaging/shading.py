@@ -414,10 +414,8 @@ def _reflect(albedo, light, backscatter, out):
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
     """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept` of the floor's light (W, 3).
 
-    If `kept` is None, the light of the floor is not added.
-
-    If `kept` is given and v is even, it also fills row v / 2 of `place` with the fractional row of `kept` for every
-    second pixel.
+    If `kept` is None, the light of the floor is not added. Otherwise, if v is even, the function also fills row v / 2
+    of `place` with the fractional row of `kept` for every second pixel.
     """
     of_row, shown = out.reshape(-1), floor.reshape(-1)
     if kept is None:

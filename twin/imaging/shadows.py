@@ -100,8 +100,9 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
     """Marks the pixels of rows `first` to `end` in `out` (lamps, H, W).
 
-    The mark is DARK where facets face away, CLEAR without floor, else OPEN. Pixels that show an object, i.e. whose
-    `label` is not 0, are OPEN; without objects, `label` is None.
+    The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN (rays decide, see
+    `_grow_shadows`). Pixels that show an object, i.e. whose `label` is not 0, are OPEN; without objects, `label` is
+    None.
     """
     height, _, _, west, south, spacing = grid
     width, cols = depth.shape[1], height.shape[1]

@@ -28,6 +28,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from twin.core.interpolation import catmull_rom_weights
 from twin.imaging.resample import sum_row
 from twin.imaging.row_parallel import in_row_bands
 
@@ -113,17 +114,6 @@ def _flow(x, y, near, scale, twist):
     return scale * du, scale * dv
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _cubic(t):
-    """Returns the weights of the pixels at -1, 0, 1, 2 for cubic interpolation at t in [0, 1] (Keys 1981, a = -1/2)."""
-    half, one, steep = np.float32(0.5), np.float32(1.0), np.float32(1.5)
-    s = one - t
-    return (
-        -half * t * s * s, one - t * t * (one + steep - steep * t),
-        one - s * s * (one + steep - steep * s), -half * s * t * t,
-    )  # fmt: skip
-
-
 @njit(cache=True, nogil=True)
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
     """Fills rows `first` to `end` of `out` (H, W, 3) with motion blur; compiled kernel of `blur_by_motion`.
@@ -193,7 +183,7 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
         for k in range(1, m + 1):
             offset = slope * np.float32(k)
             j = int(np.floor(offset))
-            w = _cubic(offset - np.float32(j))
+            w = catmull_rom_weights(offset - np.float32(j))
             share = tip if k == m else inner
             fore, back = min(a + k, size_a - 1) * stride_a, max(a - k, 0) * stride_a
             for i in range(4):
@@ -235,6 +225,6 @@ def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, en
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
 def _cubic_weights(at, before, here, after, last):
-    """Computes the weights (w,) of `_cubic` for positions `at` (w,)."""
+    """Computes the Catmull-Rom weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):
-        before[u], here[u], after[u], last[u] = _cubic(at[u] - np.floor(at[u]))
+        before[u], here[u], after[u], last[u] = catmull_rom_weights(at[u] - np.floor(at[u]))

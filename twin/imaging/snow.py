@@ -7,7 +7,7 @@ pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens 
 at depth s. During the exposure the particle moves through the image; its light is spread evenly along this path, whose
 length is its velocity in the image times the exposure time. A rolling shutter images it where it is when its row is
 read. If the rolling shutter is applied to the whole image after the particles are drawn, it displaces them like the
-floor behind them; they are therefore drawn displaced by the difference between their own displacement and this one.
+floor behind them; they are therefore drawn displaced by the difference between their own displacement and the floor's.
 
 The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
 diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is

@@ -1,7 +1,8 @@
 """Multiple scattering of light near its straight path, as mixtures of Gaussians: the spread of a beam, and of an image.
 
-A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), what arrives
-is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular frequency k is
+A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light
+that arrives is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular
+frequency k is
 
     exp(-a d - b d (1 - K(k))),
 
@@ -48,7 +49,13 @@ LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
 
 
 class Absorbed(NamedTuple):
-    """One band of the water: absorption a and scattering b [1/m], and its molecules and particles."""
+    """Optical properties of the water in one band, for the kernels of scattered light.
+
+    Args:
+        absorption_per_m: absorption coefficient a [1/m].
+        scattering_per_m: scattering coefficient b [1/m].
+        scatterer: molecules and particles that scatter the light.
+    """
 
     absorption_per_m: float
     scattering_per_m: float
@@ -62,7 +69,7 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
     Args:
         water: one band of the water.
         distances_m: (n,) distances from the lamp.
-        receiver: what the light arrives at.
+        receiver: kind of surface at which the light arrives: the floor, or a particle in the water.
 
     Returns:
         Weights of normalised Gaussians in the angle at the lamp, of the widths `LAMP_SIGMA_RAD`.
@@ -220,7 +227,8 @@ def _frequencies(least: float, most: float) -> Array:
     """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least.
 
     Args:
-        least, most: smallest and largest standard deviation of the Gaussians.
+        least, most: smallest and largest standard deviation of the Gaussians; the frequencies are in radians per unit
+            of these.
     """
     return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
 

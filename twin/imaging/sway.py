@@ -37,10 +37,30 @@ def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) ->
     direction = np.linalg.inv(item.world_from_object[:3, :3] / item.scale) @ in_world
     height_m = item.model.high_m[2]
     share = mesh.vertices_m[:, 2] / height_m  # of the height
-    lean = LARGEST_LEAN * speed**2 / (speed**2 + HALF_BENT_MPS**2)
+    lean = _lean(speed)
     width_m = item.scale * float((item.model.high_m - item.model.low_m)[:2].max())
     angle = 2 * np.pi * (STROUHAL * speed / width_m * time_s - WAVES * share) + item.phase
     deflection = height_m * lean * share**2 * (1 + OSCILLATION * np.sin(angle))
     vertices = mesh.vertices_m + deflection[:, None] * direction
     vertices[:, 2] -= deflection**2 / (2 * height_m)  # a bent plant keeps its length
     return mesh._replace(vertices_m=vertices.astype(np.float32))
+
+
+def largest_displacement_m(item: PlacedObject, current_mps: Array) -> float:
+    """Returns an upper bound of the distance by which `swayed` moves a vertex of a plant in the world, at any time [m].
+
+    It is 0 for an object that does not sway.
+
+    Args:
+        item: the object.
+        current_mps: (3,) velocity of the current in the world.
+    """
+    if not item.model.sways:
+        return 0.0
+    aside = _lean(float(np.hypot(*current_mps[:2]))) * (1 + OSCILLATION)  # of the tip, as a fraction of the height
+    return float(item.scale * item.model.high_m[2] * np.hypot(aside, aside**2 / 2))
+
+
+def _lean(speed_mps: float) -> float:
+    """Returns the mean deflection of the tip of a plant, as a fraction of its height."""
+    return LARGEST_LEAN * speed_mps**2 / (speed_mps**2 + HALF_BENT_MPS**2)

@@ -134,9 +134,10 @@ class TrueCameras:
             light: (H, W, 3) radiance in the rendered image.
             depth: (H, W) depth in the rendered image [m].
             camera: 0 left, 1 right.
-            every_px: number n; only every n-th raw pixel along columns and rows is sampled.
-            motion: motion of the camera during the exposure, of which the rolling shutter is applied if the rendered
-                images are resampled (`sampling` is not None); None = no motion.
+            every_px: number n; only every n-th raw pixel along columns and rows is sampled. The mean row number of
+                the samples is assigned the exposure time of the middle row of the raw image, at most n / 2 rows away.
+            motion: motion of the camera during the exposure; its rolling-shutter effect is applied if the rendered
+                images are resampled (`sampling` is not None). None: no motion.
         """
         if self.sampling is None:
             return (
@@ -152,16 +153,22 @@ class TrueCameras:
                 if parallax is None
                 else np.ascontiguousarray(parallax[every_px // 2 :: every_px, every_px // 2 :: every_px])
             )
-        rows = self._row_motion(motion, len(light), len(positions))
+        rows = self._row_motion(motion, len(light), every_px * (len(positions) - 1))
         if parallax is None and rows is None:
             return resample.sample(light, positions)
         return sample_rays(light, depth, positions, parallax, rows)
 
-    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
-        """Returns the motion during the read-out of the raw rows; None without rolling shutter."""
+    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, span_px: int) -> RowMotion | None:
+        """Returns the motion during the read-out of the sampled raw rows; None without rolling shutter.
+
+        Args:
+            motion: motion of the camera during the exposure.
+            n_rendered: rows of the rendered image.
+            span_px: distance from the first sampled raw row to the last.
+        """
         if motion is None or not motion.readout_s:
             return None
-        rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
+        rig, readout_s = self.rendered_rig, motion.readout_s * span_px / (n_rendered - 1)
         return RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
 
     def rectify(self, raw: Image) -> Image:
@@ -267,7 +274,11 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], exact for points at `depth_m`."""
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], exact for points at `depth_m`.
+
+    Raises:
+        TwinError: the port transmits no rays to a part of the frame, or the distortion folds the image onto itself.
+    """
     normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
     points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
@@ -279,7 +290,11 @@ def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Arr
 
 
 def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin."""
+    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin.
+
+    Raises:
+        TwinError: the port transmits no rays to a part of the image, or the distortion folds the image onto itself.
+    """
     distorted = (pixels - camera.principal_px) / camera.focal_px
     if np.isnan(lenses.undistort(distorted, camera.lens)).any():
         raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
@@ -319,6 +334,9 @@ def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64
     """Returns the margin (columns, rows) [px] that the rendered image needs on each side.
 
     With this margin it covers the rays of all raw pixels for depths from `NEAREST_M` to infinity.
+
+    Raises:
+        TwinError: the field of view with the margin is too wide.
     """
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)

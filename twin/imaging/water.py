@@ -100,7 +100,11 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
 
 
 def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
+    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type.
+
+    Raises:
+        TwinError: absorption or scattering is missing or given twice, or the spectrum cannot be read.
+    """
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if given and water.spectrum_file is not None:

@@ -71,5 +71,5 @@ class WhiteBalance:
 
 
 def _limited(electrons: Array) -> Array:
-    """Returns the factors (3,) that make electrons (3,) equal, from 1 to `MOST`."""
+    """Returns the factors (3,) that make electrons (3,) equal; they are 1 or more, and at most `MOST`."""
     return np.minimum(electrons.max() / electrons, MOST)

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from twin.core.records import Array
 
 #: X, Y, Z of the primaries of ITU-R BT.709 with the white point D65, relative to Y of white (IEC 61966-2-1).
-_XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _25_TO_7 = 25.0**7
 
 
 def lab_of(rgb: NDArray[np.floating]) -> Array:
     """Returns the CIELAB coordinates L*, a*, b* (..., 3) of linear RGB colours (..., 3), 1 = white (D65)."""
-    relative = np.maximum(np.asarray(rgb, np.float64), 0) @ (_XYZ_FROM_RGB / _XYZ_FROM_RGB.sum(1, keepdims=True)).T
+    relative = np.maximum(np.asarray(rgb, np.float64), 0) @ (XYZ_FROM_RGB / XYZ_FROM_RGB.sum(1, keepdims=True)).T
     edge = 6 / 29
     f = np.where(relative > edge**3, np.cbrt(relative), relative / (3 * edge**2) + 4 / 29)
     return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)

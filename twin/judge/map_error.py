@@ -11,8 +11,10 @@ from twin.judge.summary_statistics import finite_float, mean, percentile, rms
 
 KEYS = (
     "cell_m", "completeness", "bias_m", "rmse_m", "nmad_m", "p85_m", "le90_m", "le95_m", "max_m", "sigma_ratio",
-    "completeness_area", "le90_area_m",
+    "completeness_area", "le90_area_m", "median_m", "gross_share", "floor_median_m", "floor_le90_m",
+    "floor_gross_share", "objects_median_m", "objects_le90_m", "objects_gross_share",
 )  # fmt: skip
+GROSS_M = 0.1  #: absolute height error above which a cell counts as a gross error
 #: Metrics that are infinite, and therefore written as None, if the map has too many holes.
 INFINITE_WITH_HOLES = ("map.le90_area_m",)
 
@@ -31,7 +33,9 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
     sigma calibration: the RMS of error / sigma, which is 1 if the estimated standard deviations are correct.
     completeness_area is the fraction of the cells of the asked area that have an estimate. le90_area_m is the 90th
     percentile of |e| over these cells, where a cell without an estimate (a hole) counts as an infinite error; an
-    infinite percentile is given as None.
+    infinite percentile is given as None. median_m is the median of |e|, and gross_share the fraction of cells with
+    |e| > GROSS_M. floor_* and objects_* are median, LE90 and fraction of gross errors over the cells whose highest
+    surface is the floor or an object; without objects, all cells are floor and objects_* are None.
     """
     if elevation is None:
         return dict.fromkeys(KEYS)
@@ -39,6 +43,7 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
     errors = height_error(elevation, truth)
     estimated = np.isfinite(errors)
     error, size = errors[estimated], np.abs(errors[estimated])
+    on_object = np.zeros(len(size), bool) if truth.objects is None else truth.objects[estimated] > 0
     return {
         "cell_m": finite_float(elevation.grid.cell_m),
         "completeness": mean(estimated[truth.seen]),
@@ -52,6 +57,19 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
         "sigma_ratio": rms(normalised_error(elevation, truth)),
         "completeness_area": mean(np.isfinite(asked)),
         "le90_area_m": percentile_with_holes(asked, 90),
+        "median_m": percentile(size, 50),
+        "gross_share": mean(size > GROSS_M),
+        **_of_surface("floor", size[~on_object]),
+        **_of_surface("objects", size[on_object]),
+    }
+
+
+def _of_surface(name: str, size: Array) -> dict[str, float | None]:
+    """Returns median, LE90 and fraction of gross errors of the absolute errors (n,) over a kind of surface."""
+    return {
+        f"{name}_median_m": percentile(size, 50),
+        f"{name}_le90_m": percentile(size, 90),
+        f"{name}_gross_share": mean(size > GROSS_M),
     }
 
 

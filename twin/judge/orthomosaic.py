@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from twin.core.orthomosaic import OrthoTile
 from twin.core.records import Array
-from twin.judge.colour_difference import ciede2000, lab_of
+from twin.judge.colour_difference import XYZ_FROM_RGB, ciede2000, lab_of
 from twin.judge.patch_shift import patch_shift, transfer
 from twin.judge.summary_statistics import finite_float, percentile
 
@@ -22,7 +22,7 @@ PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest
 LEAST_CORRELATION = 0.25
 _COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is judged
 _BINS = np.linspace(0, 100, 10001)  # of the colour differences
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_LUMINANCE = XYZ_FROM_RGB[1].astype(np.float32)
 #: Distance from 10 % to 90 % of the edge response of a Gaussian blur, in standard deviations.
 _EDGE_PER_SIGMA = 2 * 1.2815515655446004
 _HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1  # of the fit of the blur [1/px]

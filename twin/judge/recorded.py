@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.nearest import nearest_index
 from twin.core.records import Array, SurveyResult, Trajectory
 from twin.judge.links import ALONG_NODES, linked_nodes, node_distance
 from twin.judge.metrics import SCHEMA, empty_metrics, timing_metrics
@@ -25,6 +26,8 @@ AlignmentName = Literal["se3", "first", "none"]
 ALIGNMENTS: tuple[AlignmentName, ...] = get_args(AlignmentName)
 #: Largest time difference of associated poses [s], that of evo.
 MAX_DIFFERENCE_S = 0.01
+#: Keys of `network_residuals`.
+NETWORK_KEYS = ("links", "loops", "loop_translation_m", "loop_rotation_deg", "loop_chi2")
 _MIN_ASSOCIATED = 3  # a rigid motion has six unknowns; each position has three coordinates
 _MAX_AXIS_DEG, _MAX_LENGTH_RATIO = 5.0, 2.0
 
@@ -73,7 +76,7 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
     alignment, the number of frames with a true pose, and the consistency of the network (`network_residuals`).
     """
     result, truth = survey.result, survey.truth
-    trajectories, warnings, n_associated = {}, list(survey.warnings), 0
+    trajectories, warnings, n_associated = dict[str, Any](), list(survey.warnings), 0
     if truth is not None:
         n_associated = len(associate(result.final.times_s, truth.times_s).estimate)
         warnings += truth_warnings(result.final, truth)
@@ -97,9 +100,25 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
             "network": network_residuals(result),
         },
     }  # fmt: skip
-    metrics = finite_tree(metrics)
-    warnings += metric_warnings(metrics)
-    return metrics | {"warnings": warnings, "warning": " ".join(warnings), "idealisations": [], "require": {}}
+    return _with_warnings(finite_tree(metrics), warnings)
+
+
+def unevaluated_replay(survey: ReplayEvaluation) -> dict[str, Any]:
+    """Returns the metrics of a replay without its evaluation: identity, data set and timing; all others None or 0."""
+    result = survey.result
+    unknown = {"alignment": None, "frames_with_truth": 0, "network": dict.fromkeys(NETWORK_KEYS)}
+    metrics = empty_metrics() | survey.identity | {
+        "schema": SCHEMA,
+        "timing": timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows)),
+        "replay": survey.source | unknown,
+    }  # fmt: skip
+    return _with_warnings(finite_tree(metrics), list(survey.warnings))
+
+
+def _with_warnings(metrics: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
+    """Returns the metrics with the given warnings and those that follow from the metrics themselves."""
+    found = [*warnings, *metric_warnings(metrics)]
+    return metrics | {"warnings": found, "warning": " ".join(found), "idealisations": [], "require": {}}
 
 
 def associate(estimated_s: Array, true_s: Array, max_difference_s: float = MAX_DIFFERENCE_S) -> Associated:
@@ -117,9 +136,7 @@ def associate(estimated_s: Array, true_s: Array, max_difference_s: float = MAX_D
     if not len(short):
         return Associated(np.zeros(0, np.int64), np.zeros(0, np.int64))
     order = np.argsort(long, kind="stable")
-    after = np.clip(np.searchsorted(long[order], short), 1, max(len(long) - 1, 1))
-    low, high = order[np.minimum(after - 1, len(long) - 1)], order[np.minimum(after, len(long) - 1)]
-    nearest = np.where(np.abs(long[high] - short) < np.abs(long[low] - short), high, low)
+    nearest = order[nearest_index(long[order], short)]
     kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_difference_s)
     pair = (kept, nearest[kept]) if truth_longer else (nearest[kept], kept)
     return Associated(*pair)
@@ -162,7 +179,12 @@ def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
-    """Returns warnings if the truth seems to have another clock, unit, scale or body than the estimate."""
+    """Returns warnings if the truth seems to have another clock, unit, scale or body than the estimate.
+
+    An estimate of fewer than three frames, as after an early interrupt, is too short for any of them.
+    """
+    if len(estimate) < _MIN_ASSOCIATED:
+        return []
     a, b = _associated_poses(estimate, truth)
     if len(a) < _MIN_ASSOCIATED:
         return [
@@ -204,7 +226,7 @@ def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
     poses = result.final.world_from_camera[result.keyframe_rows]
     found: dict[str, float | int | None] = {"links": len(measured), "loops": len(loops)}
     if not len(loops):
-        return found | dict.fromkeys(("loop_translation_m", "loop_rotation_deg", "loop_chi2"))
+        return dict.fromkeys(NETWORK_KEYS) | found
     residuals = np.array(
         [
             geometry.log(geometry.inverse(motion) @ geometry.inverse(poses[i]) @ poses[j])

@@ -61,7 +61,7 @@ def more_is_better(name: str) -> bool:
 
 
 def _value(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Returns the value of the metric with a dotted name, e.g. "map.le90_m"."""
+    """Returns the value of the metric with a dotted name, e.g. "map.le90_m"; None if it was not computed."""
     value: Any = metrics
     for key in name.split("."):
         value = value[key]

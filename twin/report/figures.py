@@ -108,7 +108,7 @@ def path_error_curves(run: Run) -> Figure | None:
         position.plot(errors.travelled_m, errors.distance_m, **style)
         height.plot(errors.travelled_m, errors.position_m[:, 2], **style)
         heading.plot(errors.travelled_m, np.rad2deg(errors.heading_rad), **style)
-    _log_scale(position)
+    log_scale(position)
     position.set(ylabel="position error [m]")
     height.set(ylabel="height error [m]")
     heading.set(ylabel="heading error [deg]", xlabel="length of the true path [m]")
@@ -116,7 +116,7 @@ def path_error_curves(run: Run) -> Figure | None:
     return figure
 
 
-def _log_scale(axes: Axes) -> None:
+def log_scale(axes: Axes) -> None:
     """Sets a logarithmic y axis that starts just below the 1st percentile of the positive values of all curves."""
     sizes = np.concatenate([np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines])
     sizes = sizes[sizes > 0]
@@ -328,7 +328,7 @@ def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None 
 
 
 def _extent(raster: Raster) -> tuple[float, float, float, float]:
-    """Returns west, east, south and north edge of a raster [m], in the order of matplotlib's `extent`."""
+    """Returns the west, east, south and north edges of a raster [m], in the order of matplotlib's `extent`."""
     grid = raster.grid
     return (grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.grid_triangles import raster_triangles
-from twin.core.records import Array, Image, StereoRig
+from twin.core.records import Array, Image, MapGrid, StereoRig
 from twin.report.run_folder import Raster
 
 #: Largest number of vertices of a surface; finer maps are subsampled.
@@ -46,14 +46,36 @@ def floor_surface(raster: Raster) -> Surface:
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
     """Returns the estimated map as a surface in the colours of the orthomosaic, or coloured by height without one."""
-    if mosaic is not None and mosaic.values.shape[0] * dem.values.shape[1] == (
-        mosaic.values.shape[1] * dem.values.shape[0]
-    ):
-        size = dem.values.shape[::-1]
-        return _surface(dem, np.asarray(cv2.resize(mosaic.values, size, interpolation=cv2.INTER_AREA), np.uint8))
+    if mosaic is not None and _covers_same_area(dem.grid, mosaic.grid):
+        return _surface(dem, _colours_of_cells(mosaic, dem.grid))
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
     level = np.nan_to_num(255 * (dem.values - low) / max(high - low, 1e-6)).astype(np.uint8)
     return _surface(dem, cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[..., ::-1])
+
+
+def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
+    """Returns whether two grids have the same north-west corner, and widths and heights that differ by less than a cell
+    plus a pixel.
+
+    A reduced orthomosaic (`run_folder.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
+    """
+    corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
+    size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m
+    tolerance_m = 1e-3 * min(cells.cell_m, pixels.cell_m)
+    return bool((np.abs(corner) < tolerance_m).all() and (np.abs(size) < cells.cell_m + pixels.cell_m).all())
+
+
+def _colours_of_cells(mosaic: Raster, cells: MapGrid) -> Image:
+    """Returns the colours (rows, cols, 3) of an orthomosaic in the cells of a map of the same area.
+
+    Cells outside the orthomosaic have the colours of its last row or column.
+    """
+    scale = mosaic.grid.cell_m / cells.cell_m
+    size = max(round(mosaic.grid.cols * scale), 1), max(round(mosaic.grid.rows * scale), 1)
+    colours = np.asarray(cv2.resize(mosaic.values, size, interpolation=cv2.INTER_AREA), np.uint8)
+    missing = max(cells.rows - size[1], 0), max(cells.cols - size[0], 0)
+    padded = np.pad(colours, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
+    return padded[: cells.rows, : cells.cols]
 
 
 def _surface(raster: Raster, colours: Image) -> Surface:

@@ -74,12 +74,14 @@ def conform(given: Any, template: Any, key: str = "", complete: bool = False) ->
 
     Args:
         given: the value.
-        template: a table (the values of its keys are checked; other keys are checked against its key "*", or accepted
-            without one), a list that holds the template of its items or is empty (items are not checked), or the
-            template of a single value: any string, Boolean or finite number stands for a value of its type,
-            `_OptionalText` for a string or None, None for a finite number or None, and NaN for a number, NaN or None.
+        template: a table (the values of its keys are checked; other keys are checked against its key "*"; without
+            that key they are accepted unchecked), a list that holds the template of its items or is empty (items are
+            not checked), or the template of a single value: any string, Boolean or finite number stands for a value of
+            its type, `_OptionalText` for a string or None, None for a finite number or None, and NaN for a number, NaN
+            or None.
         key: dotted key of the value, for the message.
-        complete: add the missing keys of tables, with None for numbers and [] for lists; a missing string is an error.
+        complete: add the missing keys of tables, with None for numbers and optional strings, and [] for lists; another
+            missing string is an error.
 
     Raises:
         ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.
@@ -122,7 +124,7 @@ def _join(key: str, name: str) -> str:
 
 
 def _scalar_rule(template: Any, given: Any) -> tuple[str, bool]:
-    """Returns a description of the values that a template allows for a single value, and whether it allows `given`."""
+    """Returns a description of the single values that a template allows, and whether `given` is one of them."""
     is_number = isinstance(given, int | float) and not isinstance(given, bool)
     if isinstance(template, str):
         return "a string", isinstance(given, str)

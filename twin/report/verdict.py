@@ -1,4 +1,4 @@
-"""First lines of a report: a badge with the verdict on the survey, and sentences on what limits its results."""
+"""First lines of a report: a badge with the verdict on the survey, and sentences on the limitations of its results."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ def badge(metrics: Mapping[str, Any] | None) -> Badge:
 def first_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Returns the sentences at the top of a report, the most serious first.
 
-    They state why a survey is not complete, each requirement missed, each warning, and what the scenario idealises.
+    They state the reason why a survey is not complete, each requirement missed, each warning, and each idealisation of
+    the scenario.
     """
     warnings = metrics.get("warnings") or list(filter(None, [metrics.get("warning")]))
     return [*_status(metrics), *_missed(metrics), *warnings, *metrics.get("idealisations", ())]

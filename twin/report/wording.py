@@ -232,16 +232,20 @@ def closed_form_comparison(links: Mapping[str, Any]) -> str:
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    """Returns the key figures of a survey; an empty list if `metrics` is empty."""
+    """Returns the key figures of a survey; an empty list if `metrics` is empty.
+
+    A replay has only the figures that have a value: recorded images have no plan, and often no truth.
+    """
     if not metrics:
         return []
     mosaic = metrics.get("orthomosaic") or {}
-    return [
+    figures = [
         *_position_figures(metrics),
         *_map_figures(metrics),
         *(_orthomosaic_figures(mosaic) if mosaic.get("pixel_m") else []),
         *_survey_figures(metrics),
     ]
+    return [figure for figure in figures if figure.value != DASH] if metrics.get("replay") else figures
 
 
 def _position_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
@@ -264,13 +268,23 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     completeness, cell = percent(elevation["completeness"]), length(elevation["cell_m"])
     area = percent(elevation.get("completeness_area"))
     mapped = f"over the mapped {completeness} of the observed floor"
-    return [
+    figures = [
         KeyFigure("Completeness", area, f"of the asked area; {completeness} of the observed floor; cell size {cell}"),
         KeyFigure("Map LE90, asked area", area_le90(elevation), f"a hole counts as infinite; {area} has a height"),
         KeyFigure("Map LE90, mapped floor", le90, f"{mapped}; NMAD {nmad}"),
         KeyFigure("Map bias", bias, f"{mapped}; RMSE {rmse}"),
         KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), f"RMS of error / sigma, 1 is right; {mapped}"),
     ]
+    if elevation.get("objects_le90_m") is not None:
+        figures += [_surface_figure(elevation, "floor", "bare floor"), _surface_figure(elevation, "objects", "objects")]
+    return figures
+
+
+def _surface_figure(elevation: Mapping[str, Any], key: str, name: str) -> KeyFigure:
+    """Returns the key figure of the height errors over the floor or the objects; `key` is the prefix of its metrics."""
+    median, gross = length(elevation[f"{key}_median_m"]), percent(elevation[f"{key}_gross_share"])
+    text = f"median of the absolute errors {median}; more than 10 cm in {gross} of the cells"
+    return KeyFigure(f"Map LE90, {name}", length(elevation[f"{key}_le90_m"]), text)
 
 
 def _orthomosaic_figures(mosaic: Mapping[str, Any]) -> list[KeyFigure]:

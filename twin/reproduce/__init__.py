@@ -1,1 +1,1 @@
-"""Reproduction of the turbidity figure of Negahdaripour & Madjidi (2003), and validation of the light model."""
+"""Experiments of `twin reproduce`: those of Negahdaripour & Madjidi (2003), and validation of the light model."""

@@ -182,7 +182,7 @@ def reference_scene(daylight: Daylight, water: Medium, surface_m: float) -> Refe
 
 
 def daylight_table(found: Sequence[DaylightCell]) -> list[tuple[str, ...]]:
-    """Returns the cells as rows of text, the header first; standard errors follow +-."""
+    """Returns the table of the results: a header, then one row per `DaylightCell`; standard errors follow "+-"."""
     header = (
         "water, sun", "depth, range", "Ed, model / truth", f"{SLOPE_DEG:g} deg to the sun", "away from it",
         "Lu/Ed, truth", "model / truth", "albedo 0.5, truth", "model / truth",

@@ -16,7 +16,7 @@ Row = tuple[str, ...]
 
 
 class Table(NamedTuple):
-    """A table.
+    """A table of the results of an experiment.
 
     Args:
         key: name of the table within its experiment.

@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 WATERS, HEIGHTS_M = ("IB", "II", "III", "1C", "3C"), (1.0, 2.0, 3.0)
 #: Pixels as fractions of image width and height: centre, right of it, lower right corner.
 PIXELS = ((0.5, 0.5), (0.8, 0.5), (0.95, 0.95))
-#: Lamp arrangements: that of the scenario `quickstart`, and narrow beams far from the cameras, panned inwards.
+#: Lamp arrangements: that of the scenario `reef`, and narrow beams far from the cameras, panned inwards.
 LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {
     "leds": (),
     "spots": tuple(
@@ -83,7 +83,7 @@ def cells(selection: Selection = ALL, walks: int = MOST_WALKS, phase: str = "sea
     for water in selection.waters:
         for lamps in selection.lamp_arrangements:
             settings = f"water.jerlov={water}", f"water.phase_function={phase}", "sun.illuminance_lx=0"
-            scenario = load_scenario("quickstart", [*settings, *LAMP_ARRANGEMENTS[lamps]])
+            scenario = load_scenario("reef", [*settings, *LAMP_ARRANGEMENTS[lamps]])
             for height_m in selection.heights_m:
                 for place in selection.pixels:
                     yield _cell(scenario, (water, lamps, height_m, place), walks)

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Truth
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
+from twin.reproduce.conclusion import finished, required_map
 from twin.scenario.model import Scenario
 from twin.session.assembly import image_vision, make_navigator, open_world
 from twin.survey import fly
@@ -29,7 +31,7 @@ class Flown:
         elevation: map along the final trajectory; after a flight without alignment, along the F2F trajectory.
         truth: true trajectory and floor.
         stages: durations of the processing stages, as `Stopwatch.summary` returns them.
-        ended: reason why the flight ended early; "" if it did not.
+        ended: why the flight ended early or the final alignment is missing; "" if neither is the case.
     """
 
     mission: Mission
@@ -74,8 +76,12 @@ def _f2f_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stop
 
 
 def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Navigator]) -> Flown:
-    """Flies a mission with the navigator that `make` returns, and builds its map."""
-    stopwatch, ended = Stopwatch(), ""
+    """Flies a mission with the navigator that `make` returns, and builds the elevation map.
+
+    Raises:
+        TwinError: no stereo pair became a keyframe, so that there is no map.
+    """
+    stopwatch, guard = Stopwatch(), StageGuard()
     with (
         tempfile.TemporaryDirectory(prefix="twin-") as folder,
         open_world(mission, stopwatch) as world,
@@ -84,12 +90,10 @@ def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Nav
         try:
             fly(mission, world, navigator, lambda *_: None)
         except SurveyAborted as error:
-            ended = str(error)
-        result = navigator.finish()
+            guard.cause = str(error)
+        result = finished(navigator, guard)
         if isinstance(navigator, F2fNavigator):
             result = replace(result, online=result.f2f, final=result.f2f)
         with stopwatch("map"):
-            elevation = navigator.build_map(result, mission.grid)
-        if elevation is None:
-            raise SurveyAborted(f"no keyframe: {ended}")
-        return Flown(mission, result, elevation, world.truth(), stopwatch.summary(), ended)
+            elevation = required_map(navigator, result, mission.grid, guard)
+        return Flown(mission, result, elevation, world.truth(), stopwatch.summary(), guard.cause)

@@ -32,6 +32,11 @@ class RigPath(NamedTuple):
     world_from_camera: Array
     repeats: tuple[int, ...] = ()
 
+    @property
+    def start(self) -> Array:
+        """Returns the planned pose (4, 4) of the left camera at the first frame: level, optical axis along -z."""
+        return geometry.pose(geometry.rotations_of_down_camera(np.zeros(1))[0], self.planned_m[0])
+
 
 def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
     """Returns the path of the first test: parallel legs along x joined by half circles, 5 cm between pairs."""
@@ -47,7 +52,7 @@ def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
     points = np.concatenate(parts)
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     along = STEP_M * np.arange(n_pairs)
-    return _ridden(np.column_stack([np.interp(along, lengths, points[:, axis]) for axis in range(2)]), seed)
+    return _rig_path(np.column_stack([np.interp(along, lengths, points[:, axis]) for axis in range(2)]), seed)
 
 
 def two_loops_path(seed: int) -> RigPath:
@@ -55,14 +60,14 @@ def two_loops_path(seed: int) -> RigPath:
     radius_m = N_LOOP * STEP_M / (2 * np.pi)
     angle = 2 * np.pi * np.arange(N_LOOP + 1) / N_LOOP
     loop = radius_m * np.column_stack([1 - np.cos(angle), np.sin(angle)])
-    path = _ridden(np.concatenate([loop, loop[1:] * [-1, 1]]), seed)
+    path = _rig_path(np.concatenate([loop, loop[1:] * [-1, 1]]), seed)
     poses = path.world_from_camera.copy()
     repeats = N_LOOP, 2 * N_LOOP
     poses[list(repeats)] = poses[0]
     return RigPath(path.planned_m, poses, repeats)
 
 
-def _ridden(xy: Array, seed: int) -> RigPath:
+def _rig_path(xy: Array, seed: int) -> RigPath:
     """Returns the path for planned positions `xy` (n, 2) [m]; true poses include the bend of the track and jitter."""
     rng, n = np.random.default_rng(seed), len(xy)
     planned = np.column_stack([xy, np.full(n, HEIGHT_M)])

@@ -13,9 +13,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from twin.judge.map_error import height_error
 from twin.report.style import COLOURS, FIGURE_STYLE
-from twin.reproduce.tank_survey import TankSurvey
+from twin.reproduce.tank_survey import TankSurvey, height_errors
 
 LEAST_M, LARGEST_M = 2e-4, 0.1  # limits of the logarithmic scale of sigma and error
 
@@ -32,7 +31,7 @@ def draw(title: str, survey: TankSurvey, file: Path) -> Path:
         _raster(panels[0, 1], survey, survey.truth.height_m, ("true height [m]", "viridis", heights))
         _raster(panels[1, 1], survey, survey.elevation.height_m, ("height in the map [m]", "viridis", heights))
         scale = LogNorm(LEAST_M, LARGEST_M)
-        error = np.maximum(np.abs(height_error(survey.elevation, survey.truth)), LEAST_M)
+        error = np.maximum(np.abs(height_errors(survey)), LEAST_M)
         _raster(panels[0, 2], survey, survey.elevation.sigma_m, ("predicted sigma [m]", "magma", scale))
         _raster(panels[1, 2], survey, error, ("absolute height error [m]", "magma", scale))
         FigureCanvasAgg(figure).print_png(str(file))

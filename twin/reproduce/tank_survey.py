@@ -1,4 +1,4 @@
-"""Tank experiments: images of a rig on an overhead track, processed like those of a survey, compared with the truth."""
+"""Tank experiments: estimates from the images that a rig on an overhead track takes, compared with the truth."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from controllers.segments import Reference
 from twin.core import geometry
+from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.estimate.pipeline import Navigator
+from twin.judge.trajectory import anchor
+from twin.reproduce.conclusion import finished, required_map
 from twin.reproduce.tank_path import RigPath, lawnmower_path, two_loops_path
 from twin.reproduce.tank_scene import tank_floor
 from twin.scenario.file import load_scenario
@@ -41,6 +44,7 @@ class TankSurvey:
         result: output of the estimators.
         elevation: map along the final trajectory.
         truth: true trajectory and floor.
+        ended: why the final alignment is missing; "" if it is not.
     """
 
     mission: Mission
@@ -48,6 +52,7 @@ class TankSurvey:
     result: SurveyResult
     elevation: ElevationMap
     truth: Truth
+    ended: str = ""
 
 
 class Closure(NamedTuple):
@@ -69,20 +74,25 @@ class Closure(NamedTuple):
 def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: int = N_PAIRS) -> TankSurvey:
     """Returns the survey of a tank experiment.
 
+    The estimators start at the planned pose of the first frame; the rig is off it by the bend and jitter of the track.
+
     Args:
         name: "tank1", parallel legs, or "tank2", two loops that cross at the start.
         folder: folder for the keyframe images.
         settings: overrides of the scenario `tank`, each "key=value".
         n_pairs: number of stereo pairs of tank1.
+
+    Raises:
+        TwinError: no stereo pair became a keyframe, so that there is no map.
     """
     path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(n_pairs, SEED)
     mission = _mission(settings)
-    stopwatch = Stopwatch()
+    stopwatch, guard = Stopwatch(), StageGuard()
     rig, estimator = mission.rig, mission.scenario.estimator_settings()
     vision = image_vision(mission, folder, stopwatch)
     with (
         RenderedWorld(mission, stopwatch) as world,
-        Navigator(rig, estimator, path.world_from_camera[0], vision=vision, stopwatch=stopwatch) as navigator,
+        Navigator(rig, estimator, path.start, vision=vision, stopwatch=stopwatch) as navigator,
     ):
         vehicle, first = world.vehicle, None
         assert isinstance(vehicle, KinematicVehicle)
@@ -93,10 +103,23 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
             repeated = k in path.repeats
             navigator.update(replace(frame, left=first.left, right=first.right) if repeated else frame)
         world.start_sequence(_sequence(path, rig.frame_rate_hz), 1)
-        result, truth = navigator.finish(), world.truth()
-        elevation = navigator.build_map(result, mission.grid)
-    assert elevation is not None
-    return TankSurvey(mission, path, result, elevation, truth)
+        result, truth = finished(navigator, guard), world.truth()
+        elevation = required_map(navigator, result, mission.grid, guard)
+    return TankSurvey(mission, path, result, elevation, truth, guard.cause)
+
+
+def height_errors(survey: TankSurvey) -> Array:
+    """Returns estimated minus true height (rows, cols) [m], anchored at the first true pose as the trajectories are.
+
+    The motion that maps the first estimated pose to the first true one is applied to the map before the comparison:
+    the estimators do not know where on the bent track the rig starts. NaN where a cell was not observed or estimated.
+    """
+    true_from_map = anchor(survey.result.final.world_from_camera[0], survey.truth.trajectory.world_from_camera[0])
+    x, y = np.meshgrid(*survey.mission.grid.centres())
+    points = np.stack([x, y, survey.elevation.height_m.astype(np.float64)], axis=-1)
+    moved = geometry.transform(true_from_map, points.reshape(-1, 3)).reshape(points.shape)
+    error_m = moved[..., 2] - survey.mission.terrain.height_at(moved[..., 0], moved[..., 1])
+    return np.where(survey.truth.seen, error_m, np.nan)
 
 
 def _mission(settings: Sequence[str]) -> Mission:

@@ -50,7 +50,7 @@ def render_levels(
     """
     levels, floor = [], block_on_sand(seed=1)
     for turbidity in turbidities:
-        scenario = load_scenario("quickstart", [*SETTINGS, f"water.turbidity={turbidity}", *settings])
+        scenario = load_scenario("reef", [*SETTINGS, f"water.turbidity={turbidity}", *settings])
         mission = replace(prepare(scenario), terrain=floor)
         view, water = render_view(mission), mission.illumination.water
         contrast = relative_contrast(scenario, mission.illumination, ranges_m)

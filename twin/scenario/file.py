@@ -33,6 +33,7 @@ _RENAMED_KEYS = {
     "imaging.forward_scatter": "imaging.scattering",
 }
 #: File of an item of `[[objects]]`.
+_OBJECT = re.compile(r"objects\.\d+")
 _OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 _ABSENT = object()
 #: Largest number of errors of one file that are listed.
@@ -181,11 +182,15 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
     """Reads a file and merges it over its base file.
 
     Args:
+        file: the scenario file.
         including_files: absolute paths of the files that extend this one, directly or indirectly.
 
     Returns:
         The merged keys and values, with absolute file paths and without old names of renamed keys; the files and line
         numbers that they come from; and one error for each old name.
+
+    Raises:
+        ScenarioError: the file extends itself, or a file cannot be read.
     """
     if resolved(file) in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
@@ -249,7 +254,7 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    """Sets a key of the tree to a value, both given as `key=value`."""
+    """Sets a key of the tree to a value, both given as `key=value`; raises ScenarioError if one is not valid."""
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -259,12 +264,20 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     value = _override_value(key, text)
+    if "." not in key:
+        _resolve_paths({key: value}, Path.cwd())
+    elif _OBJECT.fullmatch(key):
+        _resolve_paths({"objects": [value]}, Path.cwd())
     is_path = _is_path_key(key) and not isinstance(value, list)
     _assign(tree, key, str(_expand(str(value), Path.cwd())) if is_path else value, f"--set {shown(override)}")
 
 
 def _override_value(key: str, text: str) -> Any:
-    """Returns the value of an override: the TOML value that the text contains; the text itself if it is not TOML."""
+    """Returns the TOML value in the text of an override; the text itself if it is not TOML.
+
+    Raises:
+        ScenarioError: the value exceeds the limits of `toml_text`.
+    """
     try:
         given = parse_toml(f"v = {text}")
     except tomllib.TOMLDecodeError:
@@ -282,7 +295,13 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
     """Sets a dotted key in the tree.
 
     Args:
+        tree: keys and values, modified in place.
+        key: the dotted key.
+        value: its new value.
         origin: text that names the source of the value, at the beginning of error messages.
+
+    Raises:
+        ScenarioError: the key leads into a value that is not a section, or to no item of a list.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -298,7 +317,11 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
 
 
 def _child(node: Any, part: str, origin: str) -> Any:
-    """Returns the section or list item `part` of a node; a missing section is created."""
+    """Returns the section or list item `part` of a node; a missing section is created.
+
+    Raises:
+        ScenarioError: the list has no such item; the message begins with `origin`.
+    """
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdigit() or int(part) >= len(node):
@@ -335,6 +358,7 @@ _ALLOWED = {
     "dict_type": "a section",
     "string_type": "a string",
     "string_too_short": "a non-empty string",
+    "string_pattern_mismatch": "module:Class, or the name of an entry point",
     "int_type": "an integer",
     "int_parsing": "an integer",
     "int_from_float": "an integer",

@@ -6,12 +6,14 @@ from twin.scenario.model import CalibrationErrorConfig, Scenario
 
 
 def idealisations(scenario: Scenario) -> list[str]:
-    """Returns a sentence for each idealised part of a scenario: cameras, water, light, vehicle, images."""
+    """Returns a sentence for each idealised part of a scenario: cameras, water, light, vehicle,
+    restored colours, images."""
     subjects = {
         "The cameras are ideal": _cameras(scenario),
         "The water is ideal": _water(scenario),
         "The light is ideal": _light(scenario),
         "The vehicle is ideal": _vehicle(scenario),
+        "The restored colours are ideal": _restoration(scenario),
     }
     sentences = [f"{subject}: {', '.join(missing)}." for subject, missing in subjects.items() if missing]
     if scenario.imaging.fidelity == "surrogate":
@@ -56,6 +58,15 @@ def _light(scenario: Scenario) -> list[str]:
 def _vehicle(scenario: Scenario) -> list[str]:
     """Returns the names of the effects of a real vehicle that the scenario leaves out."""
     return _named({"no forces, no inertia": scenario.vehicle.dynamics == "kinematic"})
+
+
+def _restoration(scenario: Scenario) -> list[str]:
+    """Returns the errors that the restoration of real images has and that of this scenario has not.
+
+    Simulated images are restored with the true values of water, lamps, vignetting and exposure.
+    """
+    made = scenario.imaging.fidelity != "surrogate" and scenario.map.orthomosaic
+    return _named({"no error of water, lamps, vignetting and exposure": made and scenario.map.restore})
 
 
 def _named(absent: dict[str, bool]) -> list[str]:

@@ -19,6 +19,7 @@ from twin.errors import TwinError
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 
 FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of texels of the default size [m]
+PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
 Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
@@ -66,6 +67,11 @@ class TerrainConfig(Section):
     kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file"] = Field(
         default="reef", description="generator of the heights, or file for a measured DEM"
     )
+    plugin: str | None = Field(
+        default=None, max_length=200, pattern=PLUGIN_NAME,
+        description="generator of another package for the heights, which replaces that of kind and its relief_m and "
+        "base_m: module:Class, or the name of an entry point twin.terrains; it runs code of that package",
+    )  # fmt: skip
     size_m: tuple[Metres, Metres] = Field(
         default=(10.0, 10.0), description="extent along x and y, centred at the origin [m]"
     )
@@ -92,10 +98,11 @@ class TerrainConfig(Section):
         description="direction in which the values of height_file increase: up for elevations, down for depths; "
         "default: determined from the file; an ambiguous file is an error",
     )
-    cover: Literal["sand", "rubble", "rock", "reef", "seagrass", "mud"] | None = Field(
+    cover: Literal["sand", "rubble", "rock", "reef", "coral", "seagrass", "mud"] | None = Field(
         default=None,
         description="materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; "
-        "default: that of the kind of floor",
+        "coral: sand, fragments of coral and rock with crustose algae; "
+        "default: that of the kind of floor; not with texture_file",
     )
     texture_file: FilePath | None = Field(
         default=None, description="photo of a piece of sea floor, which becomes the texture; default: a generated one"
@@ -103,7 +110,7 @@ class TerrainConfig(Section):
     texture_tiling: Literal["stochastic", "repeat"] = Field(
         default="stochastic",
         description="stochastic: the texture is made of pieces of the photo, evenly lit, without visible repetition; "
-        "repeat: the photo is repeated unchanged",
+        "repeat: the photo is repeated unchanged; needs texture_file",
     )
     orthophoto_file: FilePath | None = Field(
         default=None,
@@ -691,13 +698,19 @@ class ObjectConfig(Section):
     centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of area_m: x, y in the scene [m]")
     spacing_m: float = Field(
         default=0.0, ge=0, le=1000,
-        description="least distance between the centres of scattered objects (Poisson disc), which never overlap [m]",
+        description="least distance from the centre of a scattered object to the centres of all objects placed before "
+        "it, those of other entries too (Poisson disc); scattered objects never overlap any object [m]",
     )  # fmt: skip
 
 
 class ControlConfig(Section):
     """Trajectory following and station keeping."""
 
+    plugin: str | None = Field(
+        default=None, max_length=200, pattern=PLUGIN_NAME,
+        description="controller of another package, which replaces the pose controller: module:Class, or the name of "
+        "an entry point twin.controllers; it runs code of that package",
+    )  # fmt: skip
     hold_s: float = Field(
         default=2.0, ge=0.1, le=600, description="station keeping at the end of a track, during global alignment [s]"
     )
@@ -714,6 +727,11 @@ class ControlConfig(Section):
 class EstimateConfig(Section):
     """Settings of motion estimation, the keyframe network and global alignment (GA)."""
 
+    plugin: str | None = Field(
+        default=None, max_length=200, pattern=PLUGIN_NAME,
+        description="estimator of another package, which replaces motion estimation, network and alignment: "
+        "module:Class, or the name of an entry point twin.estimators; it runs code of that package",
+    )  # fmt: skip
     window_tracks: int = Field(
         default=EstimatorSettings.window_tracks, ge=0, le=1000,
         description="number of previous tracks in the window of global alignment",
@@ -803,6 +821,11 @@ class Scenario(Section):
 
     name: str = Field(default="survey", min_length=1, max_length=80, description="name of the survey")
     seed: int = Field(default=0, ge=0, lt=2**32, description="seed of all random numbers")
+    record: Literal["none", "keyframes", "all"] = Field(
+        default="keyframes",
+        description="images that the run folder keeps, for `twin export` and the report. keyframes: stereo pairs of "
+        "the keyframes; all: also the left image of every other frame; none: no images",
+    )
     terrain: TerrainConfig = TerrainConfig()
     vehicle: VehicleConfig = VehicleConfig()
     rig: RigConfig = RigConfig()
@@ -883,11 +906,11 @@ class Scenario(Section):
 
     def estimator_settings(self) -> EstimatorSettings:
         """Returns the settings of the estimators."""
-        return EstimatorSettings(**self.estimate.model_dump())
+        return EstimatorSettings(**self.estimate.model_dump(exclude={"plugin"}))
 
     def fingerprint(self) -> str:
-        """Returns a hash of all values, 16 hexadecimal digits. Input files enter by path, not by content."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        """Returns a hash of all values except `record`, 16 hexadecimal digits; of files, only the paths are hashed."""
+        return hashlib.sha256(self.model_dump_json(exclude={"record"}).encode()).hexdigest()[:16]
 
 
 def _tan_deg(angle_deg: float) -> float:

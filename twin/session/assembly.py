@@ -8,6 +8,7 @@ from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
+from twin.session.plugin_estimator import PluginNavigator
 from twin.world.mission import Mission
 from twin.world.world import World
 
@@ -26,13 +27,21 @@ def open_world(mission: Mission, stopwatch: StageTimer) -> World:
 
 
 def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators of a survey; their visual measurements come from images or from the surrogate world.
+    """Returns the estimators of a survey, or those of the plug-in that the scenario names.
+
+    Their visual measurements come from rendered images or from the surrogate.
 
     Args:
+        mission: the survey.
+        world: the flown world; in a surrogate survey it makes the visual measurements.
         folder: run folder; keyframe images and mosaic tiles are stored in its subfolder "keyframes".
+        stopwatch: timer of the stages.
     """
     if mission.scenario.imaging.fidelity == "rendered":
-        return navigator_with(mission, image_vision(mission, folder, stopwatch), stopwatch)
+        vision = image_vision(mission, folder, stopwatch)
+        if (plugin := mission.scenario.estimate.plugin) is not None:
+            return PluginNavigator(mission, plugin, vision, stopwatch)
+        return navigator_with(mission, vision, stopwatch)
     from twin.surrogate.surrogate_world import SurrogateWorld
 
     assert isinstance(world, SurrogateWorld)

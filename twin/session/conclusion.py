@@ -15,6 +15,7 @@ from twin.estimate.pipeline import Navigator, finish_in_stage
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
 from twin.scenario.idealisations import idealisations
+from twin.scenario.model import Scenario
 from twin.session.monitor import SurveyMonitor
 from twin.session.orthomosaic import is_wanted, make_orthomosaic
 from twin.session.survey_check import calibration_notes, survey_findings
@@ -33,7 +34,7 @@ class RunResult(NamedTuple):
     folder: Path
 
 
-class Flight(NamedTuple):
+class FlownSurvey(NamedTuple):
     """A survey that has been flown.
 
     Args:
@@ -51,7 +52,7 @@ class Flight(NamedTuple):
     guard: StageGuard
 
 
-def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
+def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
     """Aligns all keyframes, builds the map, compares trajectories and map with the truth, and writes the run folder.
 
     An interrupt ends only the current stage; the survey then has the status "aborted" with a reason that names the
@@ -87,7 +88,10 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
     actions = monitor.actions.times
     survey = EvaluationInput(
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
-        [*world.warnings, *calibration_notes(result, mission.rig), *filter(None, [actions.sentence])],
+        [
+            *plugin_notes(scenario), *world.warnings, *calibration_notes(result, mission.rig),
+            *filter(None, [actions.sentence]),
+        ],
         idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
     )  # fmt: skip
     metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
@@ -107,6 +111,17 @@ def conclude(flight: Flight, folder: RunFolder, monitor: SurveyMonitor) -> RunRe
         guard,
     )
     return RunResult(metrics["status"], metrics, folder.path)
+
+
+def plugin_notes(scenario: Scenario) -> list[str]:
+    """Returns one sentence on each plug-in of the survey."""
+    notes = {
+        scenario.terrain.plugin: "The heights of the floor are those of the plug-in {}.",
+        scenario.control.plugin: "The vehicle was steered by the plug-in {}.",
+        scenario.estimate.plugin: "The trajectories are those of the plug-in {}: its online poses (shown as F2F and as "
+        "online) and the poses that it returned at the end (final). There are no links and no alignments.",
+    }
+    return [note.format(name) for name, note in notes.items() if name is not None]
 
 
 def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:

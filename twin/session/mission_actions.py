@@ -1,4 +1,4 @@
-"""Actions of a mission in poor visibility: the vehicle slows down if frames are lost, and stops if none is measured."""
+"""Actions of a mission in poor visibility: the vehicle slows down if frames are lost, and stops without vision."""
 
 from __future__ import annotations
 

@@ -42,6 +42,8 @@ class SurveyMonitor:
     """Reports the progress of a survey at every frame; aborts it if vision is lost or the position too uncertain.
 
     Args:
+        mission: the survey as planned.
+        folder: run folder, for the log.
         progress: function called with the progress after every frame and during the later stages.
         live: whether to show the survey in Rerun while it runs.
     """

@@ -158,7 +158,7 @@ class StudyAnalysis:
 
     @cached_property
     def clusters(self) -> Array:
-        """Returns the cluster label of each survey (n,)."""
+        """Returns the label of the cluster of each survey (n,): the surveys of a cluster share a sample or a seed."""
         return self.numbers(self.cluster_name)
 
     @cached_property

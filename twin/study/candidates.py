@@ -266,7 +266,7 @@ class CandidateSurveys:
 
 
 def median_of(scores: list[SurveyScore], name: str) -> float | None:
-    """Returns the median of a metric over the completed surveys; None if none has a value.
+    """Returns the median of a metric over the surveys with status "complete"; None if none has a value.
 
     A missing LE90 over the asked area counts as infinite, because the map then has too many holes.
     """

@@ -52,7 +52,11 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of SLURM jobs as configured in Dask (jobqueue.slurm); default: one core and 4 GB per job."""
+    """Returns a cluster of SLURM jobs as configured in Dask (jobqueue.slurm); default: one core and 4 GB per job.
+
+    Raises:
+        TwinError: dask-jobqueue is not installed.
+    """
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:

@@ -163,7 +163,7 @@ def fly_surveys(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> bool:
-    """Flies surveys and calls `add_row` with the row of each; returns False if Ctrl-C ended it early, else True."""
+    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True."""
     try:
         for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
             row = row_of_outcome(outcome)

@@ -170,7 +170,10 @@ class Tuning:
 
     @property
     def recommended(self) -> Candidate | None:
-        """Returns the cheapest plan that passed verification; the cheapest confirmed plan if plans are not verified."""
+        """Returns the cheapest plan that passed verification; the cheapest confirmed plan if plans are not verified.
+
+        None if there is no such plan.
+        """
         if not self.is_verifying:
             return self.confirmed
         passed = [v.surrogate._replace(shortfall=0.0) for v in self.verifications.values() if v.passed]
@@ -234,11 +237,11 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the plan most likely to pass among the unverified plans that are cheaper than the recommended one.
+        """Returns the next plan to verify that is cheaper than the recommended one.
 
-        None if no plan is recommended, or if no such plan is left. It is one of the plans that no other cheaper plan
-        dominates: the one with the smallest shortfall of the pass probability, and the most expensive one of several
-        with the same shortfall.
+        The candidates are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those
+        that are not verified, the one with the smallest shortfall of the pass probability is returned; of several with
+        the same shortfall, the most expensive one. None if no plan is recommended, or if all candidates are verified.
         """
         if self.recommended is None:
             return None

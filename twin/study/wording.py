@@ -77,9 +77,10 @@ def confidence(interval: Interval) -> str:
 
 
 def headline(study: Study, analysis: StudyAnalysis) -> str:
-    """Returns the main results of a study: passing values of the `seek` key, pass probability, requirement met or not.
+    """Returns the main results of a study as text.
 
-    Also states the numbers of surveys that are not counted.
+    They are the answer for the key that `seek` of the study names, the pass probability, whether the requirement is
+    met, and the numbers of surveys that are not counted.
     """
     n = int(analysis.evaluated.sum())
     left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)

@@ -95,7 +95,7 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), with the last line of its first output paragraph."""
+        """Returns how the process ended (signal or exit status), and the last line of its output before a blank one."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)

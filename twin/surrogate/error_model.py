@@ -57,9 +57,9 @@ class DepthLaw(NamedTuple):
 
     Args:
         floor_px: standard deviation from one keyframe in noise-free images [px of disparity].
-        slope: ratio of that standard deviation to the Cramer-Rao bound for large bounds.
-        lamp_growth: the part that grows with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2), where
-            lamp_share is the fraction of the reflected light that comes from the lamps.
+        slope: ratio of that standard deviation to the Cramér-Rao bound for large bounds.
+        lamp_growth: the standard deviation is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2), where lamp_share
+            is the fraction of the reflected light that comes from the lamps.
         common: fraction of the variance that all keyframes share.
         gain: information that each further keyframe adds, relative to the first one, if keyframes are far apart.
         half_step: distance between keyframes at which it adds half of that [stereo baselines].
@@ -76,11 +76,11 @@ class DepthLaw(NamedTuple):
         """Returns the standard deviation from one keyframe [px of disparity].
 
         Args:
-            bound_px: Cramer-Rao bound [px].
+            bound_px: Cramér-Rao bound [px].
             lamp_share: fraction of the reflected light that comes from the lamps.
         """
-        noise_px = self.slope * np.asarray(bound_px) * np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
-        return np.hypot(self.floor_px, noise_px)
+        lamp_factor = np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
+        return np.hypot(self.floor_px, self.slope * np.asarray(bound_px)) * lamp_factor
 
     def relative_variance(self, n_views: Array | float, step_baselines: Array | float) -> Array:
         """Returns the variance after n keyframes, divided by that of one keyframe.
@@ -135,8 +135,8 @@ class BorderLaw(NamedTuple):
     Args:
         share: fraction at the border.
         floor_px: width in noise-free images [px].
-        slope: width per Cramer-Rao bound, for large bounds.
-        lamp_growth: growth of the part of the width that increases with the bound; see `DepthLaw`.
+        slope: width per Cramér-Rao bound, for large bounds.
+        lamp_growth: the part that increases with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2).
     """
 
     share: float
@@ -145,7 +145,7 @@ class BorderLaw(NamedTuple):
     lamp_growth: float
 
     def width_px(self, bound_px: Array | float, lamp_share: Array | float) -> Array:
-        """Returns the width [px] at a Cramer-Rao bound [px] and a fraction of light from the lamps."""
+        """Returns the width [px] at a Cramér-Rao bound [px] and a fraction of light from the lamps."""
         noise_px = self.slope * np.asarray(bound_px) * np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
         return np.hypot(self.floor_px, noise_px)
 
@@ -161,11 +161,17 @@ class ErrorModel(NamedTuple):
         bound_range_px: smallest and largest Cramér-Rao bound of the surveys to which the model was fitted.
         point_fraction: number of matched stereo points of a keyframe, as a fraction of the number that the scenario
             asks for (`estimate.points`).
-        match_sigma_px: reported standard deviation of a patch's position in one image.
+        match_sigma_px: reported standard deviation of a patch's position in one image of a level floor.
+        stereo_relief_gain: increase of this standard deviation over relief: it becomes
+            sqrt(match_sigma_px^2 + (stereo_relief_gain * p)^2), where p is the RMS parallax of the relief within a
+            patch between the two cameras, i.e. its unevenness times baseline / depth (see `matchability`).
         match_error_ratio: ratio of the true to the reported standard deviation of a patch's position in one image.
-        lamp_error_growth: growth of the match error due to the lamps on the vehicle: the square of `match_error_ratio`
-            is multiplied by 1 + (lamp_error_growth * lamp_share)^2, where lamp_share is the fraction of the reflected
-            light that comes from the lamps.
+        lamp_error_growth: growth of the match errors of links due to the lamps on the vehicle: the squares of
+            `match_error_ratio` and of `relief_gain` are multiplied by 1 + (lamp_error_growth * lamp_share)^2, where
+            lamp_share is the fraction of the reflected light that comes from the lamps. Shading and brightness of a
+            patch change when the lamps move.
+        lamp_sigma_growth: growth of the reported covariance of a link due to the lamps, which the estimators derive
+            from residuals: it is multiplied by 1 + (lamp_sigma_growth * lamp_share)^2.
         match_fraction: fraction of a keyframe's points in the field of view of another keyframe that are matched there.
         match_parallax_px: parallax of the relief within a patch, i.e. its unevenness times distance / depth, at which
             half of the points that could be matched between two keyframes are matched. The fraction is
@@ -176,8 +182,9 @@ class ErrorModel(NamedTuple):
         match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
             of its standard deviation, the error is r b + sqrt(1 - r^2) e, where b and e have unit variance, b is common
             to all links to that pair, and e is independent from link to link.
-        distance_growth: growth of the reported match variance with the distance between two keyframes: the variance
-            is multiplied by 1 + (distance_growth * distance / depth)^2.
+        distance_growth: growth of the reported and of the true match variance in the earlier keyframe of a link with
+            the distance between the two keyframes: the variance is multiplied by
+            1 + (distance_growth * distance / depth)^2.
         relief_gain: standard deviation of the match error due to relief within the patch, per pixel of unevenness (see
             `matchability`) and per unit of distance / depth. The error is the same for all matches of one patch of
             floor, so it accumulates along a path. Let g = (g_x, g_y) be the image gradient in x (along rows) and y,
@@ -213,12 +220,14 @@ class ErrorModel(NamedTuple):
         map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
             Kalman depth filter provides a depth.
         border_holes: fraction of the cells without a depth near the borders of the images.
-        relief_error_gain: true standard deviation of the height error due to the roughness of a cell, per roughness.
-            The roughness is the RMS deviation of the floor from a plane within the window of dense matching. The error
-            is common to all views of the cell.
+        relief_error_gain: true standard deviation of the height error due to the roughness of a cell, per roughness,
+            for roughness of about `relief_error_limit_px / relief_error_gain`; see `map_model.roughness_error_px`. The
+            roughness is the RMS deviation of the floor from a plane within the window of dense matching. The error is
+            common to all views of the cell.
         relief_error_limit_px: limit of this standard deviation for large roughness [px of disparity].
         edge_error_gain: true standard deviation of the height error at edges, where the matching window shows two
-            surfaces, per unresolved roughness r^3 / (r^2 + `map_model.EDGE_PX`^2) for the roughness r.
+            surfaces, per unresolved roughness r^3 / (r^2 + `map_model.EDGE_PX`^2) for the roughness r. The errors are
+            gross errors of a quarter of the cells (`map_model.gross_noise`).
         edge_sigma_gain: reported standard deviation of the height due to roughness, per unresolved roughness.
         edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
@@ -226,8 +235,10 @@ class ErrorModel(NamedTuple):
     bound_range_px: tuple[float, float] = (0.0, 1.0)
     point_fraction: FractionLaw = FractionLaw(0.9, 1.0, 4.0)
     match_sigma_px: SigmaLaw = SigmaLaw(0.02, 1.0)
+    stereo_relief_gain: float = 0.0
     match_error_ratio: float = 1.05
     lamp_error_growth: float = 0.0
+    lamp_sigma_growth: float = 0.0
     match_fraction: FractionLaw = FractionLaw(0.97, 1.0, 4.0)
     match_parallax_px: float = 3.0
     match_covariance_inflation: float = 1.5

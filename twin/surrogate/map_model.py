@@ -9,6 +9,7 @@ deviation from the plane (the roughness of the cell), and cells without a height
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ WINDOW_PX = 11  #: side of the window of dense matching, over which the roughnes
 #: Roughness [px of disparity] of which half is unresolved: dense matching resolves smaller deviations from the plane of
 #: the window, while at larger ones the window shows two surfaces.
 EDGE_PX = 0.5
+_GROSS_SIGMAS = 1.15  # a normal variable exceeds this many standard deviations with a probability of a quarter
 #: Law of a depth that more keyframes do not improve.
 ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 _NO_CELLS = np.zeros((0, 0), np.float32)
@@ -42,8 +44,10 @@ class CellErrors(NamedTuple):
 
     Args:
         lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
-        edge_noise: (rows, cols) standard normal samples of the error due to roughness, shared by all views of a cell;
-            see `window_noise`.
+        relief_noise: (rows, cols) standard normal samples of the error due to relief within the matching window, shared
+            by all views of a cell; see `window_noise`.
+        edge_noise: (rows, cols) samples of the error at edges, of zero mean and unit variance, shared by all views of a
+            cell; see `gross_noise`.
         cell_noise: (rows, cols) standard normal samples of the precision of depth, shared by all views of a cell and
             correlated over a window; see `cell_scatter`.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
@@ -65,6 +69,7 @@ class CellErrors(NamedTuple):
     """
 
     lateral_noise: Map
+    relief_noise: Map
     edge_noise: Map
     cell_noise: Map
     dropout: Map
@@ -277,6 +282,22 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 
 
+def gross_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
+    """Returns numbers (rows, cols) of zero mean and unit variance, most of which are 0, for gross errors at edges.
+
+    They are the numbers of `window_noise` beyond `_GROSS_SIGMAS` in magnitude, divided by the square root of their mean
+    square over all cells. Dense matching resolves most cells at an edge and assigns others, in patches, to the wrong
+    surface.
+
+    Args:
+        shape, window_cells, rng: see `window_noise`.
+    """
+    noise = window_noise(shape, window_cells, rng)
+    density = math.exp(-(_GROSS_SIGMAS**2) / 2) / math.sqrt(2 * math.pi)
+    beyond = 2 * _GROSS_SIGMAS * density + math.erfc(_GROSS_SIGMAS / math.sqrt(2))
+    return np.where(np.abs(noise) > _GROSS_SIGMAS, noise / np.float32(math.sqrt(beyond)), np.float32(0))
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _border_of(camera, x, y, disparity):
     """Returns the distance of a normalised (x, y, disparity) from the nearest border of the two images [px]."""
@@ -486,10 +507,9 @@ def _sample_patch(
             scale = np.exp(_interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j])
             error_px = scale * np.sqrt(error_share) * _interpolate(errors.depth_error_px, k, fraction)
             value += per_px * error_px * depth_noise[i - row, j - col]
-            rough_error_px = roughness_error_px(
-                rough_px, errors.relief_error_gain, errors.relief_error_limit_px, errors.edge_error_gain
-            )
-            value += per_px * rough_error_px * errors.edge_noise[i, j]
+            relief_px = roughness_error_px(rough_px, errors.relief_error_gain, errors.relief_error_limit_px, 0.0)
+            edge_px = roughness_error_px(rough_px, 0.0, 1.0, errors.edge_error_gain)
+            value += per_px * (relief_px * errors.relief_noise[i, j] + edge_px * errors.edge_noise[i, j])
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
             sigma_px = scale * _interpolate(errors.depth_sigma_px, k, fraction)
@@ -509,14 +529,18 @@ def _sample_patch(
 def roughness_error_px(rough_px, relief_gain, relief_limit_px, edge_gain):
     """Returns the standard deviation of a height error due to roughness [px of disparity].
 
+    The part due to relief is a q^2 / sqrt(1 + q^4), with q = relief_gain r / a, for the roughness r and the limit a: it
+    is proportional to r^2 for small roughness, which dense matching resolves. The part due to edges is that of
+    `ErrorModel.edge_error_gain`. Both are added as variances.
+
     Args:
         rough_px: roughness of the cell [px of disparity].
         relief_gain, relief_limit_px, edge_gain: see `ErrorModel`.
     """
-    relief = (relief_gain * rough_px) ** 2
-    relief = relief / (1 + relief / max(relief_limit_px, 1e-9) ** 2)
+    share = (relief_gain * rough_px / max(relief_limit_px, 1e-9)) ** 2
+    relief = relief_limit_px * share / np.sqrt(1 + share**2)
     edge = edge_gain * rough_px**3 / (rough_px**2 + EDGE_PX**2)
-    return np.sqrt(relief + edge**2)
+    return np.sqrt(relief**2 + edge**2)
 
 
 @njit(cache=True, nogil=True)

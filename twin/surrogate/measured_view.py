@@ -2,7 +2,7 @@
 
 A true point is imaged by the true cameras (lens, port, calibration errors) and the image is rectified with the believed
 calibration (`imaging.true_cameras`). The estimators then remove the pitch, the roll and the row offset of the right
-image that they estimate from row differences (`estimate.vision.epipolar_calibration`). What remains is a deterministic
+image that they estimate from row differences (`estimate.vision.epipolar_calibration`). The result is a deterministic
 map from the true (x, y, disparity) of a point to the measured one. It is tabulated once per survey, on a regular grid
 over the image and disparity, and interpolated linearly.
 
@@ -51,7 +51,8 @@ class MeasuredView(NamedTuple):
     """Measured positions and row differences of true points after the estimators have removed rectification errors.
 
     Args:
-        table: measured positions.
+        table: measured positions on a grid of true positions; without values if all points are measured at their true
+            positions.
         row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of
             `table`.
         removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove.

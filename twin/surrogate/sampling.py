@@ -58,7 +58,7 @@ def sample_link(
         bias_fraction: `match_bias_fraction` of the `ErrorModel`.
         relief_sigma: standard deviation of the error due to relief, per unit of distance / depth.
         common_bias: true standard deviation of the common bias.
-        distance_growth: growth of the reported variance with distance / depth.
+        distance_growth: growth of the true and of the reported variance in the earlier pair with distance / depth.
         common_sigma: reported standard deviation of the common bias.
         inflation: factor on the reported covariance, because matches are correlated.
         noise_share: variance of the noise of a point, divided by that of a single match that it represents.
@@ -73,7 +73,8 @@ def sample_link(
     inverse_depth = np.mean(points[:, 2]) / baseline
     distance = inverse_depth * earlier_from_later[:3, 3]  # in units of depth
     cell_m = width / focal / earlier_noise.shape[1] / inverse_depth
-    n, independent, growth = 0, np.sqrt(1 - bias_fraction * bias_fraction), distance_growth**2 * np.sum(distance**2)
+    n, growth = 0, distance_growth**2 * np.sum(distance**2)
+    independent = np.sqrt(1 - bias_fraction * bias_fraction + growth)
     a, b = np.empty_like(points), np.empty_like(points)
     for k in range(len(points)):
         seen = measure_point(table, transferred[k, 0], transferred[k, 1], transferred[k, 2])

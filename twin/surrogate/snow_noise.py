@@ -99,7 +99,7 @@ def _patches(
 
 
 def _information(clean: Gray, patch_px: int) -> float:
-    """Returns the mean over the image of the sum of squared gradients along the rows over a patch."""
+    """Returns the sum over a patch of the squared gradient along the rows, averaged over the image."""
     return max(patch_px**2 * float(np.mean(np.diff(clean, axis=1) ** 2)), 1e-12)
 
 

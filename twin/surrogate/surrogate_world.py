@@ -89,7 +89,11 @@ class SurrogateWorld(World):
 
 
 def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
-    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`."""
+    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`.
+
+    Raises:
+        ScenarioError: the survey lies outside this range, and `imaging.extrapolate` is not set.
+    """
     found = fitted.quantities_outside_fit(survey_conditions(mission, matchability))
     if not found:
         return ()

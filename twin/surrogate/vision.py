@@ -35,7 +35,7 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import CellErrors, MapModel, window_noise
+from twin.surrogate.map_model import CellErrors, MapModel, gross_noise, window_noise
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
@@ -60,6 +60,7 @@ class _KeyframeTruth(NamedTuple):
         noise: (rows, cols, 3) standard normal samples of the stereo errors of the raster points.
         bound_px: Cramér-Rao bound of a patch's position [px].
         unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
+        stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
         n_points: number of matched points that the raster points represent.
         unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
         unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
@@ -75,6 +76,7 @@ class _KeyframeTruth(NamedTuple):
     noise: Array
     bound_px: float
     unevenness_px: float
+    stereo_parallax_px: float
     n_points: float
     unit_cov: Array
     unit_root: Array
@@ -211,6 +213,12 @@ class SurrogateVision:
         assert self._latest is not None
         return len(self._latest.points) / self._latest.n_points
 
+    @property
+    def stereo_parallax_px(self) -> float:
+        """Returns the RMS parallax of the relief in a patch between the two cameras in the last keyframe [px]."""
+        assert self._latest is not None
+        return self._latest.stereo_parallax_px
+
     def parallax_px(self, earlier_pose: Array) -> float:
         """Returns the parallax of the relief in a patch between the last keyframe and an earlier pose (4, 4) [px]."""
         assert self._latest is not None
@@ -270,19 +278,20 @@ class SurrogateVision:
             points = self._true_points(hits, depth_m)
             true_measured = scene.view.measure(points)
             n = len(points)
-            sigma_px = model.match_sigma_px(bound_px) * np.sqrt(n / n_points)
+            unevenness_px = scene.matchability.unevenness_at(mean_m)
+            stereo_parallax_px = unevenness_px * float(np.mean(points[:, 2]))
+            sigma_px = match_sigma_px(model, bound_px, stereo_parallax_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
             n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, self.rig, self.settings.patch_px)
             unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, n_tracked)
             cells = floor_cells(pose, points, self.rig.baseline_m)
-            unevenness_px = scene.matchability.unevenness_at(mean_m)
             observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
             if self._rows is not None:
                 observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px))
             self.stereo_observations.append(observation)
             self._latest = _KeyframeTruth(
-                pose, points, hits, noise, bound_px, unevenness_px, n_points, *unit, cells, true_measured, clear_share,
-                noise_ratio,
+                pose, points, hits, noise, bound_px, unevenness_px, stereo_parallax_px, n_points, *unit, cells,
+                true_measured, clear_share, noise_ratio,
             )  # fmt: skip
             error_root = self._unit_root.T * sigma_px * model.match_error_ratio
             measured = true_measured + noise.reshape(-1, 3)[hits] @ error_root
@@ -422,14 +431,16 @@ class SurrogateVision:
         n_matches = later.n_points * match_fraction
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
         noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
-        sigma_px = model.match_sigma_px(bound_px) * noise_scale
-        error_ratio = model.match_error_ratio * np.hypot(1, model.lamp_error_growth * self.lamp_share)
+        parallax_px = max(later.stereo_parallax_px, earlier.stereo_parallax_px)
+        sigma_px = match_sigma_px(model, bound_px, parallax_px) * noise_scale
+        lamp_factor = np.hypot(1, model.lamp_error_growth * self.lamp_share)
+        error_ratio = model.match_error_ratio * lamp_factor
         normals = self._link_normals(number, other, n + 1)
         in_view, motion, cov = sampling.sample_link(
             later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise, normals,
             earlier.pose, later.pose, self._camera, self._unit_cov * (sigma_px * later.noise_ratio) ** 2,
             self._unit_root * (sigma_px * error_ratio), model.match_bias_fraction,
-            model.relief_gain * later.unevenness_px / self.rig.focal_px * noise_scale,
+            model.relief_gain * lamp_factor * later.unevenness_px / self.rig.focal_px * noise_scale,
             model.common_bias_px / self.rig.focal_px, model.distance_growth,
             COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation, single,
         )  # fmt: skip
@@ -438,7 +449,8 @@ class SurrogateVision:
             return None
         growth = self._relief_growth(later, earlier, model)
         residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
-        return Motion(motion, cov * growth, n_matched, float(residual))
+        lamp_growth = 1 + (model.lamp_sigma_growth * self.lamp_share) ** 2
+        return Motion(motion, cov * growth * lamp_growth, n_matched, float(residual))
 
     def _relief_growth(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
         """Returns the factor by which relief increases the residuals' variance and the reported covariance of a link.
@@ -447,8 +459,9 @@ class SurrogateVision:
         without relief, 2 sigma^2.
         """
         bound_px = max(later.bound_px, earlier.bound_px)
+        stereo_px = max(later.stereo_parallax_px, earlier.stereo_parallax_px)
         relief_px = model.relief_gain * _parallax_px(later, earlier.pose, self.rig.baseline_m)
-        return 1 + relief_px**2 / (2 * model.match_sigma_px(bound_px) ** 2)
+        return 1 + relief_px**2 / (2 * match_sigma_px(model, bound_px, stereo_px) ** 2)
 
     def _match_fraction(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
         """Returns the fraction of a keyframe's points in the field of view of an earlier one that are matched there."""
@@ -485,10 +498,14 @@ class SurrogateVision:
         return mapper.result()
 
     def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
-        """Samples the errors of the heights that the Kalman depth filter gives, for a map with (rows, cols) cells."""
+        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells.
+
+        `CellErrors` holds their random numbers and standard deviations.
+        """
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
         window_cells = self.scene.map_model.window_cells
-        edge_noise, cell_noise = (window_noise(shape, window_cells, self._rng) for _ in range(2))
+        relief_noise, cell_noise = (window_noise(shape, window_cells, self._rng) for _ in range(2))
+        edge_noise = gross_noise(shape, window_cells, self._rng)
         level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
         error_factor = float(np.exp(level + ratio)) * model.depth_binned_error(self.binning)
         sigma_factor = float(np.exp(level)) * model.depth_binned_sigma(self.binning)
@@ -496,7 +513,7 @@ class SurrogateVision:
         binned_scatter = np.full(len(bounds_px), model.depth_binned_scatter(self.binning))
         cell_scatter = model.depth_cell_scatter(bounds_px) if self.binning == 1 else binned_scatter
         return CellErrors(
-            lateral_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px, depths_m,
+            lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px, depths_m,
             model.depth_error.sigma_px(bounds_px, self.lamp_share) * error_factor,
             model.depth_sigma.sigma_px(bounds_px, self.lamp_share) * sigma_factor,
             cell_scatter,
@@ -513,6 +530,17 @@ class SurrogateVision:
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
         self._n_used += n
         return self._normals[self._n_used - n : self._n_used]
+
+
+def match_sigma_px(model: ErrorModel, bound_px: float, stereo_parallax_px: float) -> float:
+    """Returns the reported standard deviation of a patch's position in one image [px].
+
+    Args:
+        model: error model of the measurements.
+        bound_px: Cramér-Rao bound [px].
+        stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
+    """
+    return float(np.hypot(model.match_sigma_px(bound_px), model.stereo_relief_gain * stereo_parallax_px))
 
 
 def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:

@@ -101,6 +101,7 @@ class ComparisonVision:
             sigma_ratio = np.sqrt(traces[0] / traces[1] * self.surrogate.raster_fraction)
             self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
             self.statistics["bound_px"].append(self.surrogate.bound_px)
+            self.statistics["stereo_parallax_px"].append(self.surrogate.stereo_parallax_px)
         return points
 
     def tracking_cov(self) -> Array | None:
@@ -194,8 +195,8 @@ class ComparisonVision:
     ) -> ElevationMap:
         """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
-        There are four sampled maps: with pose errors alone, and with pose errors and one of depth errors, lateral
-        errors and errors due to roughness, each with a unit standard deviation.
+        There are four sampled maps: one with pose errors alone, and three with pose errors and one other kind of error
+        with a unit standard deviation: depth errors, lateral errors, or errors at edges of the relief.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         none = model._replace(
@@ -215,6 +216,8 @@ class ComparisonVision:
         for name, self.surrogate.model in models.items():
             maps[name] = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
         self.surrogate.model = model
+        rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
+        self.statistics["metres_per_px"] = [map_model.depth_m**2 / (rig.focal_px * rig.baseline_m)]
         for name, cells in self._cell_classes().items():
             self._compare_maps(name, cells, maps)
         self._count_holes(elevation)
@@ -284,8 +287,8 @@ class ComparisonVision:
     def _count_holes(self, elevation: ElevationMap) -> None:
         """Adds the number of observed cells and the fraction with a height, by roughness and by distance from borders.
 
-        Distances from the border of the images are those of smooth cells, and the roughness is that of cells far from
-        the border.
+        The numbers by distance from the border of the images count smooth cells only; those by roughness count cells
+        far from the border only.
         """
         map_model, roughness = self.surrogate.scene.map_model, self._roughness_px()
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)

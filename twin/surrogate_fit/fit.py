@@ -8,11 +8,11 @@ Every survey has the same weight.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import least_squares
 
 from twin.surrogate.error_model import (
     BinningFactors,
@@ -24,6 +24,7 @@ from twin.surrogate.error_model import (
     SigmaLaw,
 )
 from twin.surrogate.map_model import roughness_error_px
+from twin.surrogate.vision import match_sigma_px
 from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, UNIT_PX
 
 _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute value
@@ -32,7 +33,6 @@ _HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a b
 _OUTLIER = 0.3  # residual of a log variance beyond which a class of cells has less weight
 _LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # statistics of cells without edges
 _SOURCES = ("images", "patches", "relief")
-_RELATIVE_SIGMA = 0.1  # assumed relative standard error of the mean squared error over a third of a survey's links
 
 #: Samples of each statistic of one survey, by name; see `ComparisonVision.statistics`.
 SurveyStatistics = Mapping[str, Sequence[float]]
@@ -51,17 +51,18 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         return np.array([np.median(s[name]) for s in surveys])
 
     f2f_ratios = np.sqrt(median("f2f_nees") / median("f2f_nees_surrogate"))
-    match_sigmas_px = median("match_sigma_ratio") * [compared.match_sigma_px(b) for b in bounds]
-    match_sigma_px = _fit_sigma_law(bounds, match_sigmas_px)
+    parallax = median("stereo_parallax_px")
+    compared_px = [match_sigma_px(compared, b, p) for b, p in zip(bounds, parallax, strict=True)]
+    sigma_law, stereo_relief_gain = _fit_match_sigma(bounds, parallax, median("match_sigma_ratio") * compared_px)
     f2f_sigma_px = _fit_sigma_law(bounds, median("f2f_sigma_ratio") * [compared.f2f_sigma_px(b) for b in bounds])
     mosaic_sigmas_px = median("mosaic_sigma_ratio") * [compared.mosaic_sigma_px(b) for b in bounds]
     mosaic_sigma_px = _fit_sigma_law(bounds, mosaic_sigmas_px)
     distance_growth, link_ratios = _fit_distance_growth(surveys, compared.distance_growth)
-    inflation = float(np.median(link_ratios / median("match_sigma_ratio")))
-    patch_ratios, relief_gain, bias_fraction = _fit_link_errors(surveys, compared.relief_gain)
-    match_error_ratio, lamp_error_growth = _fit_lamp_growth(
-        patch_ratios / median("match_sigma_ratio"), median("lamp_share")
+    compared_lamps = np.hypot(1, compared.lamp_sigma_growth * median("lamp_share"))
+    inflation, lamp_sigma_growth = _fit_lamp_growth(
+        link_ratios / median("match_sigma_ratio") * compared_lamps, median("lamp_share")
     )
+    links = _fit_link_errors(surveys, median("match_sigma_ratio"), median("lamp_share"), compared)
     errors, reported = (_fit_map_variances(surveys, quantity, compared) for quantity in ("error", "sigma"))
     cell_scatter, binned_scatter = _fit_cell_scatter(surveys, compared.depth_cell_scatter)
     known_fractions = np.array([s["hole_known"][0] for s in surveys])
@@ -71,15 +72,17 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     return compared._replace(
         bound_range_px=(float(bounds.min()), float(bounds.max())),
         point_fraction=_fit_fraction_law(bounds, median("point_fraction")),
-        match_sigma_px=match_sigma_px,
-        match_error_ratio=match_error_ratio,
-        lamp_error_growth=lamp_error_growth,
+        match_sigma_px=sigma_law,
+        stereo_relief_gain=stereo_relief_gain,
+        match_error_ratio=links.match_error_ratio,
+        lamp_error_growth=links.lamp_error_growth,
+        lamp_sigma_growth=lamp_sigma_growth,
         match_fraction=_fit_fraction_law(bounds, np.minimum(match_fractions, 1.0)),
         match_parallax_px=compared.match_parallax_px,
         match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
-        match_bias_fraction=bias_fraction,
+        match_bias_fraction=links.match_bias_fraction,
         distance_growth=distance_growth,
-        relief_gain=relief_gain,
+        relief_gain=links.relief_gain,
         f2f_sigma_px=f2f_sigma_px,
         f2f_error_ratio=compared.f2f_error_ratio * float(np.median(f2f_ratios)),
         f2f_anticorrelation=float(np.median([_fit_anticorrelation(s) for s in surveys])),
@@ -112,22 +115,25 @@ def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted
         compared: error model of the surrogate with which the surveys were compared.
         fitted: error model fitted to the surveys.
     """
-    ratios = {
-        "match_sigma_px": "match_sigma_ratio",
-        "f2f_sigma_px": "f2f_sigma_ratio",
-        "mosaic_sigma_px": "mosaic_sigma_ratio",
-    }
+
+    def match_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
+        return match_sigma_px(model, float(np.median(s["bound_px"])), float(np.median(s["stereo_parallax_px"])))
+
+    def misfit(ratio: str, sigma_px: Callable[[ErrorModel, SurveyStatistics], float]) -> float:
+        logs = [np.log(np.median(s[ratio]) * sigma_px(compared, s) / sigma_px(fitted, s)) for s in surveys]
+        return float(np.sqrt(np.mean(np.square(logs))))
+
+    def f2f_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
+        return model.f2f_sigma_px(float(np.median(s["bound_px"])))
+
+    def mosaic_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
+        return model.mosaic_sigma_px(float(np.median(s["bound_px"])))
+
     return {
-        field: _rms_log_ratio(surveys, ratio, getattr(compared, field), getattr(fitted, field))
-        for field, ratio in ratios.items()
+        "match_sigma_px": misfit("match_sigma_ratio", match_sigma),
+        "f2f_sigma_px": misfit("f2f_sigma_ratio", f2f_sigma),
+        "mosaic_sigma_px": misfit("mosaic_sigma_ratio", mosaic_sigma),
     }
-
-
-def _rms_log_ratio(surveys: Sequence[SurveyStatistics], ratio: str, compared: SigmaLaw, fitted: SigmaLaw) -> float:
-    """Returns the RMS over surveys of ln(reported / fitted standard deviation) for the statistic named `ratio`."""
-    bounds = [np.median(s["bound_px"]) for s in surveys]
-    logs = [np.log(np.median(s[ratio]) * compared(b) / fitted(b)) for s, b in zip(surveys, bounds, strict=True)]
-    return float(np.sqrt(np.mean(np.square(logs))))
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
@@ -140,8 +146,25 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
     return SigmaLaw(float(solution.x[0]), float(solution.x[1]))
 
 
+def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarray) -> tuple[SigmaLaw, float]:
+    """Fits `match_sigma_px` and `stereo_relief_gain` of the error model; residuals are log ratios.
+
+    Args:
+        bounds: (n,) Cramér-Rao bounds [px].
+        parallax: (n,) RMS parallax of the relief in a patch between the two cameras [px].
+        sigmas: (n,) reported standard deviations of a patch's position in one image [px].
+    """
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * parallax) ** 2) / sigmas)
+
+    limits = [1e-4, 0.0, 0.0], [10.0, 100.0, 10.0]
+    floor_px, slope, gain = least_squares(residuals, [sigmas.min() / 2, 1.0, 0.3], bounds=limits).x.tolist()
+    return SigmaLaw(floor_px, slope), gain
+
+
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float = 1.0) -> FractionLaw:
-    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramer-Rao bounds (n,) [px].
+    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramér-Rao bounds (n,) [px].
 
     Residuals much larger than `outlier` have less weight.
     """
@@ -167,13 +190,25 @@ def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
     return float(u[np.argmin(np.abs((1 + (n - 1) * (1 - u) ** 2) / (n * (1 + u**2)) - ratio))])
 
 
-def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) -> tuple[np.ndarray, float, float]:
+class _LinkErrors(NamedTuple):
+    """Parameters of the true errors of links; see `ErrorModel`."""
+
+    match_error_ratio: float
+    lamp_error_growth: float
+    relief_gain: float
+    match_bias_fraction: float
+
+
+def _fit_link_errors(
+    surveys: Sequence[SurveyStatistics], match_ratios: np.ndarray, lamp_share: np.ndarray, compared: ErrorModel
+) -> _LinkErrors:
     """Separates link errors into contributions of patch matching, of relief and of a bias of each keyframe.
 
-    Errors due to relief grow with the distance between the keyframes; errors of patch matching do not. The links of
-    each survey are therefore sorted by distance and divided into thirds, and one relief gain is fitted to the mean
-    squared errors of all thirds of all surveys. Over a smooth floor the errors do not determine the relief gain, so
-    the gain of the compared model, or a minimum value if that is larger, is added as an observation.
+    Errors due to relief grow with the unevenness of the floor and with the distance between the keyframes. The links of
+    each survey are therefore sorted by distance and divided into thirds, and match error ratio, its growth under lamps
+    and relief gain are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
+    logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain, so the gain
+    of the compared model, but at least `RELIEF_GAIN`, is a weak prior.
 
     A keyframe's bias makes the errors of two consecutive links cancel partly, because the keyframe ends the first link
     and starts the second. Relief adds equal errors to both. The bias fraction is fitted to the scalar products of the
@@ -182,42 +217,50 @@ def _fit_link_errors(surveys: Sequence[SurveyStatistics], compared_gain: float) 
 
     Args:
         surveys: statistics of n surveys.
-        compared_gain: relief gain of the compared model.
-
-    Returns:
-        Ratio (n,) of each survey's patch-matching errors to those of the "patches" model of `single_error_models`;
-        relief gain; bias fraction.
+        match_ratios: (n,) ratio of the standard deviations of matches reported by images and by the compared model.
+        lamp_share: (n,) fraction of the reflected light that comes from the lamps.
+        compared: error model of the surrogate with which the surveys were compared.
     """
-    thirds = np.array([_squared_errors_by_distance(s) for s in surveys])
-    images, by_patches, by_relief = thirds.transpose(2, 0, 1)
-    prior = max(compared_gain / RELIEF_GAIN, 0.5) ** 2
-    effects, observed = [np.array([_RELATIVE_SIGMA / prior])], [np.array([_RELATIVE_SIGMA])]
-    for patch, relief_effect in zip(by_patches / images, by_relief / images, strict=True):
-        projection = np.eye(3) - np.outer(patch, patch) / (patch @ patch)  # eliminates the patch errors
-        effects.append(projection @ relief_effect)
-        observed.append(projection.sum(axis=1))
-    effect = np.concatenate(effects)
-    relief = max(float(effect @ np.concatenate(observed) / (effect @ effect)), 0.0)
+    images, by_patches, by_relief = np.array([_squared_errors_by_distance(s) for s in surveys]).transpose(2, 0, 1)
+    reported, share = np.square(match_ratios)[:, None], lamp_share[:, None]
+    by_relief = by_relief / (RELIEF_GAIN**2 * (1 + (compared.lamp_error_growth * share) ** 2))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        lamps = 1 + (x[1] * share) ** 2
+        logs = np.log(lamps * (x[0] ** 2 * reported * by_patches + x[2] ** 2 * by_relief) / images) / 2
+        return np.append(logs.ravel(), _PRIOR * (x[2] / max(compared.relief_gain, RELIEF_GAIN) - 1))
+
+    start, limits = [1.0, 0.5, max(compared.relief_gain, RELIEF_GAIN)], ([1e-3, 0.0, 0.0], [100.0, 10.0, 100.0])
+    ratio, growth, gain = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x.tolist()
+    relief = gain**2 * (1 + (growth * share) ** 2)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
     products = np.array([[np.mean(s[f"consecutive_product_{name}"]) for name in _SOURCES] for s in surveys])
+    products[:, 2] *= (relief / (RELIEF_GAIN**2 * (1 + (compared.lamp_error_growth * share) ** 2)))[:, 0]
     n_products = np.array([len(s["consecutive_product_images"]) for s in surveys])
-    measured = n_products @ ((products[:, 0] - relief * products[:, 2]) / patches)
+    measured = n_products @ ((products[:, 0] - products[:, 2]) / patches)
     bias = BIAS_FRACTION * measured / (n_products @ products[:, 1])
-    return np.sqrt(patches), RELIEF_GAIN * float(np.sqrt(relief)), float(np.clip(bias, 0.0, 0.98))
+    return _LinkErrors(ratio, growth, gain, float(np.clip(bias, 0.0, 0.98)))
 
 
-def _fit_lamp_growth(error_ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """Fits `match_error_ratio` (without lamps) and `lamp_error_growth` of the error model.
+def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
+    """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations.
 
-    Both are fitted to the squared error ratios by least squares of relative residuals.
+    Residuals are log ratios; large ones have less weight.
 
     Args:
-        error_ratios: (n,) ratio of the true to the reported standard deviation of a match, one per survey.
+        ratios: (n,) ratios, one per survey.
         lamp_share: (n,) fraction of the reflected light that comes from the lamps, one per survey.
+
+    Returns:
+        The ratio c without lamps, and its growth k.
     """
-    effects = np.column_stack([np.ones_like(error_ratios), lamp_share**2]) / error_ratios[:, None] ** 2
-    constant, growth = nnls(effects, np.ones(len(error_ratios)))[0]
-    return float(np.sqrt(constant)), float(np.sqrt(growth / max(constant, 1e-6)))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return x[0] + np.log1p((x[1] * lamp_share) ** 2) / 2 - np.log(ratios)
+
+    start = [float(np.median(np.log(ratios))), 0.5]
+    found = least_squares(residuals, start, bounds=([-10.0, 0.0], [10.0, 10.0]), loss="soft_l1", f_scale=_OUTLIER).x
+    return float(np.exp(found[0])), float(found[1])
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
@@ -324,7 +367,8 @@ class _MapErrors(NamedTuple):
         relief_gain: standard deviation per roughness of a cell.
         relief_limit_px: limit of this standard deviation for large roughness [px].
         edge_gain: standard deviation per unresolved roughness.
-        departures: (n,) logarithm of measured / modelled standard deviation of each survey, the mean over its classes.
+        departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
+            classes of cells, because a class may consist of a few cells at one spot of the floor.
         binned: factors due to binning, the medians of measured / modelled values over the surveys with binned images;
             the laws are fitted to the other surveys.
     """
@@ -343,8 +387,10 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
 
     The model variance of a class is that of the map with pose errors alone, plus a term each for depth (`DepthLaw`),
     lateral shift, relief within the matching window, and edges. A term is the variance that a unit error adds to a
-    sampled map, times a fitted factor. Residuals are differences of logarithms; every survey has the same weight. The
-    reported variances of the map with pose errors alone already contain the effects of a lateral shift and of relief.
+    sampled map, times a fitted factor. The relief error is common to all views of a cell, so the fusion of several
+    tracks does not reduce it, and its variance follows from the height per pixel of disparity. Residuals are
+    differences of logarithms; every survey has the same weight. The reported variances of the map with pose errors
+    alone already contain the effects of a lateral shift and of relief.
 
     Args:
         surveys: statistics of n surveys.
@@ -356,11 +402,12 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     for number, s in enumerate(surveys):
         classes = [name for name in s if name.startswith(f"map_{quantity}_")]
         rows += [s[name] for name in classes]
-        conditions += [(float(np.median(s["bound_px"])), float(np.median(s["lamp_share"])))] * len(classes)
+        condition = float(np.median(s["bound_px"])), float(np.median(s["lamp_share"])), float(s["metres_per_px"][0])
+        conditions += [condition] * len(classes)
         weights += [float(binning[number] == 1) / np.sqrt(max(len(classes), 1))] * len(classes)
         numbers += [number] * len(classes)
     images, pose, depth, lateral, edge, views, step, rough = np.array(rows).T
-    (bounds, lamps), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
+    (bounds, lamps, metres_per_px), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
     of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
     per_px2 = of_depth / UNIT_PX**2
 
@@ -368,7 +415,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
         law = DepthLaw(*x[:6])
         depth_px2 = law.sigma_px(bounds, lamps) ** 2 * law.relative_variance(views, step)
         relief_px2 = roughness_error_px(rough, x[7], x[8], 0.0) ** 2
-        common = per_px2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
+        common = metres_per_px**2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
         return pose + per_px2 * depth_px2 + common + x[9] ** 2 * of_edge
 
     gains = (compared.relief_error_gain, compared.relief_error_limit_px, compared.edge_error_gain)
@@ -388,11 +435,11 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     found = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER)
     ratios = np.log(images / variance(found.x)) / 2
     flown = sorted(set(numbers))
-    means, by = np.array([np.mean(ratios[np.array(numbers) == number]) for number in flown]), binning[flown]
-    factors = [float(np.median(means[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
-    means -= np.select([by == 2, by == 4], factors, 0.0)
+    departures, by = np.array([np.median(ratios[np.array(numbers) == number]) for number in flown]), binning[flown]
+    factors = [float(np.median(departures[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
+    departures -= np.select([by == 2, by == 4], factors, 0.0)
     x = found.x.tolist()
-    return _MapErrors(DepthLaw(*x[:6]), *x[6:], departures=means, binned=BinningFactors(*np.exp(factors).tolist()))
+    return _MapErrors(DepthLaw(*x[:6]), *x[6:], departures=departures, binned=BinningFactors(*np.exp(factors).tolist()))
 
 
 def _robust_scatter(departures: np.ndarray) -> float:

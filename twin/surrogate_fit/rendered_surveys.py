@@ -29,9 +29,9 @@ from twin.world.rendered_world import RenderedWorld
 _FILE = "surrogate_comparison.json"
 _MIN_SURVEYS = 2
 _MAX_LOST = 0.2  # largest fraction of lost frames, and of failed links, of a survey to which the model is fitted
-#: Cramer-Rao bound [px] above which no survey is flown: at 0.17 px, 86 % of the frames were lost.
+#: Cramér-Rao bound [px] above which no survey is flown: at 0.17 px, 86 % of the frames were lost.
 _MAX_BOUND_PX = 0.5
-_NEVER_PX = 1e3  # Cramer-Rao bound that no survey has
+_NEVER_PX = 1e3  # Cramér-Rao bound that no survey has
 _BOUND = "bound_px"
 _CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
 
@@ -64,7 +64,7 @@ def comparison_model(model: ErrorModel) -> ErrorModel:
 def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
     """Returns the smallest and the largest value of each condition, by name of `QUANTITIES`.
 
-    If the survey with the largest Cramer-Rao bound was lost, the bound has no upper limit: all surveys with larger
+    If the survey with the largest Cramér-Rao bound was lost, the bound has no upper limit: all surveys with larger
     bounds are lost as well.
 
     Args:

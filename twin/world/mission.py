@@ -22,7 +22,9 @@ from twin.imaging.lamps import light_sources_in_camera
 from twin.imaging.lens_psf import NEAREST_FOCUS_M
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
-from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source
+from twin.plugin.guard import check_loadable, terrain_heights
+from twin.plugin.loading import CONTROLLERS, ESTIMATORS
+from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source, TerrainConfig
 from twin.simulate.autopilot import top_speed_mps
 from twin.world.clearance import planned_clearance
 from twin.world.limits import check_map_size
@@ -175,6 +177,7 @@ def prepare(scenario: Scenario) -> Mission:
     source = scenario.source
     terrain = _attempt(lambda: load_terrain(scenario), source, errors)
     plan = _attempt(lambda: plan_survey(scenario, terrain), source, errors)
+    _attempt(lambda: _check_plugins(scenario), source, errors)
     _attempt(lambda: _check_speed(scenario), source, errors)
     _attempt(lambda: _check_current(scenario), source, errors)
     if (sensor := scenario.sensor) is not None:
@@ -223,6 +226,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
         TwinError: the floor cannot be generated or read.
     """
     t = scenario.terrain
+    _check_texture_keys(t)
     if t.kind != "file":
         given = [key for key in ("height_file", "texture_file", "orthophoto_file", "z") if getattr(t, key)]
         if given:
@@ -234,18 +238,43 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
             )
         texel_m = scenario.texel_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # unused without images
         texture = terrains.TextureSource(texel_m, cover=t.cover, coarsen=t.texture_px_m is None)
+        if (plugin := t.plugin) is not None:
+            return terrains.generate_from(
+                lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed),
+                t.size_m, t.grid_m, texture, t.cover or terrains.default_cover(t.kind), scenario.seed,
+            )  # fmt: skip
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed)
+    if t.plugin is not None:
+        raise TwinError("terrain.plugin", 'has no effect on a measured DEM (terrain.kind = "file")', "another kind")
     if t.height_file is None:
         raise TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
     tiling = t.texture_tiling if scenario.imaging.fidelity == "rendered" else "repeat"  # unused without images
+    photographed = t.texture_file is not None or t.orthophoto_file is not None
     texture = terrains.TextureSource(
-        scenario.texel_m, t.texture_file, tiling, t.orthophoto_file, t.cover, coarsen=t.texture_px_m is None
-    )
+        scenario.texel_m, t.texture_file, tiling, t.orthophoto_file, t.cover, coarsen=t.texture_px_m is None,
+        in_images=photographed or scenario.imaging.fidelity == "rendered",
+    )  # fmt: skip
     return terrains.load(t.height_file, texture, t.height_spacing_m, t.height_range_m, scenario.seed, t.z)
 
 
+def _check_texture_keys(t: TerrainConfig) -> None:
+    """Raises TwinError if a floor with a photo has materials, or one without a photo has a way of tiling photos."""
+    if t.texture_file is not None and t.cover is not None:
+        raise TwinError("terrain.cover", "has no effect on a floor with terrain.texture_file", "one of the two")
+    if t.texture_file is None and t.texture_tiling != TerrainConfig.model_fields["texture_tiling"].default:
+        raise TwinError("terrain.texture_tiling", "has no effect without a photo", "with terrain.texture_file")
+
+
+def _check_plugins(scenario: Scenario) -> None:
+    """Raises TwinError if the controller or the estimator of another package cannot be loaded or used."""
+    check_loadable("control.plugin", CONTROLLERS, scenario.control.plugin)
+    check_loadable("estimate.plugin", ESTIMATORS, scenario.estimate.plugin)
+    if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
+        raise TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
+
+
 def _check_speed(scenario: Scenario) -> None:
-    """Raises TwinError if `plan.speed_mps` exceeds the top speed forwards, or for loops in the slowest direction."""
+    """Raises TwinError if `plan.speed_mps` exceeds the top speed: forwards or, for loops, in the slowest direction."""
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
@@ -258,13 +287,13 @@ def _check_speed(scenario: Scenario) -> None:
 
 
 def _check_beacons_listed(scenario: Scenario) -> None:
-    """Checks that the scenario defines beacons if they are used for aiding."""
+    """Raises TwinError if beacons are used for aiding and the scenario defines none."""
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
         raise TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
-    """Checks that a beacon lies within the terrain, on or above the floor."""
+    """Raises TwinError if a beacon lies outside the terrain or below the floor."""
     x, y, z = beacon.position_m
     floor_m = float(terrain.height_at(x, y))
     if np.isnan(floor_m):
@@ -315,7 +344,7 @@ def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan
 
 
 def _check_exposure(sensor: SensorConfig) -> None:
-    """Checks that the shortest exposure is not longer than the longest."""
+    """Raises TwinError if the shortest exposure is longer than the longest."""
     if sensor.exposure_min_ms > sensor.exposure_max_ms:
         raise TwinError(
             "sensor.exposure_min_ms", f"{sensor.exposure_min_ms:g}: longer than the longest exposure",
@@ -406,7 +435,7 @@ def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> Ma
 
 
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
-    """Returns half the extent of a footprint along x and y [m], the largest for any heading of the bow on the path."""
+    """Returns half the extent of a footprint along x and y [m], the maximum over the headings on the path."""
     across_m, along_m = plan.footprint_m
     if plan.turns_on_the_spot:
         diagonal_m = float(np.hypot(along_m, across_m))

@@ -61,9 +61,10 @@ def _entry(
     """
     _check_keys(number, config)
     terrain, seed = world
-    key = repr((config.shape, config.mesh_file, config.mesh_up, config.colour, _pipe_width(config)))
+    variant = None if config.position_m is None or config.shape == "mesh" else number % SHAPES[config.shape].variants
+    key = repr((config.shape, config.mesh_file, config.mesh_up, config.colour, _pipe_width(config), variant))
     if key not in models:
-        models[key] = _models(number, config, seed)
+        models[key] = _models(number, config, seed, variant)
         n_faces = sum(len(model.levels[0].mesh.faces) for shapes in models.values() for model in shapes)
         if n_faces > MAX_FACES:
             raise TwinError(f"objects.{number}", f"{n_faces} triangles in all meshes", f"at most {MAX_FACES} triangles")
@@ -76,8 +77,8 @@ def _entry(
     return items
 
 
-def _models(number: int, config: ObjectConfig, seed: int) -> tuple[ObjectModel, ...]:
-    """Returns the shapes of an entry."""
+def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -> tuple[ObjectModel, ...]:
+    """Returns the shapes of an entry: the given variant of a built-in shape, or all variants if `variant` is None."""
     if config.shape == "mesh":
         assert config.mesh_file is not None
         file = Path(config.mesh_file)
@@ -86,6 +87,8 @@ def _models(number: int, config: ObjectConfig, seed: int) -> tuple[ObjectModel, 
     shape, name = SHAPES[config.shape], zlib.crc32(config.shape.encode())
     form = {"width": _pipe_width(config)} if config.shape == "pipe" and config.width_m else {}
     seeds = np.random.SeedSequence([seed, name]).spawn(shape.variants)
+    if variant is not None:
+        seeds = [seeds[variant]]
     meshes = [build_shape(config.shape, config.colour, np.random.default_rng(s), **form) for s in seeds]
     return tuple(model_of(mesh, shape.sways) for mesh in meshes)
 

@@ -15,6 +15,7 @@ from twin.core.geometry import Array
 from twin.core.records import Estimate, Readings
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
+from twin.world.plugin_pilot import PluginPilot
 
 _VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is noisy, the true velocity varies slowly
 
@@ -24,7 +25,10 @@ PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
     """Returns the pilot: a function from the estimate and the reference of the left camera to the vehicle command."""
-    return RovPilot(mission) if mission.scenario.vehicle.dynamics == "rigid" else _carrier_pilot(mission)
+    scenario = mission.scenario
+    if scenario.control.plugin is not None:
+        return PluginPilot(mission, scenario.control.plugin)
+    return RovPilot(mission) if scenario.vehicle.dynamics == "rigid" else _kinematic_pilot(mission)
 
 
 def without_feedback(estimate: Estimate, reference: Reference, readings: Readings) -> Estimate:
@@ -50,7 +54,7 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     return estimate._replace(world_from_camera=pose, camera_velocity=twist)
 
 
-def _carrier_pilot(mission: Mission) -> PilotOfEstimates:
+def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
     """Returns the pilot of a kinematic vehicle; a command is a velocity (3,) in the world [m/s]."""
     frequency = mission.scenario.control.natural_frequency_radps
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import scenes.builder
+from twin.core.records import Image
 from twin.core.timing import StageTimer
 from twin.imaging.camera import StereoCamera
 from twin.imaging.image_formation import ImageFormation
@@ -67,6 +68,9 @@ class RenderedWorld(World):
         if images.depth_right is not None:
             self.coverage.add(self.world_from_camera, images.depth_left, images.depth_right)
         return CameraImages(images.left, images.right, lambda: images.depth_left, images.exposure)
+
+    def extra_pair(self) -> tuple[Image, Image]:
+        return self.camera.capture_apart(self.world_from_camera, self.vehicle.twist_body)
 
     def true_surface(self) -> TrueSurface:
         return super().true_surface() if self._surface is None else self._surface

@@ -11,7 +11,7 @@ from twin.core.records import Image, MapGrid
 
 Layer = NDArray[np.float32]
 
-_ROWS = 128  # rows of the grid that are computed at once, to limit memory
+_BLOCK = 1024  # largest number of rows, and of columns, of samples that are computed at once, to limit memory
 
 
 def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]:
@@ -24,19 +24,33 @@ def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]
     n = max(1, int(np.ceil(grid.cell_m / texel_m.min() - 1e-6)))
     step_m = grid.cell_m / n
     x = grid.west_m + (np.arange(grid.cols * n) + 0.5) * step_m
+    y = grid.north_m - (np.arange(grid.rows * n) + 0.5) * step_m
     col = ((x - terrain.west_m) / texel_m[0] - 0.5).astype(np.float32)
-    inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
+    row = ((terrain.north_m - y) / texel_m[1] - 0.5).astype(np.float32)
     out = np.empty((grid.rows, grid.cols, 3), np.float32)
-    for first in range(0, grid.rows, _ROWS):
-        part = out[first : first + _ROWS]
-        y = grid.north_m - (first * n + np.arange(len(part) * n) + 0.5) * step_m
-        row = ((terrain.north_m - y) / texel_m[1] - 0.5).astype(np.float32)
-        across, down = np.meshgrid(col, row)
-        fine = cv2.remap(*_cropped(terrain.texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        part[:] = fine.reshape(len(part), n, grid.cols, n, 3).mean(axis=(1, 3), dtype=np.float32)
-        inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)
-        part[~(inside_y[:, None] & inside_x)] = np.nan
+    side = max(1, _BLOCK // n)
+    for top in range(0, grid.rows, side):
+        for left in range(0, grid.cols, side):
+            part = out[top : top + side, left : left + side]
+            across, down = np.meshgrid(col[left * n : (left + side) * n], row[top * n : (top + side) * n])
+            part[:] = _mean_of_samples(terrain.texture, across, down, n)
+    inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
+    inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)
+    out[~(inside_y[:, None] & inside_x)] = np.nan
     return out
+
+
+def _mean_of_samples(texture: Image, across: Layer, down: Layer, n: int) -> Layer:
+    """Returns the means (rows, cols, 3) of n x n samples each of a texture, interpolated bilinearly.
+
+    Args:
+        texture: (h, w, 3) albedo.
+        across, down: (rows n, cols n) columns and rows of the samples in the texture.
+        n: samples along the side of a cell.
+    """
+    fine = cv2.remap(*_cropped(texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rows, cols = across.shape[0] // n, across.shape[1] // n
+    return fine.reshape(rows, n, cols, n, 3).mean(axis=(1, 3), dtype=np.float32)
 
 
 def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:
@@ -61,7 +75,7 @@ def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | 
 def _cropped(texture: Image, across: Layer, down: Layer) -> tuple[Image, Layer, Layer]:
     """Returns the part of a texture around given columns and rows, and these columns and rows relative to that part.
 
-    OpenCV cannot resample images with more than 32767 pixels along a side.
+    OpenCV can resample neither from nor to images with more than 32767 pixels along a side.
     """
     rows, cols, _ = texture.shape
     top, left = (int(np.clip(place.min() - 1, 0, n - 1)) for place, n in ((down, rows), (across, cols)))

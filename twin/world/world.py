@@ -14,6 +14,7 @@ from twin.core.geometry import Array
 from twin.core.growing_array import GrowingArray
 from twin.core.records import Exposure, Frame, Image, MapGrid, StereoRig, Trajectory, Truth
 from twin.core.timing import StageTimer
+from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
@@ -92,6 +93,14 @@ class World(ABC):
     @abstractmethod
     def capture(self, step: Step) -> CameraImages:
         """Returns the images of the cameras at the current pose."""
+
+    def extra_pair(self) -> tuple[Image, Image]:
+        """Returns the left and the right image (H, W, 3) at the current pose; later frames do not change.
+
+        Raises:
+            TwinError: the world has no images.
+        """
+        raise TwinError("imaging.fidelity", "the surrogate has no images", '"rendered"')
 
     @abstractmethod
     def seen(self) -> NDArray[np.bool_]:

@@ -152,7 +152,9 @@ def _panel_matrix(s, panels, p):
 
 @njit(cache=True, nogil=True)
 def _factorise(s, original, panels):
-    """Replaces each panel by L1^-1 above L2. Returns False if the matrix is not numerically positive definite.
+    """Factorises the matrix in the panels: each then holds L1^-1 above L2 (see the module).
+
+    Returns False if the matrix is not numerically positive definite.
 
     Args:
         original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.

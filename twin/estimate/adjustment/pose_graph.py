@@ -220,7 +220,11 @@ class _Step(NamedTuple):
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
-    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites the matrix."""
+    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites the matrix.
+
+    Raises:
+        LinAlgError: the factors do not constrain every pose.
+    """
     diagonal = equations.diagonal
     if damping:
         axes = np.arange(6)

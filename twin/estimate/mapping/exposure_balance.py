@@ -68,7 +68,7 @@ def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Arr
 def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points: Array) -> PatchColours:
     """Returns the mean colours in an image of the patches around points (n, 3) [m] of the map.
 
-    Patches that the image does not show, or that are too dark, are left out.
+    Patches that are not completely in the image, or are too dark, are left out.
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)
     last = np.array([rig.width_px - 1, rig.height_px - 1]) - _PATCH_PX / 2

@@ -1,7 +1,8 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
 It is made in tiles of at most `TILE_PX` x `TILE_PX` pixels, one after the other; an image is read once for each tile
-that it touches. Memory is that of one tile and of two images (about 250 MB), whatever the size of the survey.
+that it touches. Memory is that of one tile and of two images, whatever the size of the survey; the layers of a tile
+(`orthophoto.OrthoLayers`) take 24 bytes per pixel, 101 MB for a whole tile.
 """
 
 from __future__ import annotations
@@ -69,8 +70,9 @@ def orthomosaic(
     """
     grid = ortho_grid(views, elevation, rig)
     factors = np.ones((len(views.depth_m), 3)) if restore else _exposure_factors(views, elevation, rig)
-    lowest_m = float(np.nanmin(elevation.height_m)) if np.isfinite(elevation.height_m).any() else np.nan
-    boxes = np.array([footprint(pose, rig, lowest_m) for pose in views.world_from_camera]).reshape(-1, 4)
+    known_m = elevation.height_m[np.isfinite(elevation.height_m)]
+    heights_m = (float(known_m.min()), float(known_m.max())) if known_m.size else (np.nan, np.nan)
+    boxes = np.array([footprint(pose, rig, heights_m) for pose in views.world_from_camera]).reshape(-1, 4)
     side = tile_side_px(round(elevation.grid.cell_m / grid.cell_m))
     tiles = [(row, col) for row in range(0, grid.rows, side) for col in range(0, grid.cols, side)]
     parts = [_padded(grid, row, col, side) for row, col in tiles]
@@ -79,7 +81,7 @@ def orthomosaic(
     for (row, col), part, numbers in zip(tiles, parts, touching, strict=True):
         layers = empty_layers(part, heights_of(elevation, part))
         for k, colours in _prepared(views, numbers, factors, restore):
-            add_view(layers, colours, views.world_from_camera[k], rig, lowest_m)
+            add_view(layers, colours, views.world_from_camera[k], rig, heights_m)
             n_done += 1
             if progress is not None:
                 progress(n_done / n_all)

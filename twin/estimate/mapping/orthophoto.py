@@ -61,18 +61,26 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
     return OrthoLayers(grid, height_m, np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), best)
 
 
-def footprint(world_from_camera: Array, rig: StereoRig, height_m: float) -> Array:
-    """Returns the bounding box (west, south, east, north) [m] of an image on a horizontal plane.
+def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
+    """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is infinite if a corner of the image does not show the plane.
+    It is the box around the four corner rays between the lowest and the highest floor, or from the camera on, if this
+    is lower than the highest floor. It is infinite if the camera is below the lowest floor, or a corner of the image
+    does not look down.
+
+    Args:
+        world_from_camera: (4, 4) pose of the camera.
+        rig: calibration, with square pixels.
+        heights_m: heights of the lowest and of the highest floor.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     rays = np.column_stack([rig.normalised(corners), np.ones(4)]) @ world_from_camera[:3, :3].T
-    down_m = world_from_camera[2, 3] - height_m
-    if down_m <= 0 or (rays[:, 2] >= -1e-3).any():
+    to_lowest_m, to_highest_m = (world_from_camera[2, 3] - height_m for height_m in heights_m)
+    if to_lowest_m <= 0 or (rays[:, 2] >= -1e-3).any():
         return np.array([-np.inf, -np.inf, np.inf, np.inf])
-    at = world_from_camera[:2, 3] - rays[:, :2] * (down_m / rays[:, 2:])
+    per_down = -rays[:, :2] / rays[:, 2:]
+    at = world_from_camera[:2, 3] + np.concatenate([per_down * to_lowest_m, per_down * max(to_highest_m, 0.0)])
     return np.concatenate([at.min(axis=0), at.max(axis=0)])
 
 
@@ -88,7 +96,13 @@ class Colours(NamedTuple):
     saturated: NDArray[np.uint8]
 
 
-def add_view(layers: OrthoLayers, colours: Colours, world_from_camera: Array, rig: StereoRig, lowest_m: float) -> None:
+def add_view(
+    layers: OrthoLayers,
+    colours: Colours,
+    world_from_camera: Array,
+    rig: StereoRig,
+    heights_m: tuple[float, float],
+) -> None:
     """Adds an image to the layers, in place.
 
     Args:
@@ -96,10 +110,10 @@ def add_view(layers: OrthoLayers, colours: Colours, world_from_camera: Array, ri
         colours: the image.
         world_from_camera: (4, 4) pose of the camera.
         rig: calibration, with square pixels.
-        lowest_m: height below which there is no floor.
+        heights_m: heights of the lowest and of the highest floor.
     """
     grid = layers.grid
-    bounds = _pixels_within(footprint(world_from_camera, rig, lowest_m), grid)
+    bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)
     if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
         return
     camera_from_world = geometry.inverse(world_from_camera)

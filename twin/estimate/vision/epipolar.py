@@ -144,7 +144,11 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of the disparity without the prior, which `sigma` includes."""
+    """Returns the standard deviation (H, W) of a disparity from the measurement alone.
+
+    Args:
+        sigma, gain: `Refinement.sigma_px`, which includes the prior, and `Refinement.gain`.
+    """
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
@@ -224,7 +228,7 @@ def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float
 
 
 def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
-    """Returns the local mean square (H, W) of the residuals, limited to `MIN_NOISE_VARIANCE` to `max_variance`."""
+    """Returns the local mean square (H, W) of the residuals, clipped to [`MIN_NOISE_VARIANCE`, `max_variance`]."""
     count = _mean(visible.astype(np.float32)) + 1e-3
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 

@@ -192,7 +192,7 @@ def row_sigma(points: StereoPoints) -> Array:
 
 
 def spread(points: StereoPoints) -> float:
-    """Returns the robust standard deviation of the row differences about their median (1.4826 MAD) [px]."""
+    """Returns the robust standard deviation (1.4826 MAD) of the row differences [px]; 0 without points."""
     rows = points.row_difference_px
     return float(_MAD_TO_SIGMA * np.median(np.abs(rows - np.median(rows)))) if len(rows) else 0.0
 

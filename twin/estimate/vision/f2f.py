@@ -18,6 +18,9 @@ MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
 MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; in pure noise, about a tenth are
 _MIN_INLIERS = 0.5  # smallest fraction of the tracked points that must agree with a motion
+_MAX_RESIDUAL_PX = 1.0  # largest median residual of the tracked points; windows of a rigid scene are tracked to 0.5 px
+_PREDICTION_SIGMAS = 3.0  # the search covers prediction errors up to this many standard deviations
+_MOST_LEVELS = 4  # pyramid levels above the full image
 _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single image does not measure
 
 
@@ -49,12 +52,14 @@ class _Located(NamedTuple):
         motion: pose of the image in the reference camera, its covariance and the number of inliers.
         inlier_share: fraction of the tracked points that are inliers, 0 to 1.
         tracked_share: fraction of the points of the reference that were tracked, 0 to 1.
+        residual_px: median distance between the tracked and the fitted positions of the points [px].
         as_reference: the image with the tracked points, which can replace the reference.
     """
 
     motion: two_view_motion.Motion
     inlier_share: float
     tracked_share: float
+    residual_px: float
     as_reference: _Reference
 
 
@@ -132,7 +137,7 @@ class FrameToFrame:
         """Fuses a measured pose with the prediction; returns "ok", or the reason why it was not used."""
         if located is None or located.tracked_share < MIN_MATCHED:
             return "too few points matched"
-        if located.inlier_share < _MIN_INLIERS:
+        if located.inlier_share < _MIN_INLIERS or located.residual_px > _MAX_RESIDUAL_PX:
             return "too few points agree"
         used = self.filter.correct(located.motion.a_from_b, located.motion.cov)
         if used:
@@ -155,6 +160,23 @@ class FrameToFrame:
         self.reference, self._common_cov = reference, np.zeros((6, 6))
         self.filter.restart()
 
+    def _pyramid_levels(self, depth_m: Array) -> int:
+        """Returns the number of pyramid levels with which the tracker bridges the error of the predicted positions.
+
+        A window finds a point up to about half its side away, on each level in pixels of twice the size. The variance
+        of the predicted positions is that of the filter's rotation about the x and y axes, plus that of its translation
+        across the optical axis at the median depth. At 15 frames a second one level suffices; at 5, the
+        acceleration of the vehicle moves the points by about 10 px more than predicted.
+
+        Args:
+            depth_m: (n,) depths of the points [m].
+        """
+        variance = np.diag(self.filter.cov)
+        across = variance[3:5] / float(np.median(depth_m)) ** 2
+        error_px = _PREDICTION_SIGMAS * self.rig.focal_px * float(np.sqrt(np.max(variance[[1, 0]] + across)))
+        levels = int(np.ceil(np.log2(max(error_px / (self.patch_px / 2), 1.0))))
+        return int(np.clip(levels, 1, _MOST_LEVELS))
+
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> _Located | None:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
@@ -164,7 +186,8 @@ class FrameToFrame:
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
         guess = self.rig.project(points).astype(np.float32)
-        tracked, ok = matching.track(reference.image, image, reference.pixels, guess, self.patch_px)
+        levels = self._pyramid_levels(points[:, 2])
+        tracked, ok = matching.track(reference.image, image, reference.pixels, guess, self.patch_px, levels)
         pixels, measured, cov = tracked[ok], reference.measured[ok], reference.cov[ok]
         current, current_cov = np.zeros_like(measured), np.zeros_like(cov)
         current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
@@ -177,13 +200,16 @@ class FrameToFrame:
         if motion is None:
             return None
         adjoint = geometry.adjoint(motion.a_from_b)
+        fitted = observation_equations.transfer(measured, motion.a_from_b, self.rig.baseline_m)[0]
+        residual_px = float(np.median(np.linalg.norm(fitted[:, :2] - current[:, :2], axis=1))) * self.rig.focal_px
         # without orthogonalisation, rounding errors would double with every frame
         pose = geometry.nearest_rigid(geometry.inverse(motion.a_from_b))
-        current[:, 2] = observation_equations.transfer(measured, motion.a_from_b, self.rig.baseline_m)[0][:, 2]
+        current[:, 2] = fitted[:, 2]
         return _Located(
             motion._replace(a_from_b=pose, cov=adjoint @ motion.cov @ adjoint.T),
             inlier_share=motion.n_points / len(pixels),
             tracked_share=float(ok.mean()),
+            residual_px=residual_px,
             as_reference=_Reference(image, pixels, current, cov),
         )
 

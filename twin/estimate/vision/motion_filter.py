@@ -20,7 +20,7 @@ class MotionFilter:
     The acceleration of a vehicle is limited. Where the image determines a pose well, the filter follows the measured
     pose; where it does not (few pixels, noise), the pose follows from the velocity over many frames, and a measurement
     that contradicts the prediction is rejected. The model is that of constant velocity (Bar-Shalom, Li & Kirubarajan
-    2001, Estimation with Applications to Tracking and Navigation, section 6.3.2). Errors of the pose are motions
+    2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose are motions
     [rotation, translation] (rad, m) in the axes of the camera: true pose = pose @ exp(error).
 
     Attributes:
@@ -56,8 +56,7 @@ class MotionFilter:
         transition = np.eye(12)
         transition[:6, :6] = geometry.adjoint(geometry.inverse(motion))
         transition[:6, 6:] = np.eye(6) * interval_s
-        by_acceleration = np.vstack([np.diag(_ACCELERATION) * interval_s**2 / 2, np.diag(_ACCELERATION) * interval_s])
-        self._cov = transition @ self._cov @ transition.T + by_acceleration @ by_acceleration.T
+        self._cov = transition @ self._cov @ transition.T + _acceleration_cov(interval_s)
 
     def correct(self, measured: Array, cov: Array) -> bool:
         """Fuses a measured pose (4, 4) with its covariance (6, 6).
@@ -76,3 +75,22 @@ class MotionFilter:
         updated = self._cov - gain @ self._cov[:6]
         self._cov = (updated + updated.T) / 2
         return True
+
+
+def _acceleration_cov(interval_s: float) -> Array:
+    """Returns the covariance (12, 12) of pose and velocity that unknown accelerations add within an interval.
+
+    The acceleration is white noise, also within the interval (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2). Its
+    density is such that the standard deviation of the change of velocity is `_ACCELERATION` times the interval.
+
+    An acceleration that is constant within the interval (section 6.3.2) would change the velocity by exactly twice the
+    change of position divided by the interval. With exactly measured poses, the filter would then reverse the sign of
+    its velocity error at each frame instead of reducing it (an alpha-beta filter with beta = 2), so that small
+    irregular motions would add up.
+
+    Args:
+        interval_s: length of the interval [s].
+    """
+    velocity = np.diag((_ACCELERATION * interval_s) ** 2)
+    shared = velocity * (interval_s / 2)
+    return np.block([[velocity * (interval_s**2 / 3), shared], [shared, velocity]])

@@ -152,7 +152,7 @@ class PixelLight:
 
     @property
     def lamp_scattered(self) -> BatchMean:
-        """Light of the floor that was scattered or reflected before it met the floor, and not scattered after it."""
+        """Light of the floor that was scattered or reflected on its way to the floor, but not scattered afterwards."""
         return _estimate(self.sums[:, LAMP_SCATTERED])
 
     @property
@@ -322,7 +322,11 @@ def _in_threads(trace: Callable[[np.random.Generator], Array], rngs: Sequence[np
 
 
 def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
-    """Returns the number of walks of a batch and the random stream of each batch."""
+    """Returns the number of walks of a batch and the random stream of each batch.
+
+    Raises:
+        TwinError: there are fewer than two batches or fewer walks than batches.
+    """
     if effort.batches < 2 or effort.walks < effort.batches:
         raise TwinError("effort.batches", f"{effort.batches} for {effort.walks} walks", "2 or more, one walk in each")
     rngs = [np.random.default_rng(s) for s in np.random.SeedSequence(effort.seed).spawn(effort.batches)]

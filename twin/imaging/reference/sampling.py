@@ -1,4 +1,4 @@
-"""Compiled random sampling of directions: from the table of a phase function, and in lobes around a lamp."""
+"""Compiled random sampling of directions: from the table of a phase function, and in lobes around a direction."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def towards(lamp, point):
 
 @njit(cache=True, nogil=True)
 def straight(scene, kind, point, normal, direction, before, density, step_m):
-    """Returns the light of all lamps that reaches a vertex without scattering, times the response of the vertex.
+    """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex.
 
     Args:
         before: the previous vertex of the walk.
@@ -150,7 +150,7 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
 
 @njit(cache=True, nogil=True)
 def sunlight(scene, kind, point, normal, direction, guided, rng):
-    """Returns the sunlight that reaches a vertex without scattering, times the response of the vertex.
+    """Returns the unscattered sunlight at a vertex, times the `response` of the vertex.
 
     In water, a sun with a disc is sampled at a random point of the disc, weighted by 1 - `share_of_escape`.
     """
@@ -251,9 +251,10 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
 
     Args:
         kind: 0 floor, 1 water.
-        direction: unit direction in which the backward path arrived there.
+        direction: unit direction in which the backward path arrived at the vertex.
         guided: share of the directions that are sampled around lamps and sun.
-        own: response of the vertex to that direction; per unit of albedo it is the density of the other directions.
+        own: response of the vertex to the direction (x, y, z); divided by the albedo of a floor, it is the density of
+            directions sampled by reflection or scattering.
     """
     own = own / scene.albedo if kind == 0 else own
     upwards = upward_share(scene, kind, direction, guided)
@@ -291,11 +292,13 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
 
 @njit(cache=True, nogil=True)
 def bin_of(view, bin_edges_px, x, y, z):
-    """Returns the bin of the distance between a pixel and the unscattered image of a point; the last bin is open.
+    """Returns the bin of the distance between a pixel and the unscattered image of a point.
+
+    The last bin has no upper limit and also holds points behind the camera.
 
     Args:
-        view: (5, 3) axes of the camera as rows, its position, and (column, row) of the pixel from the principal point
-            and the focal length [px].
+        view: (5, 3) axes of the camera as rows, its position, and (column, row) of the pixel relative to the
+            principal point and the focal length [px].
     """
     a, b, c = x - view[3, 0], y - view[3, 1], z - view[3, 2]
     depth = a * view[2, 0] + b * view[2, 1] + c * view[2, 2]
@@ -388,7 +391,10 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 
 @njit(cache=True, nogil=True)
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2]: the mean of `walk` over `n_walks` pairs of walks."""
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2] by component and bin, ordered as `sums` of `walk`.
+
+    It is the mean over `n_walks` pairs of walks: one that starts at the floor and one that starts in the water.
+    """
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
     a, b, f = view[4, 0], view[4, 1], view[4, 2]

@@ -1,0 +1,259 @@
+"""Exported data sets: other programs and our own readers find images, poses and calibration where they were."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import rasterio.warp
+from scipy.spatial.transform import Rotation
+
+from twin.app.camera_models import believed_calibration, true_calibration
+from twin.core import geometry
+from twin.core.records import ElevationMap, MapGrid, Readings, StereoRig, Trajectory
+from twin.datasets.calibration_files import read_calibration
+from twin.datasets.readers import read_dataset
+from twin.errors import TwinError
+from twin.exchange import camera_files, colmap, euroc, geotiff, ifdo, kitti, metashape, nerfstudio, tum
+from twin.exchange.attitude import yaw_pitch_roll_deg
+from twin.exchange.formats import FORMATS, check_needs, chosen_formats
+from twin.exchange.run_contents import RecordedFrame, RunContents, project
+from twin.scenario.model import Scenario
+
+N = 5
+RIG = StereoRig(64, 48, 55.0, 0.12, 5.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.06, -0.2])))
+
+
+def poses():
+    """Returns poses of a camera that looks down at a slant and turns, without symmetry."""
+    return np.array(
+        [
+            geometry.pose(
+                geometry.rotations_of_down_camera(np.array(0.3 + 0.1 * k))
+                @ geometry.so3_exp(np.array([0.1, -0.05, 0])),
+                np.array([-0.4 + 0.2 * k, 0.1 * k, 2.0 + 0.02 * k]),
+            )
+            for k in range(N)
+        ]
+    )
+
+
+@pytest.fixture
+def contents(tmp_path):
+    rng = np.random.default_rng(3)
+    frames = []
+    for k in range(N):
+        files = [tmp_path / f"{side}{k}.png" for side in ("left", "right")]
+        for file in files:
+            cv2.imwrite(str(file), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+        readings = Readings(2.0 + k, np.array([0.01, 0.02, 0.3 + k]))
+        frames.append(RecordedFrame(k, k / 5.0, files[0], files[1], k % 2 == 0, readings))
+    grid = MapGrid(-1.5, 1.8, 0.05, 70, 60)
+    x, y = np.meshgrid(*grid.centres())
+    height = (0.1 * x + 0.2 * np.sin(3 * y)).astype(np.float32)
+    height[:5, :9] = np.nan
+    elevation = ElevationMap(
+        grid, height, np.full_like(height, 0.01), rng.integers(1, 255, (70, 60, 3), dtype=np.uint8)
+    )
+    path = Trajectory(np.arange(N) / 5.0, poses())
+    shifted = Trajectory(path.times_s, geometry.pose(np.eye(3), np.array([0.01, 0, 0])) @ poses())
+    believed = believed_calibration(RIG)
+    pose = geometry.pose(geometry.so3_exp(np.array([0.01, 0.02, -0.01])), np.array([0.121, 0, 0]))
+    true = believed._replace(
+        left=believed.left._replace(distortion=np.array([0.05, -0.02, 0.001, -0.002, 0.003])), left_from_right=pose
+    )
+    return RunContents(
+        tmp_path, "run", {"name": "run"}, RIG, believed, true, {"truth": path, "final": shifted},
+        np.array([0, 2, 4]), tuple(frames), elevation,
+    )  # fmt: skip
+
+
+def test_colmap_reads_the_model_and_its_points_reproject_where_they_are_observed(contents, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    model, _ = colmap.export(contents, tmp_path)
+    read = pycolmap.Reconstruction(str(model))
+    assert (len(read.cameras), len(read.images), len(read.rigs)) == (2, 6, 1)
+    assert len(read.points3D) > 300
+    for image in read.images.values():
+        for point in image.points2D:
+            if point.has_point3D():
+                xyz = read.points3D[point.point3D_id].xyz
+                np.testing.assert_allclose(image.project_point(xyz), point.xy, atol=1e-4)  # written with 6 digits
+    left, right = (
+        next(i for i in read.images.values() if i.name == f"{side}/000002.png") for side in ("left", "right")
+    )
+    world_from_left = np.vstack([left.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
+    np.testing.assert_allclose(world_from_left, poses()[2], atol=1e-12)
+    relative = left.cam_from_world() * right.cam_from_world().inverse()
+    np.testing.assert_allclose(relative.matrix(), contents.true.left_from_right[:3], atol=1e-12)
+
+
+def test_points_triangulated_by_colmap_are_those_of_the_map(contents, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    model, _ = colmap.export(contents, tmp_path)
+    read = pycolmap.Reconstruction(str(model))
+    point = max(read.points3D.values(), key=lambda p: len(p.track.elements))
+    images = [read.images[e.image_id] for e in point.track.elements]
+    rays = [
+        (image.projection_center(), image.cam_from_world().rotation.inverse() * np.append(
+            image.camera.cam_from_img(image.points2D[e.point2D_idx].xy), 1.0))
+        for image, e in zip(images, point.track.elements, strict=True)
+    ]  # fmt: skip
+    normal = sum(np.eye(3) - np.outer(d, d) / (d @ d) for _, d in rays)
+    right = sum((np.eye(3) - np.outer(d, d) / (d @ d)) @ c for c, d in rays)
+    np.testing.assert_allclose(np.linalg.solve(normal, right), point.xyz, atol=1e-5)  # pixels with 6 digits
+    expected = contents.elevation
+    x, y = expected.grid.centres()
+    col, row = np.argmin(np.abs(x - point.xyz[0])), np.argmin(np.abs(y - point.xyz[1]))
+    assert point.xyz[2] == pytest.approx(float(expected.height_m[row, col]), abs=1e-6)
+    assert tuple(point.color) == tuple(expected.mosaic[row, col])
+
+
+def test_evo_reads_the_trajectories(contents, tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    (tmp_path / "tum").mkdir()
+    tum.export(contents, tmp_path / "tum")
+    kitti.export(contents, tmp_path / "kitti")
+    euroc.export(contents, tmp_path / "euroc")
+    read = file_interface.read_tum_trajectory_file(tmp_path / "tum" / "groundtruth.txt")
+    np.testing.assert_allclose(np.array(read.poses_se3), poses(), atol=1e-9)
+    read = file_interface.read_kitti_poses_file(tmp_path / "kitti" / "poses" / "00.txt")
+    np.testing.assert_allclose(np.array(read.poses_se3), np.linalg.inv(poses()[0]) @ poses(), atol=1e-9)
+    truth = tmp_path / "euroc" / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    read = file_interface.read_euroc_csv_trajectory(truth)
+    np.testing.assert_allclose(np.array(read.poses_se3) @ RIG.body_from_camera, poses(), atol=1e-9)
+    np.testing.assert_allclose(read.timestamps, 1.0 + np.arange(N) / 5.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("writer", [euroc, kitti])
+def test_our_readers_read_what_was_written(contents, writer, tmp_path):
+    writer.export(contents, tmp_path / "set")
+    folder = tmp_path / "set" if writer is euroc else tmp_path / "set" / "sequences" / "00"
+    dataset, _ = read_dataset(folder)
+    assert [cv2.imread(str(f.left)).tobytes() for f in dataset.images] == [
+        cv2.imread(str(f.left)).tobytes() for f in contents.frames
+    ]
+    assert all(frame.right is not None for frame in dataset.images)
+    calibration = dataset.calibration
+    np.testing.assert_allclose(calibration.left.matrix, RIG.matrix)
+    np.testing.assert_allclose(geometry.inverse(calibration.right_from_left), RIG.left_from_right, atol=1e-12)
+    expected = poses() if writer is euroc else np.linalg.inv(poses()[0]) @ poses()
+    np.testing.assert_allclose(dataset.truth.world_from_camera, expected, atol=1e-9)
+
+
+def test_readings_are_written_with_their_times(contents, tmp_path):
+    euroc.export(contents, tmp_path)
+    rows = np.loadtxt(tmp_path / "mav0" / "pressure0" / "data.csv", delimiter=",")
+    np.testing.assert_array_equal(rows, [[(1 + k / 5.0) * 1e9, 2.0 + k] for k in range(N)])
+    assert not (tmp_path / "mav0" / "dvl0").exists()  # the vehicle has none
+
+
+@pytest.mark.parametrize("name", ["opencv.yaml", "kalibr.yaml", "cameras.txt"])
+def test_calibration_files_are_read_back(contents, name, tmp_path):
+    camera_files.export(contents, tmp_path)
+    for kind, rig in (("believed", contents.believed), ("true", contents.true)):
+        read = read_calibration(tmp_path / kind / name)
+        np.testing.assert_allclose(read.left.matrix, rig.left.matrix)
+        np.testing.assert_allclose(geometry.inverse(read.right_from_left), rig.left_from_right, atol=1e-12)
+        n = min(len(read.left.distortion), 4 if name == "kalibr.yaml" else 5)
+        np.testing.assert_allclose(read.left.distortion[:n], rig.left.distortion[:n])
+
+
+def test_nerfstudio_poses_project_points_into_the_image_that_sees_them(contents, tmp_path):
+    (file,) = nerfstudio.export(replace(contents, true=None), tmp_path)
+    frame = next(f for f in json.loads(file.read_text())["frames"] if f["file_path"] == "images/right_000003.png")
+    point = np.array([0.3, 0.4, 0.1])
+    x, y, z = np.linalg.solve(np.array(frame["transform_matrix"]), np.append(point, 1.0))[:3]
+    assert z < 0  # OpenGL cameras look along -z
+    pixel = [frame["fl_x"] * x / -z + frame["cx"] - 0.5, -frame["fl_y"] * y / -z + frame["cy"] - 0.5]
+    camera = geometry.transform(geometry.inverse(poses()[3] @ RIG.left_from_right), point[None])
+    np.testing.assert_allclose([pixel], RIG.project(camera), atol=1e-9)
+
+
+def test_attitude_is_that_of_the_rotation_from_top_right_sight_to_north_east_down():
+    for yaw, pitch, roll in [(0, 0, 0), (90, 0, 0), (30, 20, 0), (250, -35, 10), (120, 5, -170)]:
+        ned_from_camera = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+        top, right, sight = ned_from_camera.T[:, [1, 0, 2]] * [1, 1, -1]  # in east, north, up
+        pose = geometry.pose(np.column_stack([right, -top, sight]), np.zeros(3))
+        np.testing.assert_allclose(yaw_pitch_roll_deg(pose), [yaw, pitch, roll], atol=1e-9)
+    north_up = geometry.pose(geometry.rotations_of_down_camera(np.array(np.pi / 2)), np.zeros(3))
+    np.testing.assert_allclose(np.sin(np.deg2rad(yaw_pitch_roll_deg(north_up))), 0, atol=1e-12)
+
+
+def test_positions_are_in_the_crs_of_the_export(contents, tmp_path):
+    origin = geotiff.georeference_in("EPSG:32633", (432000.0, 5571000.0, -35.0))
+    metashape.export(replace(contents, georeference=origin), tmp_path)
+    lines = (tmp_path / "reference_truth.csv").read_text().splitlines()
+    label, *values = lines[1 + 2 * 3].split(",")  # two images per frame
+    assert label == "left_000003.png"
+    np.testing.assert_allclose(
+        np.array(values[:3], float), poses()[3, :3, 3] + [432000, 5571000, -35], atol=1e-6, rtol=0
+    )
+    (file, _) = ifdo.export(replace(contents, georeference=origin), tmp_path)
+    item = json.loads(file.read_text())["image-set-items"]["left_000003.png"]
+    east, north = rasterio.warp.transform(
+        "EPSG:4326", "EPSG:32633", [item["image-longitude"]], [item["image-latitude"]]
+    )
+    np.testing.assert_allclose([east[0], north[0]], poses()[3, :2, 3] + [432000.01, 5571000], atol=1e-3, rtol=0)
+    assert item["image-altitude-meters"] == pytest.approx(2.06 - 35)
+    assert item["image-datetime"] == "1970-01-01 00:00:00.600000"
+
+
+def test_jpeg_is_written_on_request(contents, tmp_path):
+    euroc.export(replace(contents, jpeg_quality=90), tmp_path)
+    dataset, _ = read_dataset(tmp_path)
+    assert {frame.left.suffix for frame in dataset.images} == {".jpg"} and len(dataset.images) == N
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["eurok"], "--to: 'eurok' is not a format; did you mean 'euroc'\\? \\(allowed: euroc, "),
+        ([], "--to: is missing"),
+    ],
+)
+def test_an_unknown_format_is_refused(names, message):
+    with pytest.raises(TwinError, match=message):
+        chosen_formats(names)
+
+
+def test_names_may_be_repeated_and_separated_by_commas():
+    assert chosen_formats(["kitti,euroc", "kitti"]) == ["kitti", "euroc"]
+
+
+def test_a_run_without_images_is_refused_with_what_is_needed(contents):
+    without = replace(contents, frames=())
+    for name in ("euroc", "kitti", "colmap"):
+        with pytest.raises(TwinError, match='record = "all"'):
+            check_needs(name, without)
+    check_needs("calibration", without)
+    assert {"euroc", "kitti", "tum", "colmap", "nerfstudio", "calibration", "ifdo", "metashape", "truth"} <= set(
+        FORMATS
+    )
+
+
+def test_the_true_calibration_of_cameras_without_errors_is_exact():
+    scenario = Scenario.model_validate({"calibration_error": {"baseline_error": 0.02}})
+    true, rig = true_calibration(scenario), scenario.believed_rig()
+    np.testing.assert_array_equal(true.left.matrix, rig.matrix)
+    assert true.left_from_right[0, 3] == pytest.approx(1.02 * rig.baseline_m) and true.residual_px == 0
+
+
+def test_the_true_calibration_has_the_errors_of_the_scenario():
+    errors = {"focal_error": 0.01, "right_yaw_deg": 0.2, "left_principal_point_error_px": (2.0, -1.0)}
+    scenario = Scenario.model_validate({"calibration_error": errors})
+    true, rig = true_calibration(scenario), scenario.believed_rig()
+    assert true.left.matrix[0, 0] == pytest.approx(1.01 * rig.fx_px, rel=1e-6)
+    np.testing.assert_allclose(true.left.matrix[:2, 2], [rig.cx_px + 2, rig.cy_px - 1], atol=1e-4)
+    yaw = geometry.so3_log(true.left_from_right[:3, :3])[1]  # about the axis that points down
+    assert np.rad2deg(yaw) == pytest.approx(0.2, abs=1e-4) and true.residual_px < 1e-4
+
+
+def test_the_model_of_the_fit_is_that_of_opencv():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -1, 1], [1, 1, 3], (20, 3))
+    distortion, matrix = np.array([0.1, -0.05, 0.01, -0.02, 0.03]), RIG.matrix
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
+    camera = believed_calibration(RIG).left._replace(distortion=distortion)
+    np.testing.assert_allclose(project(points, camera), expected, atol=1e-9)

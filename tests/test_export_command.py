@@ -1,0 +1,253 @@
+"""Recorded frames are kept without loss, read back from the run folder, and their truth is that of the images."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from terrains.terrain import Terrain
+from twin.app.export_command import ExportOptions, export, run_contents
+from twin.app.true_layers import floor_normals, optical_flow
+from twin.core import geometry
+from twin.core.records import Frame, Readings, StereoRig, Trajectory
+from twin.core.timing import Stopwatch
+from twin.errors import TwinError
+from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
+from twin.scenario.file import dump_toml
+from twin.scenario.model import Scenario
+
+RIG = StereoRig(40, 30, 35.0, 0.1)
+SCENARIO = {
+    "seed": 3,
+    "terrain": {"kind": "ripples", "size_m": [4.0, 4.0], "relief_m": 0.3},
+    "rig": {"image_width_px": 96, "image_height_px": 72, "frame_rate_hz": 5.0},
+    "vehicle": {"dynamics": "kinematic"},
+    "lamps": [{"position_m": [0.25, 0.3, -0.05]}],
+    "plan": {"area_m": [1.0, 0.4], "tracks": 1, "altitude_m": 1.5},
+    "objects": [{"shape": "boulder", "size_m": 0.4, "position_m": [-0.4, 0.1]}],
+}
+
+
+def frame(index, stereo):
+    rng = np.random.default_rng(index)
+    left, right = rng.integers(0, 255, (2, 30, 40, 3), dtype=np.uint8)
+    readings = Readings(1.5 + index / 3, None, np.array([0.1, 0.2, index / 7]))
+    return Frame(index, index / 3, left, right if stereo else None, readings, stereo, (0.1, 0.2, index / 9))
+
+
+def run_folder(folder, scenario):
+    """Writes the files that a finished run of a scenario has besides its frames."""
+    folder.mkdir(exist_ok=True)
+    (folder / "scenario.resolved.toml").write_text(dump_toml(scenario))
+    (folder / "keyframes").mkdir(exist_ok=True)
+    (folder / "keyframes" / "index.json").write_text(json.dumps({"frames": [0, 2], "tracks": [1, 1]}))
+    return folder
+
+
+def test_recorded_frames_are_read_back_without_loss(tmp_path):
+    frames = [frame(k, k % 2 == 0) for k in range(4)]
+    with FrameRecorder(run_folder(tmp_path, Scenario()), "all") as recorder:
+        for one in frames:
+            recorder.add(one, geometry.pose(np.eye(3), np.array([one.index, 0, 1 / 3])), np.zeros(6))
+    contents = run_contents(tmp_path)
+    assert [f.index for f in contents.frames] == [0, 1, 2, 3] and [f.index for f in contents.pairs] == [0, 2]
+    assert [f.keyframe for f in contents.frames] == [True, False, True, False]
+    for one, read in zip(frames, contents.frames, strict=True):
+        assert read.time_s == one.time_s and read.exposure == one.exposure
+        assert read.readings.pressure_z_m == one.readings.pressure_z_m and read.readings.ahrs_rpy_rad is None
+        np.testing.assert_array_equal(read.readings.dvl_mps, one.readings.dvl_mps)
+        np.testing.assert_array_equal(cv2.imread(str(read.left), cv2.IMREAD_COLOR_RGB), one.left)
+        if one.right is not None:
+            np.testing.assert_array_equal(cv2.imread(str(read.right), cv2.IMREAD_COLOR_RGB), one.right)
+    poses = np.load(tmp_path / "frames" / "truth.npz")["world_from_camera"]
+    assert poses.shape == (4, 4, 4) and poses[1, 2, 3] == 1 / 3
+
+
+def test_an_image_that_cannot_be_written_is_an_error_at_a_later_frame(tmp_path):
+    with FrameRecorder(tmp_path, "all") as recorder, pytest.raises(OSError, match="left"):
+        (tmp_path / "frames" / "left").rename(tmp_path / "frames" / "moved")
+        for k in range(20):
+            recorder.add(frame(k, False), np.eye(4), np.zeros(6))
+
+
+def test_nothing_is_recorded_on_request(tmp_path):
+    with FrameRecorder(tmp_path, "none") as recorder:
+        recorder.add(frame(0, True), np.eye(4), np.zeros(6))
+    assert not (tmp_path / "frames").exists()
+    run_folder(tmp_path, Scenario())
+    (tmp_path / "keyframes" / "000000_left.png").write_bytes(b"image")
+    remove_keyframe_images(tmp_path)
+    assert [file.name for file in (tmp_path / "keyframes").iterdir()] == ["index.json"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (ExportOptions(crs="EPSG:32633"), "--crs: is given without --origin"),
+        (ExportOptions("EPSG:32633", "1,x"), "--origin: '1,x' is not a position"),
+        (ExportOptions("EPSG:4326", "1,2"), "--crs: 'EPSG:4326' is not a projected CRS"),
+        (ExportOptions("EPSG:nonsense", "1,2"), "--crs: 'EPSG:nonsense' is not a CRS"),
+        (ExportOptions(jpeg_quality=0), "--jpeg: 0 is not a quality"),
+    ],
+)
+def test_options_that_are_not_valid_are_refused(options, message, tmp_path):
+    with pytest.raises(TwinError, match=message):
+        run_contents(run_folder(tmp_path, Scenario()), options)
+
+
+def test_a_damaged_list_of_frames_is_refused(tmp_path):
+    with FrameRecorder(run_folder(tmp_path, Scenario()), "all") as recorder:
+        recorder.add(frame(0, True), np.eye(4), np.zeros(6))
+    table = tmp_path / "frames" / "frames.csv"
+    table.write_text(table.read_text().replace("time_s", "clock"))
+    with pytest.raises(TwinError, match="frames.csv: cannot be read"):
+        run_contents(tmp_path)
+
+
+def test_the_scenario_key_record_does_not_change_the_fingerprint():
+    assert Scenario(record="all").fingerprint() == Scenario().fingerprint() != Scenario(seed=1).fingerprint()
+
+
+def test_normals_of_a_tilted_floor_are_those_of_its_plane():
+    y, x = np.mgrid[-2:2.01:0.1, -2:2.01:0.1]
+    terrain = Terrain((0.3 * x - 0.1 * y).astype(np.float32), 0.1, -2.0, -2.0, np.zeros((4, 4, 3), np.uint8), 1.0)
+    pose = geometry.pose(geometry.rotations_of_down_camera(np.array(0.4)), np.array([0.1, 0.2, 1.0]))
+    depth = np.full((30, 40), 0.9, np.float32)
+    depth[0, 0] = np.inf
+    normals = floor_normals(terrain, depth, pose, RIG)
+    expected = pose[:3, :3].T @ np.array([-0.3, 0.1, 1.0]) / np.linalg.norm([0.3, 0.1, 1.0])
+    np.testing.assert_allclose(normals[1:].reshape(-1, 3), np.tile(expected, (29 * 40, 1)), atol=1e-5)
+    assert not normals[0, 0].any()
+
+
+def test_flow_over_a_plane_is_its_closed_form_and_hidden_points_have_none():
+    depth = np.full((30, 40), 2.0, np.float32)
+    moved = geometry.pose(np.eye(3), np.array([-0.4, 0.2, 0.0]))  # the camera moves right and up
+    flow = optical_flow(depth, depth, moved, RIG)
+    inside = np.isfinite(flow).all(axis=2)
+    np.testing.assert_allclose(flow[inside], np.tile([-7.0, 3.5], (inside.sum(), 1)), atol=1e-5)
+    assert inside[:26, 7:].all() and not inside[:, :6].any() and not inside[28:].any()
+    near = depth.copy()
+    near[10:20, 10:20] = 1.0  # an obstacle in the next image alone
+    hidden = ~np.isfinite(optical_flow(depth, near, moved, RIG)).all(axis=2) & inside
+    assert hidden[8:14, 19:26].all()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Returns the folder of a run with three rendered frames."""
+    from twin.world.mission import prepare
+    from twin.world.rendered_world import RenderedWorld
+
+    scenario = Scenario.model_validate(SCENARIO)
+    folder = run_folder(tmp_path_factory.mktemp("run"), scenario)
+    mission = prepare(scenario)
+    with RenderedWorld(mission, Stopwatch()) as world, FrameRecorder(folder, "all") as recorder:
+        sequence = mission.planned_frames(1)
+        world.start_sequence(sequence, 1)
+        for k in range(3):
+            recorder.add(world.observe(sequence[k]), world.world_from_camera, world.vehicle.twist_body)
+            world.act(np.array([1.0, 0.1, 0.0, 0.2]))
+        path = Trajectory(np.arange(3) / 5.0, world.truth().trajectory.world_from_camera)
+    path.save(folder / "trajectory_truth.tum")
+    return folder
+
+
+def test_the_world_rendered_again_gives_the_recorded_images_and_their_truth(recorded, tmp_path):
+    export(recorded, ["truth"], tmp_path)
+    folder = tmp_path / "truth"
+    index = json.loads((folder / "index.json").read_text())
+    assert index["rerendered"]["identical"] == index["rerendered"]["compared_with_noise"] == 3
+    assert index["objects"] == {"1": "boulder (objects.0)"}
+    depth, later = (cv2.imread(str(folder / "depth" / f"{k:06d}.tiff"), cv2.IMREAD_UNCHANGED) for k in (0, 1))
+    millimetres = cv2.imread(str(folder / "depth_mm" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(millimetres / 1000, depth, atol=0.5001e-3)
+    flow = cv2.readOpticalFlow(str(folder / "flow" / "000000.flo"))
+    assert np.nanmax(np.abs(flow)) > 3 and not (folder / "flow" / "000002.flo").exists()
+    albedo, shown = (cv2.imread(str(folder / "albedo" / f"{k:06d}.png")).astype(np.float32) for k in (0, 1))
+    position = np.stack(np.meshgrid(np.arange(96), np.arange(72)), -1).astype(np.float32) + flow
+    warped = cv2.remap(shown, position, None, cv2.INTER_LINEAR)
+    seen = np.isfinite(flow).all(axis=2)
+    texture = np.std(albedo[seen])
+    assert np.median(np.abs(warped - albedo)[seen]) < 0.15 * texture < np.median(np.abs(shown - albedo)[seen])
+    labels = cv2.imread(str(folder / "labels" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(labels)) == {0, 1} and later.shape == labels.shape
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("jpeg_quality", "limit_m"), [(None, 0.001), (90, 0.003)])
+def test_an_exported_survey_is_replayed_to_the_same_path(flown, jpeg_quality, limit_m, tmp_path):
+    import twin
+    from twin.datasets.replay import ReplayOptions
+
+    export(flown, ["euroc"], tmp_path, ExportOptions(jpeg_quality=jpeg_quality))
+    replayed = twin.replay(tmp_path / "euroc", tmp_path / "run", ReplayOptions(outputs=()))
+    online = Trajectory.load(flown / "trajectory_final.tum").positions
+    path = replayed.result.final.positions
+    shift, centre = online.mean(axis=0), path.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(online - shift, path - centre)
+    difference_m = np.linalg.norm(rotation.apply(path - centre) + shift - online, axis=1)
+    assert np.sqrt(np.mean(difference_m**2)) < limit_m
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Returns the folder of a flown survey with the images of all frames."""
+    from twin import survey
+    from twin.scenario.file import load_scenario
+
+    scenario = load_scenario("reef", ["plan.area_m=[2.0,1.0]", "rig.frame_rate_hz=10", "record=all"])
+    return survey.run(scenario, tmp_path_factory.mktemp("flown") / "run", outputs=()).folder
+
+
+@pytest.fixture
+def recorded_run(tmp_path):
+    """Returns the folder of a run with three recorded frames."""
+    folder = run_folder(tmp_path / "run", Scenario())
+    with FrameRecorder(folder, "all") as recorder:
+        for k in range(3):
+            recorder.add(frame(k, k % 2 == 0), np.eye(4), np.zeros(6))
+    return folder
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_an_interrupted_export_leaves_no_data_set(recorded_run, tmp_path, error):
+    def fail(_, fraction):
+        if fraction > 0.5:
+            raise error
+
+    with pytest.raises(error):
+        export(recorded_run, ["kitti"], tmp_path / "out", progress=fail)
+    assert list((tmp_path / "out").iterdir()) == []
+    (tmp_path / "out" / ".kitti.partial").mkdir()  # as an export that was killed leaves it
+    written = export(recorded_run, ["kitti"], tmp_path / "out")
+    assert [path.is_dir() for path in written["kitti"]] == [True]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["kitti"]
+
+
+def test_an_export_is_not_mixed_with_other_files(recorded_run, tmp_path):
+    (tmp_path / "out" / "kitti" / "image_2").mkdir(parents=True)
+    with pytest.raises(TwinError, match="kitti is not empty"):
+        export(recorded_run, ["calibration", "kitti"], tmp_path / "out")
+    assert not (tmp_path / "out" / "calibration").exists()
+
+
+@pytest.mark.parametrize("quality", [None, 90])
+@pytest.mark.parametrize("name", ["euroc", "mcap"])
+def test_a_truncated_image_of_the_run_is_named(recorded_run, tmp_path, name, quality):
+    image = recorded_run / "frames" / "left" / "000001.png"
+    image.write_bytes(image.read_bytes()[:-20])
+    with pytest.raises(TwinError, match=r"left/000001.png: is truncated or no PNG"):
+        export(recorded_run, [name], tmp_path / "out", ExportOptions(jpeg_quality=quality))
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize(("kept", "message"), [(3, "has no line for the keyframe 2"), (3.5, "frame 2 is incomplete")])
+def test_a_truncated_list_of_frames_is_refused(recorded_run, tmp_path, kept, message):
+    table = recorded_run / "frames" / "frames.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text("".join(lines[: int(kept)]) + (lines[3][:20] if kept % 1 else ""))
+    with pytest.raises(TwinError, match=message):
+        export(recorded_run, ["euroc"], tmp_path / "out")

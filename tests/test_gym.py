@@ -1,0 +1,102 @@
+"""The Gymnasium environment: gymnasium's own checker, its rewards and its ends."""
+
+import importlib
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import twin.gym
+from twin.errors import TwinError
+from twin.simulate.autopilot import nominal_controller
+
+SMALL = [
+    "terrain.size_m=[4.0, 3.5]",
+    "terrain.kind=flat",
+    "terrain.texture_px_m=0.01",
+    "rig.image_width_px=64",
+    "rig.image_height_px=48",
+    "rig.frame_rate_hz=10",
+    "plan.area_m=[0.3, 0.5]",
+    "plan.altitude_m=1.5",
+    "plan.overlap_along=0.7",
+    "control.hold_s=0.2",
+    "water.jerlov=clear",
+    "map.cell_m=0.05",
+]
+
+
+def make(*overrides, **options):
+    return gymnasium.make("twin.gym:SeabedTwin-v0", scenario="reef", overrides=[*SMALL, *overrides], **options)
+
+
+def test_the_environment_passes_the_checker_of_gymnasium():
+    env = make(render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(infinity|Box observation space).*")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.reset(seed=1)
+    assert env.render().shape == (48, 128, 3)
+    env.close()
+
+
+def test_an_episode_that_follows_the_plan_covers_the_area_and_ends_with_the_plan():
+    area_m2 = 1.8 * 0.6
+    env = make("plan.area_m=[1.8, 0.6]")
+    observation, info = env.reset(seed=3)
+    assert env.observation_space.contains(observation)
+    np.testing.assert_allclose(observation["pose"][:3], info["truth"]["world_from_camera"][:3, 3], atol=1e-4)
+    assert set(observation) == {"left", "right", "readings", "available", "pose", "reference"}
+    first, truncated, rewards = info["truth"]["covered"], False, []
+    assert first < 0.8
+    while not truncated:
+        # the true position: images of 64 px are too small for the estimators; the bow points along x
+        error = observation["reference"][:3] - info["truth"]["world_from_camera"][:3, 3]
+        action = np.append(np.clip(error, -1, 1), 0.0).astype(np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
+        rewards.append(reward)
+        assert not terminated, info["ended"]
+    assert min(rewards) >= 0
+    # the area is counted in cells of 0.05 m: an error of half a cell along its border of 4.8 m
+    assert sum(rewards) == pytest.approx((info["truth"]["covered"] - first) * area_m2, abs=4.8 * 0.025)
+    assert info["truth"]["covered"] > 0.9
+    env.close()
+
+
+def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
+    env = make(action="thrust", reward="track")
+    _, info = env.reset(seed=3)
+    assert info["truth"]["cross_track_m"] == pytest.approx(0, abs=1e-9)
+    down = nominal_controller(1.2, 10).state.allocation.commands(np.array([0, 0, 0, 0, 0, -100.0]))[0]
+    terminated = truncated = False
+    while not (terminated or truncated):
+        _, reward, terminated, truncated, info = env.step(down.astype(np.float32))
+        assert reward == pytest.approx(-info["truth"]["cross_track_m"])
+    assert terminated and info["ended"] == "the camera touched the floor"
+    assert info["truth"]["world_from_camera"][2, 3] < 0.1 < info["truth"]["cross_track_m"]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"action": "torque"}, "action: 'torque'"),
+        ({"reward": "fun"}, "reward: 'fun'"),
+        ({"overrides": ["imaging.fidelity=surrogate"]}, "imaging.fidelity: 'surrogate' has no images"),
+        ({"action": "thrust", "overrides": ["vehicle.dynamics=kinematic"]}, "action: 'thrust'"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused(options, message):
+    with pytest.raises(TwinError, match=message):
+        twin.gym.SeabedTwinEnv(**options)
+
+
+def test_without_gymnasium_the_import_says_which_extra_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, "twin.gym")
+    with pytest.raises(ImportError, match=r"^twin.gym needs the package gymnasium: pip install 'seabed-twin\[gym\]'"):
+        importlib.import_module("twin.gym")

@@ -1,0 +1,98 @@
+"""`twin compare`: the table, its differences, the page and the runs that cannot be compared."""
+
+import json
+
+import numpy as np
+import pytest
+
+from twin.core.records import Trajectory
+from twin.errors import TwinError
+from twin.judge.metrics import empty_metrics
+from twin.report import comparison
+
+
+def write_run(folder, error_m, completeness, **scenario):
+    """Writes a run folder whose estimates are off by a constant sideways error after the first frame."""
+    folder.mkdir(parents=True)
+    lines = [f"{key} = {json.dumps(value)}" for key, value in scenario.items()]
+    (folder / "scenario.resolved.toml").write_text("\n".join(['name = "test"', *lines]) + "\n")
+    metrics = empty_metrics() | {"name": "test", "seed": 1, "version": "0", "scenario_hash": "0"}
+    metrics |= {"status": "complete", "reason": "", "idealisations": [], "warnings": []}
+    metrics["trajectory"]["final"]["ate_rmse_m"] = error_m
+    metrics["map"]["completeness"] = completeness
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = 0.1 * np.arange(20)
+    Trajectory(np.arange(20.0), poses).save(folder / "trajectory_truth.tum")
+    poses[1:, 1, 3] = error_m
+    for name in ("online", "final"):
+        Trajectory(np.arange(20.0), poses).save(folder / f"trajectory_{name}.tum")
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    first = write_run(tmp_path / "a" / "run", 0.002, 0.9, seed=1)
+    second = write_run(tmp_path / "b" / "run", 0.003, 0.95, seed=2)
+    third = write_run(tmp_path / "b" / "worse", 0.02, None, seed=1)
+    return comparison.load_runs([first, second, third])
+
+
+def row(runs, name):
+    return next(row for row in comparison.table(runs) if row.quantity.name == name).cells
+
+
+def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(runs):
+    first, second, third = row(runs, "trajectory.final.ate_rmse_m")
+    assert (first.text, first.change, first.difference, first.level) == ("2.0 mm", "", None, "")
+    assert (second.text, second.change, second.level) == ("3.0 mm", "+1.0 mm (+50 %)", "bad")
+    assert second.difference == pytest.approx(0.001)
+    assert third.change == "+1.8 cm (10 \N{MULTIPLICATION SIGN})"
+    first, second, third = row(runs, "map.completeness")
+    assert (second.change, second.level) == ("+5 %", "good")
+    assert (third.value, third.difference, third.level) == (None, None, "")
+
+
+def test_a_quantity_that_no_run_has_is_left_out(runs):
+    assert "map.le90_m" not in [row.quantity.name for row in comparison.table(runs)]
+
+
+def test_runs_of_equal_folder_names_are_told_apart(runs):
+    assert comparison.names_of(runs) == ["a/run", "b/run", "b/worse"]
+    assert comparison.names_of(runs[1:]) == ["run", "worse"]
+
+
+def test_the_json_has_values_differences_and_what_the_scenarios_differ_in(runs):
+    tree = json.loads(json.dumps(comparison.as_json(runs)))
+    assert [run["status"] for run in tree["runs"]] == ["complete"] * 3
+    assert tree["metrics"]["trajectory.final.ate_rmse_m"]["values"] == [0.002, 0.003, 0.02]
+    assert tree["metrics"]["map.completeness"]["differences"] == [None, pytest.approx(0.05), None]
+    assert tree["scenario"] == {"seed": ["1", "2", "1"]}
+
+
+def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors(runs):
+    page = comparison.render(runs)
+    for text in (
+        "a/run",
+        "b/worse",
+        "+1.0 mm (+50 %)",
+        "different floors or plans: seed.",
+        "Differences of the scenar",
+    ):
+        assert text in page
+    assert page.count("data:image/png;base64,") == 2  # position errors and paths; the runs have no maps
+    same = comparison.render([runs[0], runs[2]])
+    assert "different floors" not in same and "Differences of the scenarios" not in same
+
+
+def test_runs_that_cannot_be_compared_are_refused(tmp_path, runs):
+    folder = runs[0].folder
+    with pytest.raises(TwinError, match="RUN: 1 runs .allowed: 2 to 8"):
+        comparison.load_runs([folder])
+    with pytest.raises(TwinError, match="the same folder is given twice"):
+        comparison.load_runs([folder, folder / ".." / "run"])
+    with pytest.raises(TwinError, match="is not a run folder"):
+        comparison.load_runs([folder, tmp_path])
+    (folder / "metrics.json").unlink()
+    with pytest.raises(TwinError, match="the survey is unfinished"):
+        comparison.load_runs([folder, runs[1].folder])

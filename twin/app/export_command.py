@@ -1,0 +1,274 @@
+"""The command `twin export`: reads a run from its folder and writes it in the formats of other programs."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.app.camera_models import believed_calibration, true_calibration
+from twin.app.outputs import new_folder
+from twin.core.georeference import Georeference
+from twin.core.records import Array, ElevationMap, Exposure, Image, Readings, StereoRig
+from twin.errors import TwinError
+from twin.exchange import geotiff
+from twin.exchange.formats import FORMATS, check_needs, chosen_formats
+from twin.exchange.run_contents import RecordedFrame, RunContents
+from twin.report.frame_recorder import EXPOSURE_COLUMNS, READING_COLUMNS
+from twin.report.replay_description import replayed_rig
+from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
+from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
+
+
+class ExportOptions(NamedTuple):
+    """Options of an export.
+
+    Args:
+        crs: CRS of the exported coordinates, such as EPSG:32633; None: that of the run.
+        origin: easting, northing and elevation of the scene origin as text, E,N or E,N,H; None: that of the run.
+        jpeg_quality: quality of exported images as JPEG, 1 to 100; None: PNG.
+    """
+
+    crs: str | None = None
+    origin: str | None = None
+    jpeg_quality: int | None = None
+
+
+def export(
+    folder: Path,
+    names: Sequence[str],
+    out: Path,
+    options: ExportOptions = ExportOptions(),  # noqa: B008 (immutable)
+    progress: Callable[[str, float], None] = lambda _, __: None,
+) -> dict[str, list[Path]]:
+    """Writes a run in several formats, each into the subfolder of `out` with the name of the format.
+
+    A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`
+    beside it, which an error or an interrupt removes.
+
+    Args:
+        folder: the run folder.
+        names: names of formats (`formats.chosen_formats`).
+        out: folder of the exported files.
+        options: CRS, origin and compression.
+        progress: called with the name of a format and the completed fraction of it, 0 to 1.
+
+    Returns:
+        The files or folders written, by format.
+
+    Raises:
+        TwinError: a format is unknown, the folder is not that of a run, the run lacks contents that a format needs, or
+            a subfolder is not empty or cannot be written; nothing was written. Or an image of the run is damaged.
+        OSError: a file cannot be written.
+    """
+    chosen = chosen_formats(names)
+    contents = run_contents(folder, options)
+    for name in chosen:
+        check_needs(name, contents)
+        new_folder(out / name)
+    written = {}
+    for name in chosen:
+        with _completed(out / name) as unfinished:
+            files = FORMATS[name].write(replace(contents, progress=partial(progress, name)), unfinished)
+        written[name] = [out / name / file.relative_to(unfinished) for file in files]
+    return written
+
+
+@contextmanager
+def _completed(folder: Path) -> Iterator[Path]:
+    """Yields a hidden folder beside `folder`, which is renamed to `folder` at the end, or removed after an exception.
+
+    Args:
+        folder: new or empty folder.
+
+    Raises:
+        OSError: a folder cannot be created, removed or renamed.
+    """
+    unfinished = folder.with_name(f".{folder.name}.partial")
+    if unfinished.exists():  # of an export that was killed
+        shutil.rmtree(unfinished)
+    unfinished.mkdir(parents=True)
+    try:
+        yield unfinished
+        unfinished.replace(folder)
+    except BaseException:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        raise
+
+
+def format_rows() -> list[tuple[str, ...]]:
+    """Returns the rows of the list of formats: name, description, and the contents that the format needs."""
+    return [("format", "contents", "needs")] + [
+        (name, form.description, ", ".join(sorted(form.needs))) for name, form in FORMATS.items()
+    ]
+
+
+def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunContents:  # noqa: B008 (immutable)
+    """Returns the contents of a run folder for the writers.
+
+    Raises:
+        TwinError: the folder is not that of a run, a file of it is damaged, or an option is not valid.
+    """
+    run = load_run(folder)
+    rig = replayed_rig(run.scenario)
+    scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE)
+    if scenario is not None:
+        rig = scenario.believed_rig()
+    assert rig is not None
+    frames = _frames(run, rig)
+    elevation = _elevation(run)
+    return RunContents(
+        folder=folder,
+        name=str(run.scenario.get("name", folder.name)),
+        scenario=run.scenario,
+        rig=rig,
+        believed=believed_calibration(rig),
+        true=None if scenario is None else true_calibration(scenario),
+        trajectories=run.trajectories,
+        keyframe_rows=run.keyframes.frames,
+        frames=frames,
+        elevation=elevation,
+        error_m=_layer(run, "dem_error", elevation),
+        orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
+        georeference=_georeference(folder, options),
+        true_layers=_true_layers(folder, scenario, frames),
+        jpeg_quality=_quality(options.jpeg_quality),
+    )
+
+
+def _true_layers(folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...]):
+    """Returns the function that renders the true layers again; None without a rendered world or true poses."""
+    if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
+        return None
+    from twin.app import true_layers
+
+    return partial(true_layers.true_layers, folder, scenario, frames)
+
+
+def _quality(quality: int | None) -> int | None:
+    """Returns the JPEG quality; raises TwinError unless it is None or from 1 to 100."""
+    if quality is not None and not 1 <= quality <= 100:
+        raise TwinError("--jpeg", f"{quality} is not a quality", "1 to 100")
+    return quality
+
+
+def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
+    """Returns the georeference of the options, or of the map files; None if there is neither.
+
+    Raises:
+        TwinError: only one of the options is given, or one is not valid.
+    """
+    if options.origin is None and options.crs is None:
+        file = folder / "dem.tif"
+        return geotiff.read_georeference(file) if file.is_file() else None
+    if options.origin is None or options.crs is None:
+        raise TwinError("--crs", "is given without --origin, or --origin without --crs", "both or none of them")
+    try:
+        east, north, *height = (float(part) for part in options.origin.split(","))
+        if len(height) > 1 or not np.isfinite([east, north, *height]).all():
+            raise ValueError
+    except ValueError:
+        problem = f"{options.origin[:60]!r} is not a position"
+        raise TwinError("--origin", problem, "E,N or E,N,H in the CRS, as in 432000,5571000,-35") from None
+    return geotiff.georeference_in(options.crs, (east, north, height[0] if height else 0.0))
+
+
+def _elevation(run: Run) -> ElevationMap | None:
+    """Returns the elevation map of a run with the colours of the orthomosaic at its cells; None if there is none."""
+    if "dem" not in run.rasters:
+        return None
+    grid, height_m = run.rasters["dem"]
+    sigma = run.rasters.get("dem_sigma")
+    sigma_m = np.full(height_m.shape, np.nan) if sigma is None or sigma.grid != grid else sigma.values
+    mosaic = _colours(run.rasters.get("mosaic"), run.rasters["dem"])
+    return ElevationMap(grid, height_m.astype(np.float32), sigma_m.astype(np.float32), mosaic)
+
+
+def _colours(mosaic: Raster | None, dem: Raster) -> Image:
+    """Returns the mean colour (rows, cols, 3) of the orthomosaic near the centre of each cell; black without data."""
+    if mosaic is None:
+        return np.zeros((*dem.values.shape, 3), np.uint8)
+    if mosaic.grid == dem.grid:
+        return mosaic.values.astype(np.uint8)
+    side = max(1, round(dem.grid.cell_m / mosaic.grid.cell_m))
+    smooth = cv2.blur(mosaic.values.astype(np.uint8), (side, side))
+    x, y = dem.grid.centres()
+    cols = np.floor((x - mosaic.grid.west_m) / mosaic.grid.cell_m).astype(int)
+    rows = np.floor((mosaic.grid.north_m - y) / mosaic.grid.cell_m).astype(int)
+    inside_rows, inside_cols = (rows >= 0) & (rows < mosaic.grid.rows), (cols >= 0) & (cols < mosaic.grid.cols)
+    sampled = smooth[np.clip(rows, 0, mosaic.grid.rows - 1)][:, np.clip(cols, 0, mosaic.grid.cols - 1)]
+    return np.where((inside_rows[:, None] & inside_cols)[..., None], sampled, np.uint8(0))
+
+
+def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.float32] | None:
+    """Returns a layer on the grid of the elevation map; None if there is none."""
+    raster = run.rasters.get(name)
+    if raster is None or elevation is None or raster.grid != elevation.grid:
+        return None
+    return raster.values.astype(np.float32)
+
+
+def _frames(run: Run, rig: StereoRig) -> tuple[RecordedFrame, ...]:
+    """Returns the frames of a run whose left image was recorded, in the order of time."""
+    keyframes = set(run.keyframes.frames.tolist())
+    folder = run.folder / "frames"
+    table = folder / "frames.csv"
+    if table.is_file():
+        listed = _listed(table)
+        if missing := keyframes - {row[0] for row in listed}:
+            raise TwinError(str(table), f"has no line for the keyframe {min(missing)}", "a complete list of the frames")
+    else:
+        path = next((run.trajectories[key] for key in ("online", "truth") if key in run.trajectories), None)
+        times = [] if path is None else path.times_s.tolist()
+        listed = [(k, times[k], None, Readings()) for k in sorted(keyframes) if k < len(times)]
+    found = []
+    for index, time_s, exposure, readings in listed:
+        left, right = (folder / side / f"{index:06d}.png" for side in ("left", "right"))
+        if not left.is_file() and index in keyframes:
+            left, right = (run.image_file(index, side) for side in ("left", "right"))
+        if left.is_file():
+            right = right if right.is_file() else None
+            found.append(RecordedFrame(index, time_s, left, right, index in keyframes, readings, exposure))
+    return tuple(found)
+
+
+def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
+    """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
+    try:
+        with table.open(newline="", encoding="utf-8") as lines:
+            return [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise TwinError(str(table), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
+
+
+def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
+    """Returns index, time, exposure and readings of a line of frames.csv; raises ValueError if it is incomplete."""
+    if None in row or None in row.values():
+        raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
+    return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
+
+
+def _exposure(row: dict[str, str]) -> Exposure | None:
+    """Returns the exposure of a line of frames.csv; None if its cells are empty."""
+    red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
+    return (float(red), float(green), float(blue)) if red else None
+
+
+def _readings(row: dict[str, str]) -> Readings:
+    """Returns the readings of a line of frames.csv."""
+    cells = [row[name] for name in READING_COLUMNS]
+
+    def vector(first: int) -> Array | None:
+        return np.array([float(cell) for cell in cells[first : first + 3]]) if cells[first] else None
+
+    return Readings(float(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))

@@ -1,0 +1,29 @@
+"""Import of packages that belong to an optional extra of this project."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from twin.errors import TwinError
+
+
+def optional(module: str, extra: str, purpose: str) -> Any:
+    """Returns a module of an optional package.
+
+    Args:
+        module: full name of the module, for example "rosbags.rosbag2".
+        extra: name of the extra of this project that installs the package.
+        purpose: command or option that needs the package, for the message.
+
+    Raises:
+        TwinError: the package is not installed.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        package = module.partition(".")[0]
+        if (error.name or "").partition(".")[0] != package:
+            raise
+        problem = f"needs the package {package}, which is not installed"
+        raise TwinError(purpose, problem, f"pip install 'seabed-twin[{extra}]'") from None

@@ -1,0 +1,230 @@
+"""Access to the messages of a ROS 2 bag (MCAP or SQLite file, or folder with metadata.yaml) by the package rosbags.
+
+A bag is untrusted. Messages are decoded with the message definitions of ROS 2 Humble, never with those in the bag, from
+which rosbags would generate code. Sizes are checked before memory is allocated for them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from twin.core.optional_packages import optional
+from twin.core.paths import is_file
+from twin.datasets.text_files import inside, read_yaml
+from twin.errors import TwinError
+
+_MOST_CHUNK_BYTES = 2**30  # largest chunk of an MCAP file after decompression
+_MOST_MESSAGES = 20_000_000
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_SUFFIXES = (".mcap", ".db3")
+_PURPOSE = "reading ROS 2 bags"
+
+
+class BagMessage(NamedTuple):
+    """Position of a message in a bag and the time in its header.
+
+    Args:
+        topic: topic of the message.
+        logged_ns: time at which the message was recorded [ns].
+        repetition: number of earlier messages of the topic with the same `logged_ns`.
+        stamp_ns: time in the header of the message [ns]; 0 if the publisher did not set it.
+    """
+
+    topic: str
+    logged_ns: int
+    repetition: int
+    stamp_ns: int
+
+
+def is_bag(path: Path) -> bool:
+    """Returns whether a path is an MCAP or SQLite file by its suffix, or the folder of a ROS 2 bag."""
+    return (path.is_file() and path.suffix in _SUFFIXES) or (path.is_dir() and (path / "metadata.yaml").is_file())
+
+
+class Bag:
+    """An open ROS 2 bag.
+
+    Args:
+        path: file or folder of the bag.
+
+    Attributes:
+        path: file or folder of the bag.
+        topics: type of the messages of each topic, for example "sensor_msgs/msg/Image".
+
+    Raises:
+        TwinError: the bag is damaged, truncated, too large or compressed by file or by message, or rosbags is not
+            installed.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        files = _files(path)
+        rosbag2 = optional("rosbags.rosbag2", "exchange", _PURPOSE)
+        _bound_decompression()
+        for file in files:
+            _check_end(file)
+        with self._damage():
+            self._reader: Any = rosbag2.Reader(path)
+            self._reader.open()
+            self.topics: dict[str, str] = {one.topic: one.msgtype for one in self._reader.connections}
+            self._check_sizes()
+
+    def first(self, topic: str) -> Any:
+        """Returns the first message of a topic, decoded; None if the topic has no message.
+
+        Raises:
+            TwinError: the bag is damaged.
+        """
+        return next(self.messages(topic), None)
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Yields the messages of a topic, decoded, in the order in which they were recorded.
+
+        Raises:
+            TwinError: the bag is damaged.
+        """
+        with self._damage():
+            for _, _, data in self._reader.messages(self._connections([topic])):
+                yield _typestore().deserialize_cdr(data, self.topics[topic])
+
+    def index(self, topics: Sequence[str]) -> dict[str, list[BagMessage]]:
+        """Returns the messages of topics whose type begins with a header, in the order in which they were recorded.
+
+        The whole bag is read once; only times are kept.
+
+        Raises:
+            TwinError: the bag is damaged.
+        """
+        found: dict[str, list[BagMessage]] = {topic: [] for topic in topics}
+        with self._damage():
+            for connection, logged_ns, data in self._reader.messages(self._connections(topics)):
+                before = found[connection.topic]
+                same = before[-1].repetition + 1 if before and before[-1].logged_ns == logged_ns else 0
+                before.append(BagMessage(connection.topic, logged_ns, same, _stamp_ns(data)))
+        return found
+
+    def message(self, position: BagMessage) -> Any:
+        """Returns the message at a position, decoded.
+
+        Raises:
+            ValueError: the message is damaged.
+        """
+        try:
+            connections = self._connections([position.topic])
+            start = position.logged_ns
+            for k, (_, _, data) in enumerate(self._reader.messages(connections, start, start + 1)):
+                if k == position.repetition:
+                    return _typestore().deserialize_cdr(data, self.topics[position.topic])
+        except Exception as error:  # a parser of damaged data may raise any error
+            raise ValueError(repr(error)) from None
+        raise ValueError("missing")
+
+    def _connections(self, topics: Sequence[str]) -> list[Any]:
+        """Returns the connections (rosbags' term for the channels) of topics."""
+        return [one for one in self._reader.connections if one.topic in topics]
+
+    def _check_sizes(self) -> None:
+        """Raises ValueError if an MCAP file has no index of its chunks, or a chunk or the bag is too large."""
+        if self._reader.message_count > _MOST_MESSAGES:
+            raise ValueError(f"{self._reader.message_count} messages; at most {_MOST_MESSAGES}")
+        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
+        for storage in storages:
+            chunks = getattr(storage, "chunks", None)
+            if chunks is not None and not chunks and self._reader.message_count:
+                raise ValueError("no index of chunks; `mcap recover FILE -o NEW` writes one")
+            if chunks and max(chunk.uncompressed_size for chunk in chunks) > _MOST_CHUNK_BYTES:
+                raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        """Converts every error of the parser to a TwinError that names the bag."""
+        try:
+            yield
+        except (TwinError, GeneratorExit):
+            raise
+        except Exception as error:  # a parser of damaged data may raise any error
+            text = " ".join(str(error).split())[:200] or type(error).__name__
+            raise TwinError(str(self.path), f"cannot be read: {text}", "an undamaged ROS 2 bag") from None
+
+
+def _files(path: Path) -> list[Path]:
+    """Returns the files of a bag, which lie in its folder; raises TwinError if its metadata are damaged."""
+    if not path.is_dir():
+        return [path]
+    source = path / "metadata.yaml"
+    table = read_yaml(source).get("rosbag2_bagfile_information")
+    names = table.get("relative_file_paths") if isinstance(table, dict) else None
+    if not isinstance(table, dict) or not isinstance(names, list) or not names:
+        raise TwinError(str(source), "does not describe a ROS 2 bag", "metadata.yaml with relative_file_paths")
+    if table.get("compression_mode"):
+        problem = f"the bag is compressed (mode {str(table['compression_mode'])[:20]!r})"
+        raise TwinError(str(source), problem, "a bag without compression of files or messages")
+    files = [inside(path, Path(str(name)).name, source) for name in names]
+    if missing := [file.name for file in files if not is_file(file)]:
+        raise TwinError(str(source), f"{missing[0][:100]} is missing", "all files of the bag")
+    return files
+
+
+def _check_end(file: Path) -> None:
+    """Raises TwinError unless an MCAP file begins and ends with the magic bytes of the format."""
+    if file.suffix != ".mcap":
+        return
+    with file.open("rb") as opened:
+        start = opened.read(len(_MCAP_MAGIC))
+        if start != _MCAP_MAGIC:
+            raise TwinError(str(file), "is not an MCAP file" if start else "is empty", "a ROS 2 bag")
+        opened.seek(-min(file.stat().st_size, len(_MCAP_MAGIC)), 2)
+        if file.stat().st_size < 2 * len(_MCAP_MAGIC) or opened.read() != _MCAP_MAGIC:
+            raise TwinError(str(file), "is truncated", "a complete bag; `mcap recover FILE -o NEW` saves its beginning")
+
+
+def _stamp_ns(data: bytes | memoryview) -> int:
+    """Returns the time [ns] in the header with which a message in CDR begins (OMG DDS-XTypes 1.3, section 7.4).
+
+    Raises:
+        ValueError: the message is too short.
+    """
+    if len(data) < 12:
+        raise ValueError("a message without header")
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return seconds * 1_000_000_000 + nanoseconds
+
+
+@cache
+def _typestore() -> Any:
+    """Returns the message definitions of ROS 2 Humble."""
+    typesys = optional("rosbags.typesys", "exchange", _PURPOSE)
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+@cache
+def _bound_decompression() -> None:
+    """Limits the data that rosbags decompresses from a chunk to the size that the chunk states.
+
+    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory.
+    """
+    storage = optional("rosbags.rosbag2.storage_mcap", "exchange", _PURPOSE)
+    lz4 = optional("lz4.frame", "exchange", _PURPOSE)
+
+    def limited(size: int) -> int:
+        """Returns the size that a decompressor may return: one byte more than the chunk states.
+
+        Raises:
+            ValueError: the chunk states more than `_MOST_CHUNK_BYTES`.
+        """
+        if size > _MOST_CHUNK_BYTES:
+            raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
+        return size + 1
+
+    def from_zstd(data: bytes, size: int) -> bytes:
+        return storage.zstd.ZstdDecompressor().decompress(data, max_length=limited(size))
+
+    def from_lz4(data: bytes, size: int) -> bytes:
+        return lz4.LZ4FrameDecompressor().decompress(data, max_length=limited(size))
+
+    storage.DECOMPRESSORS.update({"zstd": from_zstd, "lz4": from_lz4})

@@ -1,0 +1,91 @@
+"""Choice of the two image topics of a ROS 2 bag: those with a camera_info, left and right by name or by baseline."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from twin.datasets.bag_images import COMPRESSED_IMAGE, IMAGE
+from twin.errors import TwinError
+
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+#: Words in topics that name the side of a camera.
+_LEFT = re.compile(r"(^|[/_])(left|cam0|cam_0|camera0|camera_0|infra1|image_0)([/_]|$)", re.IGNORECASE)
+_RIGHT = re.compile(r"(^|[/_])(right|cam1|cam_1|camera1|camera_1|infra2|image_1)([/_]|$)", re.IGNORECASE)
+_RECTIFIED = re.compile(r"[/_]rect(_|$|/|ified)", re.IGNORECASE)
+
+
+class StereoTopics(NamedTuple):
+    """Image topics of both cameras, and the topics of their calibrations (None: not recorded)."""
+
+    left: str
+    right: str
+    left_info: str | None
+    right_info: str | None
+
+    @property
+    def rectified(self) -> bool:
+        """Returns whether the images are rectified, by the names that image_proc gives to topics (`image_rect`)."""
+        return all(_RECTIFIED.search(topic) is not None for topic in (self.left, self.right))
+
+
+def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
+    """Returns the image topics of a bag, each with the topic of its calibration.
+
+    The calibration of an image topic NAMESPACE/NAME or NAMESPACE/NAME/compressed is NAMESPACE/camera_info.
+
+    Args:
+        topics: type of the messages of each topic.
+    """
+    found = {}
+    for topic, kind in topics.items():
+        if kind in (IMAGE, COMPRESSED_IMAGE) and not topic.endswith("/compressedDepth"):
+            image = topic.removesuffix("/compressed") if kind == COMPRESSED_IMAGE else topic
+            info = f"{image.rpartition('/')[0]}/camera_info"
+            found[topic] = info if topics.get(info) == _CAMERA_INFO else None
+    return found
+
+
+def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any], path: Path) -> StereoTopics:
+    """Returns the only stereo pair among image topics.
+
+    A topic of uncompressed images takes precedence over the topic of the same images in compressed form. Left and
+    right are recognised by words in the topics, such as "left" or "cam0"; without such words, the right camera is the
+    one whose projection matrix has a baseline.
+
+    Args:
+        images: image topics, each with the topic of its calibration (None: not recorded).
+        first: function that returns the first message of a topic, or None.
+        path: the bag, for messages.
+
+    Raises:
+        TwinError: there is no pair with calibrations, or there are several.
+    """
+    calibrated = {topic: info for topic, info in images.items() if info and not _has_uncompressed(topic, images)}
+    sides = [[topic for topic in calibrated if word.search(topic)] for word in (_LEFT, _RIGHT)]
+    if [len(side) for side in sides] != [1, 1] and len(calibrated) == 2:
+        sides = _by_baseline(calibrated, first)
+    if [len(side) for side in sides] == [1, 1] and sides[0] != sides[1]:
+        (left,), (right,) = sides
+        return StereoTopics(left, right, images[left], images[right])
+    found = ", ".join(images)
+    problem = "which two image topics are a stereo pair is ambiguous" if calibrated else "has no stereo pair"
+    allowed = f"--topics LEFT,RIGHT of: {found}" if found else "a bag with sensor_msgs/Image or CompressedImage"
+    raise TwinError(str(path), problem, allowed)
+
+
+def _has_uncompressed(topic: str, images: Mapping[str, str | None]) -> bool:
+    """Returns whether the images of a compressed topic are also recorded uncompressed."""
+    return topic.endswith("/compressed") and topic.removesuffix("/compressed") in images
+
+
+def _by_baseline(calibrated: Mapping[str, str | None], first: Callable[[str], Any]) -> list[list[str]]:
+    """Returns the topics of left and of right cameras: P[0, 3] of the CameraInfo is negative only for right ones."""
+    sides: list[list[str]] = [[], []]
+    for topic, info in calibrated.items():
+        message = first(info) if info else None
+        if message is not None:
+            sides[int(float(message.p[3]) < 0)].append(topic)
+    return sides

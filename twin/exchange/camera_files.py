@@ -1,0 +1,102 @@
+"""Camera calibration in the files of OpenCV, Kalibr and COLMAP, true and believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from twin.core import geometry
+from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, RunContents
+
+
+def export(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the calibration in the forms of OpenCV, Kalibr and COLMAP, and returns the folders `believed` and `true`.
+
+    The believed calibration is that of the estimators, with which the images were rectified. The true calibration
+    describes the same rectified images: if the believed one has errors, the rectified images still have some distortion
+    and a relative rotation. Without a known true calibration, only `believed` is written.
+    """
+    written = []
+    for name, rig in (("believed", contents.believed), ("true", contents.true)):
+        if rig is not None:
+            target = folder / name
+            target.mkdir(exist_ok=True)
+            write_opencv(target / "opencv.yaml", rig)
+            write_kalibr(target / "kalibr.yaml", rig)
+            write_colmap_cameras(target, rig)
+            written.append(target)
+    return written
+
+
+def write_opencv(file: Path, rig: RigCalibration) -> None:
+    """Writes an OpenCV file: M1, D1, M2, D2, R, T (right from left), image_width, image_height, residual_px."""
+    right_from_left = geometry.inverse(rig.left_from_right)
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    try:
+        storage.write("image_width", rig.left.size_px[0])
+        storage.write("image_height", rig.left.size_px[1])
+        matrices = {
+            "M1": rig.left.matrix,
+            "D1": rig.left.distortion.reshape(1, -1),
+            "M2": rig.right.matrix,
+            "D2": rig.right.distortion.reshape(1, -1),
+            "R": right_from_left[:3, :3],
+            "T": right_from_left[:3, 3:],
+        }
+        for name, matrix in matrices.items():
+            storage.write(name, np.ascontiguousarray(matrix))
+        storage.write("residual_px", rig.residual_px)
+    finally:
+        storage.release()
+
+
+def write_kalibr(file: Path, rig: RigCalibration) -> None:
+    """Writes a Kalibr camchain: cam0 left, cam1 right with T_cn_cnm1; k3 is left out, as the model radtan has none."""
+    right_from_left = geometry.inverse(rig.left_from_right)
+    tree = {"cam0": _kalibr_camera(rig.left, "cam0"), "cam1": _kalibr_camera(rig.right, "cam1")}
+    tree["cam1"]["T_cn_cnm1"] = [[float(value) for value in row] for row in right_from_left]
+    file.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), encoding="utf-8")
+
+
+def _kalibr_camera(camera: CameraIntrinsics, name: str) -> dict[str, Any]:
+    """Returns the entry of one camera in a Kalibr camchain; `name` is "cam0" or "cam1"."""
+    matrix = camera.matrix
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [float(value) for value in camera.distortion[:4]],
+        "resolution": list(camera.size_px),
+        "rostopic": f"/{name}/image_raw",
+    }
+
+
+def write_colmap_cameras(folder: Path, rig: RigCalibration) -> None:
+    """Writes cameras.txt and rigs.txt of COLMAP: camera 1 left, camera 2 right; rig 1 has camera 1 as its reference."""
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    lines += [f"{k} {_colmap_camera(camera)}" for k, camera in ((1, rig.left), (2, rig.right))]
+    (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    pose = colmap_pose(geometry.inverse(rig.left_from_right))
+    header = "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, POSE)"
+    (folder / "rigs.txt").write_text(f"{header}\n1 2 CAMERA 1 CAMERA 2 1 {pose}\n", encoding="utf-8")
+
+
+def colmap_pose(camera_from_world: np.ndarray) -> str:
+    """Returns a pose (4, 4) in the form of COLMAP: QW QX QY QZ TX TY TZ."""
+    values = [*geometry.quaternion_wxyz(camera_from_world[:3, :3]), *camera_from_world[:3, 3]]
+    return " ".join(f"{value:.17g}" for value in values)
+
+
+def _colmap_camera(camera: CameraIntrinsics) -> str:
+    """Returns model, size and parameters of a camera as text; COLMAP has the corner of the first pixel at (0, 0)."""
+    (width, height), matrix, distortion = camera.size_px, camera.matrix, camera.distortion
+    values = [matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5]
+    model = "PINHOLE"
+    if distortion.any():
+        model = "FULL_OPENCV"
+        values += [*distortion, 0.0, 0.0, 0.0]
+    return f"{model} {width} {height} " + " ".join(f"{value:.17g}" for value in values)

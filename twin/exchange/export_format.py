@@ -1,0 +1,27 @@
+"""A format of `twin export`: description, needed contents, and the function that writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from twin.exchange.run_contents import RunContents
+
+#: Contents that a format may need: images (left), pairs (images of both cameras), map, truth, world (rendered again).
+Need = Literal["images", "pairs", "map", "truth", "world"]
+
+
+class ExportFormat(NamedTuple):
+    """A format of `twin export`.
+
+    Args:
+        description: one line for the list of formats.
+        needs: contents without which the format cannot be written.
+        write: writes the contents to a folder that exists, and returns the files written, or the folders that are
+            filled with many files. The function imports the libraries that it needs when it is called.
+    """
+
+    description: str
+    needs: frozenset[Need]
+    write: Callable[[RunContents, Path], list[Path]]

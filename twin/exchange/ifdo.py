@@ -1,0 +1,142 @@
+"""Writer of iFDO files (image FAIR Digital Object, version 2.1): metadata of an image set of marine imaging."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import uuid
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.core.georeference import Georeference
+from twin.core.records import Array
+from twin.exchange.attitude import yaw_pitch_roll_deg
+from twin.exchange.image_copy import copy_image
+from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunContents
+
+VERSION = "v2.1.0"
+_START = datetime(1970, 1, 1, tzinfo=UTC)  # a simulated survey has no date
+
+
+def export(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the images and ifdo.json, with position, attitude, calibration and hash of each image.
+
+    Positions and attitudes are those of the final trajectory, as in the report of a real survey; without one, they are
+    the true ones. Latitude and longitude (EPSG:4326), which iFDO requires, are written if the export has a CRS;
+    otherwise, the file has only poses in local coordinates. Times count from 1970-01-01, because a simulated survey has
+    no date.
+    """
+    (folder / "images").mkdir(exist_ok=True)
+    path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
+    items: dict[str, Any] = {}
+    for k, frame in enumerate(contents.frames):
+        sides = (("left", frame.left, np.eye(4)), ("right", frame.right, contents.rig.left_from_right))
+        for side, file, left_from_camera in sides:
+            if file is not None:
+                stem = folder / "images" / f"{side}_{frame.index:06d}"
+                copied = copy_image(file, stem, contents.jpeg_quality)
+                pose = path.world_from_camera[frame.index] @ left_from_camera
+                items[copied.name] = _item(contents, frame, copied, pose)
+        contents.progress((k + 1) / len(contents.frames))
+    target = folder / "ifdo.json"
+    text = json.dumps({"image-set-header": _header(contents), "image-set-items": items}, indent=1)
+    target.write_text(text, encoding="utf-8")
+    return [target, folder / "images"]
+
+
+def _header(contents: RunContents) -> dict[str, Any]:
+    """Returns the fields of the whole image set."""
+    identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
+    origin = contents.georeference
+    named = {"image-context": "simulated survey", "image-project": contents.name, "image-event": contents.name}
+    header: dict[str, Any] = {
+        "image-set-name": contents.name,
+        "image-set-uuid": identifier,
+        "image-set-handle": f"urn:uuid:{identifier}",
+        "image-set-ifdo-version": VERSION,
+        "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
+        "image-creators": [{"name": "twin"}],
+        "image-pi": {"name": "twin"},
+        "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
+        "image-copyright": "simulated images, no copyright holder",
+        "image-platform": {"name": "BlueROV2 Heavy, simulated"},
+        "image-sensor": {"name": "stereo camera, simulated"},
+        "image-acquisition": "photo",
+        "image-quality": "raw",
+        "image-deployment": "survey",
+        "image-navigation": "reconstructed",
+        "image-illumination": "artificial light" if contents.scenario.get("lamps") else "sunlight",
+        "image-pixel-magnitude": "mm",
+        "image-marine-zone": "seafloor",
+        "image-spectral-resolution": "rgb",
+        "image-camera-calibration-model": _calibration(contents.believed.left),
+    }
+    header |= {key: {"name": name} for key, name in named.items()}
+    crs = "EPSG:4326" if origin is not None and origin.crs_wkt is not None else "local metres, x east, y north, z up"
+    return header | {"image-coordinate-reference-system": crs}
+
+
+def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
+    """Returns the calibration as iFDO defines it [px, degrees]; the centre of the first pixel is at (0, 0)."""
+    matrix = camera.matrix
+    field = np.rad2deg(2 * np.arctan([camera.size_px[k] / 2 / matrix[k, k] for k in (0, 1)]))
+    return {
+        "calibration-model-type": "rectilinear water",
+        "calibration-focal-length-xy-pixel": [float(matrix[0, 0]), float(matrix[1, 1])],
+        "calibration-principal-point-xy-pixel": [float(matrix[0, 2]), float(matrix[1, 2])],
+        "calibration-distortion-coefficients": [float(value) for value in camera.distortion] + [0.0, 0.0, 0.0],
+        "calibration-approximate-field-of-view-water-xy-degree": [float(value) for value in field],
+    }
+
+
+def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
+    """Returns the fields of one image, given its file and the pose (4, 4) of its camera in the world."""
+    digest = hashlib.sha256(image.read_bytes()).hexdigest()
+    time = _START + timedelta(seconds=frame.time_s)
+    yaw, pitch, roll = yaw_pitch_roll_deg(pose)
+    return {
+        "image-uuid": _uuid(digest.encode() + image.name.encode()),
+        "image-hash-sha256": digest,
+        "image-datetime": time.strftime("%Y-%m-%d %H:%M:%S.%f"),
+        "image-camera-yaw-degrees": yaw,
+        "image-camera-pitch-degrees": pitch,
+        "image-camera-roll-degrees": roll,
+        **_position(contents.georeference, pose),
+    }
+
+
+def _position(origin: Georeference | None, pose: Array) -> dict[str, Any]:
+    """Returns the fields of the position for the pose (4, 4) of a camera in the world.
+
+    They are in the CRS of `origin` and in EPSG:4326, or in local coordinates [m] without a CRS.
+    """
+    x, y, z = (float(value) for value in pose[:3, 3])
+    rotation = [float(value) for value in pose[:3, :3].ravel()]
+    if origin is None or origin.crs_wkt is None:
+        where = {"pose-utm-east-north-up-meters": [x, y, z], "pose-absolute-orientation-utm-matrix": rotation}
+        return {"image-camera-pose": where}
+    from rasterio.crs import CRS
+    from rasterio.warp import transform
+
+    crs = CRS.from_wkt(origin.crs_wkt)
+    easting, northing = (float(value) for value in origin.from_scene(x, y))
+    (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [easting], [northing])[:2]
+    altitude_m = z + origin.elevation_m
+    return {
+        "image-latitude": round(latitude, 9),
+        "image-longitude": round(longitude, 9),
+        "image-altitude-meters": altitude_m,
+        "image-camera-pose": {
+            "pose-utm-epsg": str(crs.to_epsg() or ""),
+            "pose-utm-east-north-up-meters": [easting, northing, altitude_m],
+            "pose-absolute-orientation-utm-matrix": rotation,
+        },
+    }
+
+
+def _uuid(data: bytes) -> str:
+    """Returns a UUID of version 4 that depends on `data` only, so that equal exports have equal identifiers."""
+    return str(uuid.UUID(bytes=hashlib.sha256(data).digest()[:16], version=4))

@@ -1,0 +1,49 @@
+"""Copies of recorded images into exported data sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+
+from twin.errors import TwinError
+
+_PNG_END = b"IEND\xaeB`\x82"  # last bytes of a complete PNG file
+
+
+def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Path:
+    """Copies an image file, or writes it as JPEG, and returns the path of the new file.
+
+    Args:
+        source: PNG file.
+        stem: path of the new file without its suffix.
+        jpeg_quality: quality of the JPEG, 1 to 100; None: the bytes of the file are copied.
+
+    Raises:
+        TwinError: the source is truncated or no PNG image.
+        OSError: the source cannot be read, or the new file cannot be written.
+    """
+    kind, data = encoded_image(source, jpeg_quality)
+    file = stem.with_name(f"{stem.name}.{'jpg' if kind == 'jpeg' else kind}")
+    file.write_bytes(data)
+    return file
+
+
+def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, bytes]:
+    """Returns the format ("png" or "jpeg") and the bytes of an image file.
+
+    Args:
+        source: PNG file.
+        jpeg_quality: quality with which the image is encoded as JPEG, 1 to 100; None: the bytes of the file.
+
+    Raises:
+        TwinError: the file is truncated or no PNG image.
+        OSError: the file cannot be read.
+    """
+    data = source.read_bytes()
+    image = None if jpeg_quality is None else cv2.imread(str(source), cv2.IMREAD_COLOR)
+    if not data.endswith(_PNG_END) or (image is None and jpeg_quality is not None):
+        raise TwinError(str(source), "is truncated or no PNG image", "an undamaged image of the run")
+    if image is None:
+        return "png", data
+    return "jpeg", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality or 0])[1].tobytes()

@@ -1,0 +1,98 @@
+"""Formats of images, poses and calibrations. Each function imports its writer when it is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from twin.exchange.export_format import ExportFormat
+from twin.exchange.run_contents import RunContents
+
+
+def _euroc(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the EuRoC/ASL folder mav0."""
+    from twin.exchange import euroc
+
+    return euroc.export(contents, folder)
+
+
+def _kitti(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes a KITTI odometry sequence."""
+    from twin.exchange import kitti
+
+    return kitti.export(contents, folder)
+
+
+def _tum(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes trajectories and image lists in the TUM layout."""
+    from twin.exchange import tum
+
+    return tum.export(contents, folder)
+
+
+def _colmap(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes a COLMAP text model."""
+    from twin.exchange import colmap
+
+    return colmap.export(contents, folder)
+
+
+def _nerfstudio(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes a nerfstudio data set."""
+    from twin.exchange import nerfstudio
+
+    return nerfstudio.export(contents, folder)
+
+
+def _calibration(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the calibration, true and believed."""
+    from twin.exchange import camera_files
+
+    return camera_files.export(contents, folder)
+
+
+def _ifdo(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the iFDO image metadata."""
+    from twin.exchange import ifdo
+
+    return ifdo.export(contents, folder)
+
+
+def _metashape(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the reference CSV of Metashape."""
+    from twin.exchange import metashape
+
+    return metashape.export(contents, folder)
+
+
+def _truth(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the exact truth of the recorded images."""
+    from twin.exchange import truth_images
+
+    return truth_images.export(contents, folder)
+
+
+IMAGE_FORMATS: dict[str, ExportFormat] = {
+    "euroc": ExportFormat(
+        "EuRoC/ASL folder: stereo images, calibration, truth, pressure, attitude", frozenset({"images"}), _euroc
+    ),
+    "kitti": ExportFormat(
+        "KITTI odometry sequence: stereo pairs, calib.txt, times.txt, true poses", frozenset({"pairs"}), _kitti
+    ),
+    "tum": ExportFormat("TUM: trajectories of the left camera, lists of images", frozenset(), _tum),
+    "colmap": ExportFormat(
+        "COLMAP text model: stereo rig, poses, 3D points of the map with tracks", frozenset({"pairs"}), _colmap
+    ),
+    "nerfstudio": ExportFormat("nerfstudio: transforms.json and images", frozenset({"images"}), _nerfstudio),
+    "calibration": ExportFormat(
+        "camera calibration in OpenCV, Kalibr and COLMAP form, true and believed", frozenset(), _calibration
+    ),
+    "ifdo": ExportFormat("iFDO v2.1 metadata of the images (JSON)", frozenset({"images"}), _ifdo),
+    "metashape": ExportFormat(
+        "Metashape reference CSV: position and attitude of each image", frozenset({"images"}), _metashape
+    ),
+    "truth": ExportFormat(
+        "exact truth of each left image: depth, flow, normals, albedo, clear water, light, veil, labels",
+        frozenset({"images", "world"}),
+        _truth,
+    ),
+}

@@ -1,0 +1,181 @@
+"""Writer of ROS 2 bags in MCAP: images, calibration, transforms, odometry, readings of the navigation sensors."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.optional_packages import optional
+from twin.core.records import Trajectory
+from twin.errors import TwinError
+from twin.exchange.euroc import timestamp_ns
+from twin.exchange.image_copy import encoded_image
+from twin.exchange.ros2_messages import BODY, LEFT, RIGHT, WORLD, MessageFactory
+from twin.exchange.run_contents import RunContents
+
+BAG = "ros2_bag"  # folder of the bag, and the name of its MCAP file
+_WATER_KG_M3, _GRAVITY_MPS2, _AIR_PA = 1025.0, 9.81, 101_325.0  # sea water, standard air pressure
+PASCAL_PER_METRE = _WATER_KG_M3 * _GRAVITY_MPS2
+
+
+class Message(NamedTuple):
+    """A message to be written: its time [ns], its topic, and the message itself."""
+
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def export(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the bag `folder`/ros2_bag (MCAP and metadata.yaml) with all messages in the order of time.
+
+    Topics: /left/image_rect/compressed, /left/camera_info and the same for right; /tf_static; /odometry and /tf of the
+    final trajectory; /ground_truth/odometry if the truth is known; /imu/data (attitude), /pressure, /dvl if recorded.
+    All times are those of `euroc.timestamp_ns`.
+
+    Raises:
+        TwinError: the package rosbags is not installed, or the bag exists already.
+        OSError: the folder cannot be written.
+    """
+    rosbag2 = optional("rosbags.rosbag2", "exchange", "--to mcap")
+    path, factory = folder / BAG, MessageFactory()
+    if path.exists():
+        raise TwinError(str(path), "exists already", "a new folder")
+    with rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for one in _messages(contents, factory):
+            if one.topic not in connections:
+                kind, qos = one.message.__msgtype__, _static_qos() if one.topic == "/tf_static" else []
+                connections[one.topic] = writer.add_connection(
+                    one.topic, kind, typestore=factory.typestore, offered_qos_profiles=qos
+                )
+            writer.write(connections[one.topic], one.time_ns, factory.serialised(one.message))
+    return [path]
+
+
+def pressure_pa(height_m: float, surface_m: float) -> float:
+    """Returns the absolute pressure [Pa] at a height above z = 0: p = p_air + rho g (surface - height).
+
+    Args:
+        height_m: height of the sensor above the plane z = 0 [m].
+        surface_m: height of the water surface above this plane [m]; 0: not known, so the result is the pressure
+            relative to that at the plane z = 0.
+    """
+    air_pa = _AIR_PA if surface_m > 0 else 0.0
+    return air_pa + PASCAL_PER_METRE * (surface_m - height_m)
+
+
+def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+    """Returns all messages of a run in the order of time; images are read one by one."""
+    streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
+    body_from_left = contents.rig.body_from_camera
+    for topic, name in (("/odometry", "final"), ("/ground_truth/odometry", "truth")):
+        if name in contents.trajectories and len(contents.trajectories[name]):
+            streams.append(_odometry(factory, topic, contents.trajectories[name], body_from_left))
+    return heapq.merge(*streams, key=lambda one: one.time_ns)
+
+
+def _static(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+    """Yields the static transforms of the two cameras in the body."""
+    rig = contents.rig
+    poses = {(BODY, LEFT): rig.body_from_camera, (BODY, RIGHT): rig.body_from_camera @ rig.left_from_right}
+    time_ns = timestamp_ns(0.0)
+    yield Message(time_ns, "/tf_static", factory.transforms(time_ns, poses))
+
+
+def _images(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+    """Yields the images of the recorded frames, each with its CameraInfo."""
+    believed = contents.believed
+    baseline_m = contents.rig.baseline_m
+    for k, frame in enumerate(contents.frames):
+        time_ns = timestamp_ns(frame.time_s)
+        for side, name, file, camera in (
+            ("left", LEFT, frame.left, believed.left),
+            ("right", RIGHT, frame.right, believed.right),
+        ):
+            if file is not None:
+                kind, data = encoded_image(file, contents.jpeg_quality)
+                topic, distance_m = f"/{side}/image_rect/compressed", baseline_m if side == "right" else 0.0
+                yield Message(time_ns, topic, factory.compressed_image(time_ns, name, kind, data))
+                info = factory.camera_info(time_ns, name, camera, distance_m)
+                yield Message(time_ns, f"/{side}/camera_info", info)
+        contents.progress((k + 1) / len(contents.frames))
+
+
+def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_from_left: Array) -> Iterator[Message]:
+    """Yields the pose and the twist of the body at each frame; for the topic /odometry also the pose as /tf.
+
+    Args:
+        factory: makes the messages.
+        topic: "/odometry" for the estimate, "/ground_truth/odometry" for the truth.
+        trajectory: poses of the left camera in the world.
+        body_from_left: (4, 4) pose of the left camera in the body.
+    """
+    poses = trajectory.world_from_camera @ geometry.inverse(body_from_left)
+    twists = body_twists(trajectory.times_s, poses)
+    for time_s, pose, twist in zip(trajectory.times_s, poses, twists, strict=True):
+        time_ns = timestamp_ns(time_s)
+        yield Message(time_ns, topic, factory.odometry(time_ns, pose, twist))
+        if topic == "/odometry":
+            yield Message(time_ns, "/tf", factory.transforms(time_ns, {(WORLD, BODY): pose}))
+
+
+def body_twists(times_s: Array, poses: Array) -> Array:
+    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes, from the motion to the next pose.
+
+    The last pose has the twist of the one before; the twist of a single pose is zero.
+
+    Args:
+        times_s: (n,) increasing times.
+        poses: (n, 4, 4) poses world_from_body.
+    """
+    found = np.zeros((len(poses), 6))
+    for k in range(len(poses) - 1):
+        motion = geometry.inverse(np.ascontiguousarray(poses[k])) @ poses[k + 1]
+        found[k] = geometry.log(np.ascontiguousarray(motion)) / (times_s[k + 1] - times_s[k])
+    if len(poses) > 1:
+        found[-1] = found[-2]
+    return found
+
+
+def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+    """Yields the readings of AHRS, pressure sensor and DVL at the recorded frames.
+
+    The covariances follow from the standard deviations in the section [navigation] of the scenario.
+    """
+    navigation = contents.scenario.get("navigation", {})
+    surface_m = float(contents.scenario.get("sun", {}).get("depth_m", 0.0))
+    level_rad, heading_rad = (
+        np.deg2rad(navigation.get(key, 0.0)) for key in ("attitude_sigma_deg", "heading_sigma_deg")
+    )
+    pressure_sigma_pa = PASCAL_PER_METRE * navigation.get("pressure_sigma_m", 0.0)
+    for frame in contents.frames:
+        time_ns, readings = timestamp_ns(frame.time_s), frame.readings
+        if readings.ahrs_rpy_rad is not None:
+            sigmas_rad = np.array([level_rad, level_rad, heading_rad])
+            yield Message(time_ns, "/imu/data", factory.attitude(time_ns, readings.ahrs_rpy_rad, sigmas_rad))
+        if readings.pressure_z_m is not None:
+            value_pa = pressure_pa(readings.pressure_z_m, surface_m)
+            yield Message(time_ns, "/pressure", factory.pressure(time_ns, value_pa, pressure_sigma_pa))
+        if readings.dvl_mps is not None:
+            sigma_mps = float(navigation.get("dvl_sigma_mps", 0.0))
+            yield Message(time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps))
+
+
+def _static_qos() -> list[Any]:
+    """Returns the quality of service of /tf_static: late subscribers get the last message (transient local)."""
+    interfaces = optional("rosbags.interfaces", "exchange", "--to mcap")
+    forever = interfaces.QosTime(9223372036, 854775807)  # as rosbag2 writes an unlimited duration
+    return [
+        interfaces.Qos(
+            interfaces.QosHistory.KEEP_LAST, 1, interfaces.QosReliability.RELIABLE,
+            interfaces.QosDurability.TRANSIENT_LOCAL, forever, forever, interfaces.QosLiveliness.AUTOMATIC, forever,
+            False,
+        )
+    ]  # fmt: skip

@@ -1,0 +1,239 @@
+"""Gymnasium environment over `twin.World`: `gymnasium.make("twin.gym:SeabedTwin-v0")`; see docs/plugins.md.
+
+Importing this module registers the environment. It needs the extra `gym` of the package.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, SupportsFloat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controllers.segments import Reference
+from twin.core import geometry
+from twin.core.records import Array, Frame
+from twin.errors import SurveyAborted, TwinError
+from twin.scenario.file import load_scenario
+from twin.session.stepped_world import SteppedWorld
+from twin.world.pilot import make_pilot
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:
+    raise ImportError("twin.gym needs the package gymnasium: pip install 'seabed-twin[gym]'") from error
+
+ENVIRONMENT = "SeabedTwin-v0"
+#: Turn rate at full yaw action [rad/s]; speed at full velocity action / planned speed.
+YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
+#: An episode ends if the left camera comes closer to the floor below it [m].
+LEAST_CLEARANCE_M = 0.1
+
+Observation = dict[str, Any]
+
+
+class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """Survey of a scenario as a reinforcement-learning environment.
+
+    A step lasts from one keyframe to the next: `frames_per_step` frames, the last of which has both images. The
+    estimators of the scenario run in the loop and give the believed pose. The truth is only in `info` and in the
+    reward. An episode is truncated after the last frame of the plan, and terminated if the left camera leaves the
+    terrain or comes closer than 0.1 m to the floor, or if the survey is aborted.
+
+    Observation (dictionary):
+        left, right: (H, W, 3) uint8 RGB, rectified stereo pair.
+        readings: (7,) float64: height from pressure [m]; roll, pitch, yaw [rad]; velocity from the DVL in body axes
+            [m/s]. Zero where `available` is 0.
+        available: (3,) int8, whether there are readings of pressure, attitude and DVL.
+        pose: (7,) float64, believed pose of the left camera in the world: x, y, z [m], quaternion x, y, z, w.
+        reference: (4,) float64, planned x, y, z [m] and yaw [rad] of the left camera at this time.
+
+    Action, each value in [-1, 1]:
+        "velocity": (4,) forward, left and up velocity of the left camera, and yaw rate to the left. 1 is 1.5 times
+            plan.speed_mps, or 0.5 rad/s. The controller of the scenario steers, by the believed pose, to the
+            position and yaw that follow from integration of these velocities.
+        "thrust": (8,) thruster commands.
+
+    Reward of a step:
+        "coverage": part of the asked area that both cameras saw for the first time [m2].
+        "track": minus the distance of the true left camera from its planned position at the end of the step [m].
+
+    Info: `time_s`; `truth`, with `world_from_camera` (4, 4), `cross_track_m` (distance from the planned position) and
+    `covered` (fraction of the asked area seen so far); `ended`, the reason for the termination, or "".
+
+    Args:
+        scenario: name or path of a scenario with imaging.fidelity = "rendered".
+        overrides: strings "key=value" that replace values of the scenario.
+        action: kind of action.
+        reward: kind of reward.
+        render_mode: None, or "rgb_array": `render` returns the stereo pair side by side.
+
+    Raises:
+        TwinError: the scenario cannot be flown or has no images, or the value of an argument is not allowed.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 3}
+
+    def __init__(
+        self,
+        scenario: str = "quickstart",
+        overrides: Sequence[str] = (),
+        action: Literal["velocity", "thrust"] = "velocity",
+        reward: Literal["coverage", "track"] = "coverage",
+        render_mode: str | None = None,
+    ):
+        given = load_scenario(scenario, overrides)
+        if given.imaging.fidelity != "rendered":
+            raise TwinError("imaging.fidelity", f"{given.imaging.fidelity!r} has no images", '"rendered"')
+        if action not in ("velocity", "thrust") or (action == "thrust" and given.vehicle.dynamics != "rigid"):
+            raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+        if reward not in ("coverage", "track"):
+            raise TwinError("reward", f"{reward!r}: no such reward", '"coverage" or "track"')
+        self._world = SteppedWorld(given)
+        self._velocity_action, self._reward, self.render_mode = action == "velocity", reward, render_mode
+        self.frames_per_step = self._world.mission.plan.n_frames_per_keyframe
+        self._most_mps = SPEED_RATIO * given.plan.speed_mps
+        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else 8,), np.float32)
+        shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
+        self.observation_space = spaces.Dict(
+            {
+                "left": spaces.Box(0, 255, shape, np.uint8),
+                "right": spaces.Box(0, 255, shape, np.uint8),
+                "readings": spaces.Box(-np.inf, np.inf, (7,), np.float64),
+                "available": spaces.MultiBinary(3),
+                "pose": spaces.Box(-np.inf, np.inf, (7,), np.float64),
+                "reference": spaces.Box(-np.inf, np.inf, (4,), np.float64),
+            }
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode and returns its first observation and its info.
+
+        Args:
+            seed: seed of the random generator of the environment, from which the seed of the scenario (floor, noise) is
+                drawn; None: the generator continues its sequence.
+            options: not used.
+
+        Raises:
+            ScenarioError: the survey cannot be flown with the drawn seed.
+        """
+        super().reset(seed=seed)
+        self._frame = self._world.reset(int(self.np_random.integers(2**31)))
+        self._navigator = self._world.estimator()
+        self._steer = make_pilot(self._world.mission)
+        self._estimate = self._navigator.update(self._frame, 1)
+        start = self._world.reference
+        self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
+        grid = self._world.mission.grid
+        self._asked = self._world.mission.plan.inside_area(*np.meshgrid(*grid.centres()))
+        self._covered_m2 = self._seen_m2()
+        self._ended = ""
+        return self._observation(), self._info()
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Applies an action up to the next keyframe; returns observation, reward, terminated, truncated and info."""
+        values = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        truncated = False
+        try:
+            for k in range(self.frames_per_step):
+                frame = self._world.step(self._command(values), keyframe=k + 1 == self.frames_per_step)
+                if frame is None:
+                    truncated = True
+                    break
+                self._frame = frame
+                if self._world.aligns:
+                    self._navigator.align_track(self._world.track)
+                self._estimate = self._navigator.update(frame, self._world.track)
+        except SurveyAborted as error:
+            self._ended = str(error)
+        self._ended = self._ended or self._collision()
+        seen_m2 = self._seen_m2()
+        gained_m2, self._covered_m2 = seen_m2 - self._covered_m2, seen_m2
+        reward = gained_m2 if self._reward == "coverage" else -self._cross_track_m()
+        return self._observation(), reward, bool(self._ended), truncated, self._info()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Returns the stereo pair side by side (H, 2 W, 3); None unless the render mode is "rgb_array"."""
+        if self.render_mode != "rgb_array":
+            return None
+        return np.concatenate([self._frame.left, self._right()], axis=1)
+
+    def close(self) -> None:
+        """Releases the OpenGL context."""
+        self._world.close()
+
+    def _command(self, values: Array) -> Array:
+        """Returns the command of the vehicle for one frame, given the action."""
+        if not self._velocity_action:
+            return values
+        interval_s, last = 1 / self._world.rig.frame_rate_hz, self._target
+        yaw = float(last.yaw) + values[3] * YAW_RATE_RADPS * interval_s
+        c, s = np.cos(yaw), np.sin(yaw)
+        forward, left, up = values[:3] * self._most_mps
+        velocity = np.array([c * forward - s * left, s * forward + c * left, up])
+        self._target = Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
+        return self._steer(self._estimate, self._target)
+
+    def _observation(self) -> Observation:
+        """Returns the observation at the current frame."""
+        reference, pose = self._world.reference, self._estimate.world_from_camera
+        readings, available = _readings(self._frame)
+        return {
+            "left": self._frame.left,
+            "right": self._right(),
+            "readings": readings,
+            "available": available,
+            "pose": np.concatenate([pose[:3, 3], geometry.quaternion_xyzw(pose[:3, :3])]),
+            "reference": np.append(reference.position, float(reference.yaw)),
+        }
+
+    def _right(self) -> NDArray[np.uint8]:
+        """Returns the right image; at a frame without one, that of an extra exposure (`SteppedWorld.capture`)."""
+        return self._world.capture().right if self._frame.right is None else self._frame.right
+
+    def _info(self) -> dict[str, Any]:
+        """Returns the info of a step: time, truth, and the reason for a termination."""
+        asked_m2 = float(self._asked.sum()) * self._world.mission.grid.cell_m**2
+        truth = {
+            "world_from_camera": self._world.true_pose,
+            "cross_track_m": self._cross_track_m(),
+            "covered": self._covered_m2 / asked_m2,
+        }
+        return {"time_s": self._frame.time_s, "truth": truth, "ended": self._ended}
+
+    def _cross_track_m(self) -> float:
+        """Returns the distance of the true left camera from its planned position [m]."""
+        return float(np.linalg.norm(self._world.true_pose[:3, 3] - self._world.reference.position))
+
+    def _seen_m2(self) -> float:
+        """Returns the part of the asked area that both cameras have seen in a keyframe [m2]."""
+        return float((self._world.world.seen() & self._asked).sum()) * self._world.mission.grid.cell_m**2
+
+    def _collision(self) -> str:
+        """Returns why the episode ends: the camera left the terrain or came too near to the floor; otherwise ""."""
+        x, y, z = self._world.true_pose[:3, 3]
+        floor_m = float(self._world.mission.terrain.height_at(x, y))
+        if np.isnan(floor_m):
+            return "the camera left the terrain"
+        return "the camera touched the floor" if z - floor_m < LEAST_CLEARANCE_M else ""
+
+
+def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:
+    """Returns the readings (7,) of pressure, attitude and DVL, zero where missing, and the mask (3,) of those given."""
+    given = frame.readings
+    parts = given.pressure_z_m, given.ahrs_rpy_rad, given.dvl_mps
+    filled = [np.zeros(n) if part is None else np.atleast_1d(part) for n, part in zip((1, 3, 3), parts, strict=True)]
+    return np.concatenate(filled).astype(np.float64), np.array([part is not None for part in parts], np.int8)
+
+
+def register() -> None:
+    """Registers the environment under its id, if it is not registered yet."""
+    if ENVIRONMENT not in gymnasium.registry:
+        gymnasium.register(ENVIRONMENT, entry_point="twin.gym:SeabedTwinEnv")
+
+
+register()

@@ -1,0 +1,1 @@
+"""Plug-ins: controllers, estimators, terrains and readers of other packages that replace those of this package."""

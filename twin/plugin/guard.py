@@ -1,0 +1,142 @@
+"""Calls of a plug-in: exceptions in it and unusable values from it end the survey with a reason that names it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.errors import SurveyAborted, TwinError
+from twin.plugin import loading
+
+#: Largest difference of R'R from the identity, and of det R from 1, for a rotation R of a pose.
+_ROTATION_TOLERANCE = 1e-6
+_MOST_HEIGHT_M = 1e4  # largest absolute height of a floor
+_MOST_POSITION_M = 1e6  # largest absolute coordinate of a pose
+
+
+class PluginFailed(SurveyAborted):
+    """A plug-in raised an exception or returned an unusable value; the message names it."""
+
+
+class GuardedPlugin:
+    """Plug-in whose calls and results are checked. It is created at the first call.
+
+    Args:
+        key: key of the scenario that names the plug-in, for example "control.plugin".
+        group: group of entry points.
+        name: "module:Class", or the name of an entry point.
+        methods: methods that the plug-in must have.
+        arguments: arguments of its class.
+
+    Raises:
+        TwinError: the class cannot be loaded.
+    """
+
+    def __init__(self, key: str, group: str, name: str, methods: Sequence[str], *arguments: Any):
+        self.label = f"{key} {name}"
+        self._create: Callable[..., Any] = loading.load(key, group, name)
+        self._methods, self._arguments = methods, arguments
+        self._plugin: Any = None
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Returns the result of a method, which gets copies of the arguments and so cannot change them.
+
+        Raises:
+            PluginFailed: the class or the method raised an exception, or a method is missing.
+        """
+        if self._plugin is None:
+            self._plugin = self._attempt("its class", self._create, self._arguments)
+            if missing := [name for name in self._methods if not callable(getattr(self._plugin, name, None))]:
+                raise PluginFailed(f"{self.label}: has no method {missing[0]}")
+        return self._attempt(method, getattr(self._plugin, method), arguments)
+
+    def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
+        """Returns a value that a method returned as an array of floats.
+
+        Args:
+            method: name of the method, for the message.
+            value: the returned value.
+            shape: shape that the array must have.
+
+        Raises:
+            PluginFailed: the value is not an array of this shape, or a number is not finite.
+        """
+        try:
+            array = np.array(value, dtype=np.float64)
+        except Exception:  # conversion runs code of the value: a tensor with a gradient raises RuntimeError
+            self.refuse(method, f"{type(value).__name__}", f"numbers of shape {shape}")
+        if array.shape != shape:
+            self.refuse(method, f"shape {array.shape}", f"{shape}")
+        if not np.isfinite(array).all():
+            n = np.count_nonzero(~np.isfinite(array))
+            self.refuse(method, f"{n} of {array.size} numbers that are not finite", "finite numbers")
+        return array
+
+    def poses(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
+        """Returns a value that a method returned as rigid poses: `shape` is (4, 4) or (n, 4, 4).
+
+        Raises:
+            PluginFailed: the value is not valid for `numbers`, a rotation is not orthonormal with determinant 1, a
+                last row is not (0, 0, 0, 1), or a coordinate is larger than 1e6 m.
+        """
+        array = self.numbers(method, value, shape)
+        rotation = array[..., :3, :3]
+        error = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(initial=0.0)
+        turned = np.abs(np.linalg.det(rotation) - 1).max(initial=0.0)
+        if max(error, turned) > _ROTATION_TOLERANCE:
+            self.refuse(method, "a matrix that is no rotation", "an orthonormal rotation with determinant 1")
+        if np.abs(array[..., 3, :] - [0, 0, 0, 1]).max(initial=0.0) > 0:
+            self.refuse(method, "a last row that is not (0, 0, 0, 1)", "a rigid pose")
+        if (largest := np.abs(array[..., :3, 3]).max(initial=0.0)) > _MOST_POSITION_M:
+            self.refuse(method, f"a position of {largest:g} m", f"up to {_MOST_POSITION_M:g} m")
+        return array
+
+    def covariance(self, method: str, value: Any) -> Array:
+        """Returns a value that a method returned as a covariance (6, 6).
+
+        Raises:
+            PluginFailed: the value is not valid for `numbers`, or not symmetric and positive semidefinite.
+        """
+        array = self.numbers(method, value, (6, 6))
+        scale = np.abs(array).max()
+        if np.abs(array - array.T).max() > 1e-9 * scale or np.linalg.eigvalsh(array)[0] < -1e-9 * scale:
+            self.refuse(method, "a matrix that is no covariance", "symmetric and positive semidefinite")
+        return array
+
+    def refuse(self, method: str, returned: str, expected: str) -> NoReturn:
+        """Raises PluginFailed; the message names the method, the returned value and the expected one."""
+        raise PluginFailed(f"{self.label}: {method} returned {returned} (expected: {expected})")
+
+    def _attempt(self, what: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+        """Returns the result of a function of the plug-in; an exception in it becomes PluginFailed."""
+        try:
+            return function(*copy.deepcopy(arguments))
+        except (Exception, SystemExit) as error:  # any error of code that is not ours
+            raise PluginFailed(f"{self.label}: {what} raised {loading.described(error)}") from None
+
+
+def check_loadable(key: str, group: str, name: str | None) -> None:
+    """Raises TwinError if a plug-in is named and cannot be loaded."""
+    if name is not None:
+        loading.load(key, group, name)
+
+
+def terrain_heights(name: str, x_m: Array, y_m: Array, seed: int) -> Array:
+    """Returns the heights (rows, cols) [m] of a floor from a terrain plug-in (`TerrainGenerator.heights`).
+
+    Raises:
+        TwinError: the plug-in cannot be loaded, raised an exception, or returned an unusable value.
+    """
+    key, shape = "terrain.plugin", (len(y_m), len(x_m))
+    plugin = GuardedPlugin(key, loading.TERRAINS, name, ["heights"])
+    try:
+        height_m = plugin.numbers("heights", plugin.call("heights", x_m, y_m, seed), shape)
+        if np.abs(height_m).max() > _MOST_HEIGHT_M:
+            plugin.refuse("heights", f"a height of {np.abs(height_m).max():g} m", f"up to {_MOST_HEIGHT_M:g} m")
+        return height_m
+    except PluginFailed as error:
+        raise TwinError(key, str(error).removeprefix(f"{key} ")) from None

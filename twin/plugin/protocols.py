@@ -1,0 +1,112 @@
+"""Interfaces of plug-ins: arguments and results of a controller, an estimator and a terrain of another package."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from controllers.allocation import ThrustAllocation
+from controllers.segments import Reference
+from controllers.tracking import HullModel
+from twin.core.geometry import Array
+from twin.core.records import Estimate, Frame, SensorNoise, StereoRig
+
+
+class ControllerSetup(NamedTuple):
+    """Argument of the class of a controller: the vehicle with its published parameters.
+
+    The factors of the scenario on the drag and the added mass of the true vehicle are not applied.
+
+    Args:
+        rig: believed calibration; `rig.body_from_camera` is the pose of the left camera in the body.
+        period_s: time between commands, that of a frame [s].
+        hull: inertia, added mass and drag of the BlueROV2 Heavy.
+        allocation: its thrust allocation; `allocation.commands(wrench)[0]` are the thruster commands (8,) for a wrench
+            (6,) [moment, force] in the body [N m, N].
+        n_commands: 8 thruster commands; 3 for vehicle.dynamics = "kinematic".
+    """
+
+    rig: StereoRig
+    period_s: float
+    hull: HullModel
+    allocation: ThrustAllocation
+    n_commands: int
+
+
+class Controller(Protocol):
+    """Controller of the vehicle: key `control.plugin`, entry points `twin.controllers`.
+
+    The class is called once per survey with a `ControllerSetup`.
+    """
+
+    def command(self, estimate: Estimate, reference: Reference) -> Array:
+        """Returns the command until the next frame.
+
+        Args:
+            estimate: online estimate of the pose and the velocity of the left camera. If no motion was measured at this
+                frame, position and velocity are those of the reference.
+            reference: planned position, velocity, yaw and acceleration of the left camera in the world, for this frame.
+
+        Returns:
+            Thruster commands (8,), which the thrusters limit to [-1, 1]. For vehicle.dynamics = "kinematic" the
+            velocity (3,) in the world [m/s].
+        """
+        ...
+
+
+class EstimatorSetup(NamedTuple):
+    """Argument of the class of an estimator: calibration and start, no truth.
+
+    Args:
+        rig: believed calibration of the rectified images.
+        start: (4, 4) planned pose world_from_camera of the left camera at the first frame.
+        noise: believed noise of the navigation sensors.
+    """
+
+    rig: StereoRig
+    start: Array
+    noise: SensorNoise
+
+
+class Estimator(Protocol):
+    """Estimator of the trajectory: key `estimate.plugin`, entry points `twin.estimators`.
+
+    The class is called once per survey with an `EstimatorSetup`. Poses are rigid, world_from_camera (4, 4) of the left
+    camera. The twin builds the elevation map along the final trajectory from the stereo pairs of the keyframes.
+    """
+
+    def update(self, frame: Frame) -> Array | None:
+        """Returns the online pose (4, 4) at a frame; None if it could not be measured, and the vehicle slows down.
+
+        Args:
+            frame: time, left image, right image (None between keyframes), and readings of the navigation sensors.
+        """
+        ...
+
+    def covariance(self) -> Array | None:
+        """Returns the covariance (6, 6) of the last pose, or None if it is unknown.
+
+        Errors are motions [rotation, translation] (rad, m) in the axes of the camera. With None, sigma of the map
+        contains the noise of stereo only, and the consistency of the positions is not judged.
+        """
+        ...
+
+    def finish(self) -> Array | None:
+        """Returns the final poses (n, 4, 4) of all n frames; None if they are the online poses."""
+        ...
+
+
+class TerrainGenerator(Protocol):
+    """Generator of the heights of a sea floor: key `terrain.plugin`, entry points `twin.terrains`.
+
+    The class is called without arguments.
+    """
+
+    def heights(self, x_m: Array, y_m: Array, seed: int) -> Array:
+        """Returns the heights (rows, cols) of the floor above the reference plane z = 0 [m].
+
+        Args:
+            x_m: (cols,) x of the grid nodes, ascending [m].
+            y_m: (rows,) y of the grid nodes, ascending [m].
+            seed: seed of the scenario; the same seed must give the same floor.
+        """
+        ...

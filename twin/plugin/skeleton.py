@@ -1,0 +1,100 @@
+"""Skeleton of a package with a plug-in: pyproject, module and test, written by `twin new-plugin`."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from twin.errors import TwinError
+
+Kind = Literal["controller", "estimator", "terrain", "reader"]
+
+
+class _Flown(NamedTuple):
+    """Survey with which the test of a skeleton flies its plug-in.
+
+    Args:
+        section: section of the scenario with the key `plugin`.
+        fidelity: value of imaging.fidelity.
+        error_m: largest RMSE of the trajectory and of the cross-track error that the test accepts [m].
+    """
+
+    section: str
+    fidelity: str
+    error_m: float
+
+
+_FLOWN: dict[str, _Flown] = {
+    "controller": _Flown("control", "surrogate", 0.05),
+    "estimator": _Flown("estimate", "rendered", 0.15),
+    "terrain": _Flown("terrain", "surrogate", 0.05),
+}
+KINDS: tuple[Kind, ...] = ("controller", "estimator", "terrain", "reader")
+
+
+def plugin_kind(text: str) -> Kind:
+    """Returns the kind of plug-in that a text names; raises TwinError if it names none."""
+    for kind in KINDS:
+        if text == kind:
+            return kind
+    raise TwinError("new-plugin", f"{text!r} is no kind of plug-in", ", ".join(KINDS))
+
+
+def package_name(folder: Path) -> str:
+    """Returns the name of the package in a folder: that of the folder in lower case, with underscores.
+
+    Raises:
+        TwinError: the name is not valid for a Python package, or a package of this name can already be imported.
+    """
+    name = re.sub(r"[\s.-]+", "_", folder.absolute().name).lower()
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
+        allowed = "letters, digits and underscores, starting with a letter"
+        raise TwinError("new-plugin", f"{folder.absolute().name!r} gives no name of a Python package", allowed)
+    if importlib.util.find_spec(name) is not None:
+        raise TwinError("new-plugin", f"a package called {name} is already installed", "a folder of another name")
+    return name
+
+
+def write(kind: Kind, folder: Path) -> list[Path]:
+    """Writes a package with a working plug-in and its test into a folder, and returns its files.
+
+    Args:
+        kind: kind of plug-in.
+        folder: new or empty folder; its name becomes the name of the package and of the entry point.
+
+    Raises:
+        TwinError: the name of the folder is no name of a package.
+        OSError: a file cannot be written.
+    """
+    package = package_name(folder)
+    flown = _FLOWN.get(kind)
+    values = {
+        "NAME": package.replace("_", "-"),
+        "KIND": kind,
+        "PACKAGE": package,
+        "CLASS": kind.capitalize(),
+        "SECTION": flown.section if flown else "",
+        "FIDELITY": flown.fidelity if flown else "",
+        "ERROR_M": f"{flown.error_m:g}" if flown else "",
+        "USE": f"    twin run quickstart --set {flown.section}.plugin={package}"
+        if flown
+        else "    twin replay DATASET",
+    }
+    templates = {
+        "pyproject.toml": "pyproject.toml",
+        "README.md": "README.md",
+        f"{package}/__init__.py": f"{kind}.py",
+        f"tests/test_{package}.py": "test_survey.py" if flown else "test_reader.py",
+    }
+    written: list[Path] = []
+    for name, template in templates.items():
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        text = files("twin.plugin").joinpath(f"skeletons/{template}.txt").read_text(encoding="utf-8")
+        file.write_text(re.sub(r"@([A-Z_]+)@", lambda found: values[found[1]], text), encoding="utf-8")
+        written.append(file)
+    return written

@@ -1,0 +1,112 @@
+"""Estimator of another package in a survey (`estimate.plugin`): map and metrics follow from its poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import Estimate, Frame, SurveyResult, Trajectory
+from twin.core.timing import StageTimer
+from twin.estimate.pipeline import Navigator
+from twin.estimate.stereo_vision import StereoVision
+from twin.estimate.vision.keyframes import Keyframe
+from twin.plugin.guard import GuardedPlugin
+from twin.plugin.loading import ESTIMATORS
+from twin.plugin.protocols import EstimatorSetup
+from twin.world.mission import Mission
+
+METHODS = ("update", "covariance", "finish")
+_NO_POSE = "the plug-in measured no pose"
+
+
+class PluginNavigator(Navigator):
+    """Navigator whose poses come from a plug-in; stereo matching and the map are those of `Navigator`.
+
+    The F2F and the online trajectory are the online poses of the plug-in; the final trajectory is the result of its
+    method `finish`. There are no links and no alignments.
+
+    Args:
+        mission: the survey to fly; the plug-in gets its believed calibration, start and sensor noise.
+        name: value of `estimate.plugin`.
+        vision: images of the keyframes, for the map.
+        stopwatch: timer of the stages; the time of the plug-in is that of the stage "f2f".
+
+    Raises:
+        TwinError: the plug-in cannot be loaded.
+    """
+
+    def __init__(self, mission: Mission, name: str, vision: StereoVision, stopwatch: StageTimer):
+        noise, start = mission.scenario.believed_noise(), mission.start
+        settings = replace(mission.scenario.estimator_settings(), use_ga=False, use_f2m=False)
+        super().__init__(mission.rig, settings, start, noise, vision, stopwatch=stopwatch)
+        setup = EstimatorSetup(mission.rig, start.copy(), noise)
+        self._plugin = GuardedPlugin("estimate.plugin", ESTIMATORS, name, METHODS, setup)
+        self._images, self._pose, self._cov = vision, start.copy(), np.zeros((6, 6))
+        self._node_covs: list[Array] = []
+        self._finishes = True
+
+    def update(self, frame: Frame, track: int = 1) -> Estimate:
+        """Passes one frame to the plug-in and returns its online estimate.
+
+        Raises:
+            PluginFailed: the plug-in raised an exception or returned an unusable value.
+            OSError: images could not be written.
+        """
+        interval_s = self._interval_s(frame.time_s)
+        keyframe = self._stereo_keyframe(frame, track)  # before the plug-in, which could change the images
+        with self.stopwatch("f2f"):
+            found = self._plugin.call("update", frame)
+            cov = self._plugin.call("covariance")
+        last, status = self._pose, "ok" if found is not None else _NO_POSE
+        if found is not None:
+            self._pose = self._plugin.poses("update", found, (4, 4))
+        self._cov = np.zeros((6, 6)) if cov is None else self._plugin.covariance("covariance", cov)
+        self.log.n_lost += found is None
+        if keyframe is not None:
+            keyframe.world_from_camera = self._pose
+            self.network.add(keyframe)
+            self._node_covs.append(self._cov)
+        moved = geometry.inverse(last) @ self._pose if len(self.log) else np.eye(4)
+        self.log.append(frame.time_s, self._pose, self._pose)
+        velocity, sigma_m = geometry.log(moved) / interval_s, float(np.sqrt(np.trace(self._cov[3:, 3:])))
+        return Estimate(frame.time_s, self._pose.copy(), self._pose.copy(), velocity, sigma_m, status)
+
+    def align_track(self, track: int) -> None:
+        """Does nothing: the plug-in corrects its poses itself."""
+
+    def abandon_alignment(self) -> None:
+        """Disables the call of `finish` of the plug-in: the final trajectory is the online trajectory."""
+        super().abandon_alignment()
+        self._finishes = False
+
+    def finish(self) -> SurveyResult:
+        """Returns the trajectories of the plug-in and the keyframes.
+
+        Raises:
+            PluginFailed: `finish` of the plug-in failed.
+        """
+        result = super().finish()
+        n = len(result.online)
+        final = self._plugin.call("finish") if self._finishes and n else None
+        if final is not None:
+            final = self._plugin.poses("finish", final, (n, 4, 4))
+            result = replace(result, final=Trajectory(result.online.times_s, final))
+        covs = np.array(self._node_covs[: len(result.keyframe_rows)]).reshape(-1, 6, 6)
+        return replace(result, node_cov=covs)
+
+    def _stereo_keyframe(self, frame: Frame, track: int) -> Keyframe | None:
+        """Matches the stereo pair of a keyframe; None if the frame is not one, or has too few matched points."""
+        if not self._is_keyframe(frame, "ok"):
+            return None
+        self._images.track_frame(frame)
+        row, number = len(self.log), len(self.network.keyframes)
+        points = self._images.observe_stereo(frame, row)
+        if points is None:
+            return None
+        depth_m = float(np.median(points.xyz[:, 2]))
+        return Keyframe(
+            number, row, track, self._pose, points, frame.readings, depth_m=depth_m, exposure=frame.exposure
+        )

@@ -1,0 +1,188 @@
+"""Simulated world that a program advances frame by frame (`twin.World`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from controllers.segments import Reference
+from twin.core.geometry import Array
+from twin.core.records import Estimate, Frame, Image, StereoRig, Truth
+from twin.core.timing import Stopwatch
+from twin.estimate.pipeline import Navigator
+from twin.scenario.model import Scenario
+from twin.session.assembly import make_navigator, open_world
+from twin.session.mission_actions import MissionActions
+from twin.world.flight import Flight
+from twin.world.mission import Mission, prepare
+from twin.world.pace import FULL, Pace
+from twin.world.pilot import make_pilot, without_feedback
+from twin.world.world import World
+
+
+class StereoPair(NamedTuple):
+    """Left and right image (H, W, 3) uint8 RGB of one exposure."""
+
+    left: Image
+    right: Image
+
+
+class SteppedWorld:
+    """Simulated world of a scenario, advanced frame by frame. Use as a context manager, or call `close`.
+
+    `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
+    the next frame of the plan. A frame holds images and sensor readings, no truth. The same seed and the same commands
+    give the same frames, bit for bit. One object holds one OpenGL context; use it in one thread.
+
+    Args:
+        scenario: the survey, from `twin.load_scenario`.
+
+    Raises:
+        ScenarioError: the survey cannot be flown.
+    """
+
+    def __init__(self, scenario: Scenario):
+        self._mission = prepare(scenario)
+        self._open = ExitStack()
+        self._world: World | None = None
+        self._flight: Flight | None = None
+        self._stopwatch = Stopwatch()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the flight: closes its estimators and releases the OpenGL context; `reset` can start another flight."""
+        self._world = self._flight = None
+        self._open.close()
+
+    def reset(self, seed: int | None = None) -> Frame:
+        """Starts the survey anew and returns its first frame; the vehicle is at rest at the start of the plan.
+
+        Args:
+            seed: seed of all random numbers, as the key `seed` of a scenario; None: the seed of the last flight, or
+                that of the scenario before the first flight.
+
+        Raises:
+            ScenarioError: the survey cannot be flown with this seed, for example over the floor that it generates.
+        """
+        self.close()
+        scenario = self._mission.scenario
+        if seed is not None and seed != scenario.seed:
+            self._mission = prepare(scenario.model_copy(update={"seed": seed}))
+        self._stopwatch = Stopwatch()
+        self._world = self._open.enter_context(open_world(self._mission, self._stopwatch))
+        self._flight = Flight(self._mission, self._world)
+        return self._flight.start()
+
+    def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
+        """Moves the vehicle for one frame interval under a constant command and returns the next frame.
+
+        Args:
+            command: (8,) thruster commands in [-1, 1], in the order of the thrusters of the BlueROV2 Heavy; the
+                thrusters limit larger values. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
+            pace: pace along the planned path from this frame to the next, from `actions`.
+            keyframe: whether the next frame is a keyframe, which has both images; None: as planned.
+
+        Returns:
+            The next frame; None if the last frame of the plan has been flown.
+
+        Raises:
+            ValueError: the command has another shape.
+            RuntimeError: `reset` was not called, or not after an earlier call returned None.
+            SurveyAborted: the physics diverged, for example because a command is not finite.
+        """
+        values, n = np.array(command, dtype=np.float64), 8 if self.mission.scenario.vehicle.dynamics == "rigid" else 3
+        if values.shape != (n,):
+            raise ValueError(f"the command has the shape {values.shape} (expected: ({n},))")
+        return self.flight.step(values, pace, keyframe)
+
+    def capture(self) -> StereoPair:
+        """Returns a stereo pair at the current pose, in addition to the frames; later frames do not change.
+
+        Raises:
+            TwinError: the scenario has imaging.fidelity = "surrogate", which has no images.
+        """
+        return StereoPair(*self.world.extra_pair())
+
+    def truth(self) -> Truth:
+        """Returns the ground truth of the survey so far; it must not reach an estimator."""
+        return self.world.truth()
+
+    def estimator(self, folder: Path | None = None) -> Navigator:
+        """Returns the estimators of the scenario, which get the believed calibration and no truth; `close` ends them.
+
+        Args:
+            folder: folder for images of keyframes; None: a temporary folder that `close` removes.
+        """
+        if folder is None:
+            folder = Path(self._open.enter_context(TemporaryDirectory(prefix="twin-")))
+        return self._open.enter_context(make_navigator(self._mission, self.world, folder, self._stopwatch))
+
+    def pilot(self) -> Callable[[Estimate, Frame], Array]:
+        """Returns the controller of the scenario: a function from the estimate of a frame and this frame to a command.
+
+        The function steers to the planned reference of the current frame.
+        """
+        steer, flight = make_pilot(self._mission), self.flight
+
+        def command(estimate: Estimate, frame: Frame) -> Array:
+            return steer(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
+
+        return command
+
+    def actions(self) -> MissionActions:
+        """Returns the actions in poor visibility: a function from an estimate to the pace towards the next frame."""
+        return MissionActions(self._mission)
+
+    @property
+    def mission(self) -> Mission:
+        """The survey as planned, with its scenario, floor and map grid."""
+        return self._mission
+
+    @property
+    def rig(self) -> StereoRig:
+        """Believed calibration of the cameras."""
+        return self._mission.rig
+
+    @property
+    def world(self) -> World:
+        """The simulated world of the flight. Raises RuntimeError before `reset`."""
+        if self._world is None:
+            raise RuntimeError("call reset first")
+        return self._world
+
+    @property
+    def flight(self) -> Flight:
+        """The flight. Raises RuntimeError before `reset`."""
+        if self._flight is None:
+            raise RuntimeError("call reset first")
+        return self._flight
+
+    @property
+    def reference(self) -> Reference:
+        """Planned position, velocity, yaw and acceleration of the left camera at the current frame."""
+        return self.flight.reference
+
+    @property
+    def track(self) -> int:
+        """Number of the track of the current frame, from 1."""
+        return self.flight.track
+
+    @property
+    def aligns(self) -> bool:
+        """Whether the estimators align the network before they process the current frame (`Flight.aligns`)."""
+        return self.flight.aligns
+
+    @property
+    def true_pose(self) -> Array:
+        """True pose world_from_camera (4, 4) of the left camera at the current frame; not for estimators."""
+        return self.world.world_from_camera

@@ -1,0 +1,101 @@
+"""Flight of a mission frame by frame: sequence of the planned frames and times of the global alignments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from controllers.segments import Reference
+from twin.core.geometry import Array
+from twin.core.records import Frame
+from twin.world.mission import FrameSequence, Mission, Step
+from twin.world.pace import FULL, Pace
+from twin.world.world import FastForward, World
+
+
+class Flight:
+    """Flight of a mission through its world: all tracks, with station keeping after each of them.
+
+    `start` returns the first frame; `step` moves the vehicle and returns the next one, or None after the last frame.
+
+    Args:
+        mission: the survey to fly.
+        world: simulates the vehicle and returns the frames; nothing has been flown in it before.
+        fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
+
+    Attributes:
+        track: number of the track of the current frame, from 1.
+        aligns: whether the current frame is the first one of the second half of the station keeping after a track: the
+            network is aligned before this frame is estimated.
+        n_skipped: number of frames that `fast_forward` simulated in the last step.
+    """
+
+    def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
+        self.mission, self.world = mission, world
+        self._fast_forward = fast_forward
+        self._parts = self._planned_parts()
+        self.track, self.aligns, self.n_skipped = 1, False, 0
+
+    @property
+    def reference(self) -> Reference:
+        """Planned position, velocity, yaw and acceleration of the left camera at the current frame."""
+        return self._step.reference
+
+    @property
+    def holding(self) -> bool:
+        """Whether the vehicle keeps station at the current frame."""
+        return self._step.holding
+
+    def start(self) -> Frame:
+        """Returns the first frame."""
+        self._enter(*next(self._parts))
+        return self._observe()
+
+    def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
+        """Moves the vehicle for one frame interval and returns the next frame; None after the last frame of the plan.
+
+        Args:
+            command: (8,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
+            pace: pace along the planned path from this frame to the next.
+            keyframe: whether the next frame is a keyframe, with both images; None: as planned.
+
+        Raises:
+            RuntimeError: an earlier call returned None.
+            SurveyAborted: the physics diverged.
+        """
+        if self._k == len(self._sequence):
+            raise RuntimeError("all frames of the plan have been flown; reset starts another flight")
+        self.world.act(command)
+        self.n_skipped = 0
+        sequence, k = self._sequence, self._k + 1
+        if sequence.holding or (pace == FULL and sequence.rate == 1):
+            self._k = k if self._fast_forward is None else self._fast_forward(sequence, k)
+            self.n_skipped = self._k - k
+        else:
+            self.world.end_sequence(k)
+            self._enter(self.mission.next_frames(self.track, sequence.path_times_s[k - 1], pace), self.track)
+        self.aligns = False
+        while self._k == len(self._sequence):
+            part = next(self._parts, None)
+            if part is None:
+                return None
+            self._enter(*part)
+        return self._observe(keyframe)
+
+    def _planned_parts(self) -> Iterator[tuple[FrameSequence, int, bool]]:
+        """Yields the planned sequences of frames, each with its track and whether the network is aligned before it."""
+        for track in self.mission.tracks:
+            yield self.mission.planned_frames(track), track, False
+            yield self.mission.station_keeping_frames(track), track, False
+            yield self.mission.station_keeping_frames(track), track, True
+
+    def _enter(self, sequence: FrameSequence, track: int, aligns: bool = False) -> None:
+        """Starts a sequence of frames of a track."""
+        self._sequence, self._k = sequence, 0
+        self.track, self.aligns = track, aligns
+        self.world.start_sequence(sequence, track)
+
+    def _observe(self, keyframe: bool | None = None) -> Frame:
+        """Returns the frame at the current pose."""
+        planned = self._sequence[self._k]
+        self._step: Step = planned if keyframe is None else planned._replace(keyframe=keyframe)
+        return self.world.observe(self._step)
