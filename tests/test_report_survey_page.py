@@ -5,6 +5,7 @@ import json
 import re
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 from judge_synthetic import SCENARIO, write_folder
@@ -15,6 +16,7 @@ from twin.judge.budget import stage_times
 from twin.report import figures, wording
 from twin.report.run_folder import load_run
 from twin.report.stage_table import stage_rows
+from twin.report.style import FIGURE_STYLE
 from twin.report.survey_page import sample_images, write_report
 
 
@@ -207,3 +209,12 @@ def test_an_outlier_of_the_height_does_not_flatten_the_hill_shading():
     # not equal: the shading is scaled to the steepest slope, which is that of the outlier
     assert shaded[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
     assert np.abs(shaded[away] - expected[away]).max() < 0.2
+
+
+@pytest.mark.parametrize("figure", [figures.path_error_curves])
+def test_tick_labels_of_a_logarithmic_axis_are_plain_numbers(folder, figure):
+    with matplotlib.rc_context(FIGURE_STYLE):
+        drawn = figure(load_run(folder))
+        drawn.canvas.draw()
+        labels = [label.get_text() for axes in drawn.axes for label in axes.get_yticklabels(which="both")]
+    assert any(labels) and not any("$" in label for label in labels)

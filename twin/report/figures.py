@@ -14,6 +14,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from twin.judge.budget import stage_times
 from twin.judge.trajectory import path_errors
@@ -121,7 +122,16 @@ def log_scale(axes: Axes) -> None:
     sizes = np.concatenate([np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines])
     sizes = sizes[sizes > 0]
     if len(sizes):
-        axes.set(yscale="log", ylim=(0.7 * float(np.percentile(sizes, 1)), None))
+        log_axis(axes.yaxis, axes.set_yscale)
+        axes.set_ylim(0.7 * float(np.percentile(sizes, 1)), None)
+
+
+def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
+    """Makes an axis logarithmic, with labels at 1, 2 and 5."""
+    set_scale("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(lambda *_: "")
 
 
 def stage_bars(run: Run) -> Figure | None:

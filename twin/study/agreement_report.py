@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from twin.report.figures import to_data_uri
+from twin.report.figures import log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent, plain
 from twin.study import agreement, wording
 from twin.study.agreement import Agreement, MetricAgreement
 from twin.study.analysis import StudyAnalysis
-from twin.study.figures import log_axis, make_panels
+from twin.study.figures import make_panels
 from twin.study.statistics import Array
 
 HEADER = ("metric", "pairs", "rendered", "surrogate", "surrogate / rendered", "KS p", "verdict")

@@ -10,10 +10,10 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from twin.report.figures import WIDTH_IN, to_data_uri
+from twin.report.figures import WIDTH_IN, log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent
 from twin.study import statistics
@@ -182,14 +182,6 @@ def unit_axis(axis: Any, metric: str) -> None:
     """Formats the ticks of an axis in the unit of the metric."""
     axis.set_major_formatter(lambda value, _: metric_value(metric, value))
     axis.set_tick_params(labelsize=8)
-
-
-def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
-    """Makes an axis logarithmic, with labels at 1, 2 and 5."""
-    set_scale("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(lambda *_: "")
 
 
 def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:

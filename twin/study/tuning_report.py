@@ -13,14 +13,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from twin.report.figures import to_data_uri
+from twin.report.figures import log_axis, to_data_uri
 from twin.report.html import render_page
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
 from twin.study import wording
 from twin.study.candidates import Candidate, pareto_front, required_probability
-from twin.study.figures import axis_label, log_axis, make_panels, spans_decades, unit_axis
+from twin.study.figures import axis_label, make_panels, spans_decades, unit_axis
 from twin.study.study_file import Study, TuningConfig
 from twin.study.tuning import TuningResult
 from twin.study.verification import Verification
