@@ -22,7 +22,7 @@ class Forecast(NamedTuple):
 
     Args:
         n_frames_per_keyframe: N, frames from one keyframe to the next.
-        keyframes_per_swath: M, number of keyframes on a leg or loop.
+        keyframes_per_swath: M, number of keyframes on a leg of mean length or on a loop.
         n_tracks: L, number of planned tracks.
         n_keyframes, n_frames: totals of the survey, without station keeping.
         duration_s, path_m: totals of the survey, without station keeping.

@@ -73,13 +73,13 @@ class SurveyPlan:
     """Planned path and heading of the left camera. The vehicle keeps station after each track.
 
     Args:
-        paths: segments of each track, the first of which has the number 1; every segment starts and ends at rest.
+        paths: segments of each track; tracks are numbered from 1, and every segment starts and ends at rest.
         area: area to cover; the legs, and the bow on the first leg, point along its heading.
         altitude_m: height of the camera above the reference plane z = 0.
         speed_mps: cruise speed along the swaths.
         frame_rate_hz: frames per second.
         n_frames_per_keyframe: N, frames from one keyframe to the next.
-        swath_length_m: length of a swath (a leg or a loop).
+        swath_length_m: length of a swath: the mean over the legs, or that of a loop.
         swath_spacing_m: greatest distance between neighbouring swaths.
         n_tracks_to_fill: number of tracks that fill the area, of which the first `n_tracks` are planned.
         footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.

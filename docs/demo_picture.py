@@ -1,6 +1,7 @@
 """Picture of the demo for the README: `python docs/demo_picture.py RUN_FOLDER PICTURE.jpg`.
 
-It shows the estimated surface from the south, a left image, and the orthomosaic of a survey that `twin demo` has flown.
+The picture shows the estimated surface from the south, a left image, and the orthomosaic of a survey that `twin demo`
+has flown.
 """
 
 import sys
@@ -23,7 +24,12 @@ def orthomosaic(file: Path) -> np.ndarray:
 
 
 def main(folder: Path, picture: Path) -> None:
-    """Draws the three views of a run folder into one picture."""
+    """Writes a picture (PNG or JPEG) with three views of a run.
+
+    Args:
+        folder: the run folder.
+        picture: file to write.
+    """
     lefts = sorted((folder / "keyframes").glob("*_left.png"))
     views = {
         "Estimated surface": surface_picture(folder / "mesh.glb"),

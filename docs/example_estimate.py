@@ -19,7 +19,7 @@ floor = np.clip(128 + 25 * noise, 0, 255).astype(np.float32)
 
 
 def image(x_m: float) -> np.ndarray:
-    """Returns the RGB image (H, W, 3) of a camera at x, 0, looking at the floor along its optical axis."""
+    """Returns the RGB image (H, W, 3) of a camera at (x_m, 0, 0) that looks straight down on the floor."""
     centre = 500 + x_m / PIXEL_M, 768.0
     gray = cv2.getRectSubPix(floor, (RIG.width_px, RIG.height_px), centre)
     gray = gray + rng.normal(0, 2, gray.shape)

@@ -1,6 +1,6 @@
 """A reader of another layout for `twin replay`: the stereo pairs of Middlebury 2014 (im0.png, im1.png, calib.txt).
 
-Its package registers it:
+The package of the reader registers it:
 
     [project.entry-points."twin.readers"]
     middlebury = "my_package:MiddleburyReader"

@@ -15,7 +15,7 @@ from terrains.textures import TextureSource, generate_texture
 from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
-MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: greatest slope (rise over run) of a reef, see `_limit_slope`
+MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: limit of the slope (rise over run) of a reef, see `_limit_slope`
 
 
 def generate(
@@ -29,7 +29,7 @@ def generate(
 ) -> Terrain:
     """Generates a terrain centred at the origin, with heights from base_m to base_m + relief_m.
 
-    A terrain of kind "flat" has the height base_m everywhere.
+    A terrain of kind "flat", or without relief, has the height base_m everywhere.
 
     Args:
         kind: a key of KINDS.
@@ -40,7 +40,7 @@ def generate(
         texture: side of a texel and cover of the floor; its files are not used.
         seed: seed of the heights and the texture.
     Raises:
-        TwinError: the kind is unknown, or the terrain is too large for memory.
+        TwinError: the kind or the cover is unknown, or the terrain is too large for memory.
     """
     if kind not in KINDS:
         raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
@@ -68,10 +68,10 @@ def generate_from(
         size_m: extent along x and y; rounded up to whole cells.
         grid_m: distance between grid nodes.
         texture: side of a texel; its files are not used.
-        cover: cover of the floor.
+        cover: a key of `ground_cover.COVERS`.
         seed: seed of the heights and the texture.
     Raises:
-        TwinError: the terrain is too large for memory.
+        TwinError: the cover is unknown, or the terrain is too large for memory.
     """
     nx, ny = (max(1, int(np.ceil(extent / grid_m - 1e-6))) + 1 for extent in size_m)
     shape = texture_shape((ny, nx), grid_m, texture.texel_m(((nx - 1) * grid_m, (ny - 1) * grid_m)))
@@ -102,7 +102,7 @@ def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random
 
 
 def _ripples(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates asymmetric ripples with meandering crests, up to 0.1 wavelength high, on broad undulations."""
+    """Generates asymmetric ripples with meandering crests, about 0.1 wavelength high at most, on broad undulations."""
     length_m = max(0.35, 8 * grid_m)
     crest_m = min(0.1 * length_m, 0.6 * relief_m)
     row, col = np.indices(shape, dtype=np.float32)
@@ -148,7 +148,7 @@ def _staircase(level: Heights) -> Heights:
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
     """Generates domes with steep, lobed flanks.
 
-    There is one dome per 3 square metres (at least three), with a radius of 0.25 to 0.9 m. The height between the
+    There is one dome per 3 square metres (at least three), with a radius of 0.25 to 0.9 m. The height far from all
     domes is -relief_m.
     """
     result = np.full(shape, -relief_m, np.float32)

@@ -84,7 +84,7 @@ def crs_parts(crs: CRS | None) -> tuple[dict[str, Any] | None, dict[str, Any] | 
 
 
 def _axis_unit_m(crs: dict[str, Any] | None) -> float:
-    """Returns the length of the unit of the first axis of a CRS [m]; 1 without a CRS."""
+    """Returns the length of the unit of the first axis of a CRS [m]; 1 for metres and without a CRS."""
     unit = crs["coordinate_system"]["axis"][0].get("unit", "metre") if crs is not None else "metre"
     return float(unit["conversion_factor"]) if isinstance(unit, dict) else 1.0
 

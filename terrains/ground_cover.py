@@ -27,7 +27,7 @@ class Cover:
         structure: one of GRAINS to SHELLS.
         size_m: distance between the elements of the structure.
         strength: change along the ramp due to the structure, as a fraction of the ramp.
-        noise: change along the ramp due to noise of all scales, as a fraction of the full range of the noise.
+        noise: change along the ramp over the full range of the noise of all scales, as a fraction of the ramp.
     """
 
     dark: Colour
@@ -69,7 +69,7 @@ DEFAULT_COVERS = {
     "file": "reef",
 }
 _TONES = 256
-EDGE_M = 0.12  #: size of the largest lobes of the border between two materials
+EDGE_M = 0.12  #: size of the largest lobes of the border between two materials [m]
 
 
 def paint(

@@ -39,7 +39,7 @@ def value_noise(x: float, y: float, table: Table, layer: int) -> float:  # pragm
     return (1.0 - v) * (a + u * (b - a)) + v * (c + u * (d - c))
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
     """Returns a sum of octaves of value noise with halved amplitudes, about -1 to 1 with mean 0.
 
@@ -49,6 +49,13 @@ def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) ->
         table: numbers of the lattice.
         layer: layer of the first octave, see `value_noise`.
     """
+    # numba compiles a function once for each value of an `int` constant in a call, but not of an `np.int64`
+    return _octaves(x, y, np.int64(octaves), table, np.int64(layer))  # pyright: ignore[reportArgumentType]
+
+
+@njit(cache=True)
+def _octaves(x: float, y: float, octaves: int, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
+    """Compiled loop of `fractal_noise`."""
     total, amplitude = 0.0, 1.0
     for octave in range(octaves):
         total += amplitude * (2.0 * value_noise(x, y, table, layer + 7 * octave) - 1.0)

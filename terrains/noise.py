@@ -41,21 +41,22 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Generates 8-bit pink noise.
 
-    Every octave has the same contrast, so an image of a floor with this texture shows detail at any distance. Starting
+    The random values of every octave have the same standard deviation, so an image of a floor with this texture shows
+    detail at any distance. Starting
     with the coarsest octave, the field is repeatedly doubled in size and the next octave is added. The total
     computing time is 4/3 of that of the finest octave.
 
     Args:
         shape: (rows, cols) of the result.
         octaves: number of octaves; the finest one has one random value per cell of the result.
-        contrast: standard deviation of one octave [grey levels].
+        contrast: standard deviation of the random values of an octave, before interpolation [grey levels].
         rng: random generator.
     Returns:
         (rows, cols) uint8 with mean 128.
     """
     sizes = [tuple(-(-n // 2**k) for n in shape) for k in range(octaves)][::-1]
     value = np.full(sizes[0], 128, np.uint8)
-    weight = contrast * np.sqrt(12) / 255  # uniform noise of 256 levels has standard deviation 256 / sqrt(12)
+    weight = contrast * np.sqrt(12) / 255  # uniform noise from 0 to 255 has the standard deviation 255 / sqrt(12)
     for rows, cols in sizes:
         value = cv2.resize(value, (cols, rows), interpolation=cv2.INTER_LINEAR)
         noise = np.frombuffer(rng.bytes(rows * cols), np.uint8).reshape(rows, cols)

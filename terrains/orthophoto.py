@@ -22,7 +22,7 @@ from twin.errors import TwinError
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
 _NO_PALETTE = "a GeoTIFF with bands of colour: gdal_translate -expand rgb writes one"
 _COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
-_MAX_SHARP = 16  #: an orthophoto may be this many times finer than the texels along each axis
+_MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than the texels along each axis, no more
 
 
 def lay_orthophoto(

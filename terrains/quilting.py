@@ -11,10 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-BLOCK_FRACTION = 5  #: side of a block: this part of the shorter side of the photo
-OVERLAP_FRACTION = 4  #: overlap of neighbouring blocks: this part of the side of a block
+BLOCK_FRACTION = 5  #: shorter side of the photo divided by the side of a block
+OVERLAP_FRACTION = 4  #: side of a block divided by the overlap of neighbouring blocks
 CANDIDATES = 60  #: random places of the photo that are compared for each block
-TOLERANCE = 1.2  #: places whose difference is at most this factor above the least one are equally likely
+TOLERANCE = 1.2  #: places whose difference is at most this many times the least one are equally likely
 LIGHTING_SAMPLES = 250_000  #: pixels of a photo to which its slow variation of brightness is fitted
 LIGHTING_ROWS = 128  #: rows of a photo that are divided by this variation at a time
 MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
@@ -25,7 +25,7 @@ def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
     The photo is divided by a polynomial of degree 2 in row and column, fitted by least squares to its brightness. Of a
     large photo, about LIGHTING_SAMPLES pixels on a regular grid are fitted. The memory beyond photo and result is that
-    of a few blocks of LIGHTING_ROWS rows.
+    of the fitted pixels and of a few blocks of LIGHTING_ROWS rows.
 
     Args:
         photo: (h, w, 3) uint8 RGB.
@@ -154,7 +154,7 @@ def _join(
 ) -> None:  # pragma: no cover (compiled)
     """Copies the part of a block (side, side, 3) beyond the cuts through its overlaps onto the target.
 
-    Block and target are blended over 3 px along the cuts.
+    Block and target are blended over a width of 3 px across the cuts.
     """
     side = target.shape[0]
     upper, west = np.full(side, -2.0), np.full(side, -2.0)

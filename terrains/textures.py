@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrains.file_header import TEXTURE_FIELD, check_texel_count, image_size
-from terrains.ground_cover import paint
+from terrains.ground_cover import COVERS, paint
 from terrains.noise import fractal_field, pink_noise
 from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.errors import TwinError
 
-COARSEN_TEXELS = 40_000_000
+COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`
 _QUILT_SEED = 1  #: a floor from files is the same for every seed of a survey
 
 
@@ -66,7 +66,11 @@ def generate_texture(
         rng: random generator.
     Returns:
         (rows, cols, 3) uint8 RGB, row 0 = north.
+    Raises:
+        TwinError: the cover is unknown.
     """
+    if cover not in COVERS:
+        raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
     octaves = int(np.clip(np.log2(max(shape)), 3, 11))
     tone = pink_noise(shape, octaves, 20.0, rng)
     material = _material_level(height_m, shape, texel_m, rng)
@@ -76,7 +80,7 @@ def generate_texture(
 def _material_level(
     height_m: NDArray[np.float32], shape: tuple[int, int], texel_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the level (rows, cols), 0 to 255, that selects the material of each texel before the tone is added.
+    """Returns the level (rows, cols), 0 to 255, that selects the material of each texel; see `ground_cover.paint`.
 
     It increases with height and slope, and varies at random in patches of up to 1 m.
     """
@@ -116,8 +120,10 @@ def texture_from_photo(
 ) -> NDArray[np.uint8]:
     """Returns the texture (rows, cols, 3) uint8 RGB of a floor, made from a photo of a part of it.
 
-    Features keep the size that they have on the floor: the photo is resampled if its pixels and the texels differ in
-    size. A photo that is then smaller than BLOCK_FRACTION * MIN_BLOCK_PX is repeated as tiles.
+    With the tiling "stochastic", slow variations of the brightness are removed, the photo is resampled to the size of
+    the texels, and the texture is quilted from pieces of it. With "repeat", or if the shorter side of the photo is
+    less than BLOCK_FRACTION * MIN_BLOCK_PX before or after the resampling, the photo is repeated as tiles. Features
+    keep the size that they have on the floor.
 
     Args:
         source: source of the texture, with a photo.

@@ -26,7 +26,7 @@ UNITS_M = {
 _DEPTH_WORD = re.compile(r"depth|sounding", re.IGNORECASE)
 #: Band names that state depths. If the band has no negative value, its values increase downwards.
 _DEPTH_BAND = re.compile(r"^\s*(water |sea ?floor |bottom )?depths?\b", re.IGNORECASE)
-#: Standard names that the CF conventions define as positive downwards.
+#: Beginnings of standard names that the CF conventions define as positive downwards.
 _CF_DEPTHS = ("depth", "sea_floor_depth")
 
 

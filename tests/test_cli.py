@@ -113,6 +113,7 @@ def test_options_reach_the_survey(twin_command):
         (["plan", "reef", "--set", "plan.area_m=[90.0,2.0]"], "--set: plan.area_m: 90 x 2 m is larger"),
         (["report", "nowhere"], "nowhere: is not a run folder"),
         (["run", "quickstart", "--out", str(ROOT)], f"--out: {ROOT} is not empty"),
+        (["run", "quickstart", "--out", str(ROOT / "README.md")], "README.md is not a folder"),
         (["run", "quickstart", "--seed", "-1"], "Invalid value for '--seed'"),
         (["run"], "Missing argument 'SCENE'"),
         (["fly"], "No such command 'fly'"),

@@ -73,7 +73,7 @@ def test_the_survey_starts_in_the_south_west_and_its_tracks_are_connected():
 
 def test_the_reference_is_the_integral_of_its_own_velocity_and_acceleration():
     p = plan(**SMALL)
-    t = np.linspace(0, p.track_duration_s(1), 40001)
+    t = np.linspace(0, p.track_duration_s(1), 8001)
     references = [p.reference(1, s) for s in t]
     position, velocity, acceleration = (
         np.array([getattr(r, k) for r in references]) for k in ("position", "velocity", "acceleration")

@@ -11,6 +11,7 @@ from recorded_datasets import RIG
 
 from twin.core import geometry
 from twin.core.records import Frame
+from twin.datasets import image_files
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
@@ -114,6 +115,16 @@ def test_a_colmap_camera_without_a_rig_has_no_baseline(tmp_path):
         read_calibration(file)
 
 
+def test_an_empty_rig_and_an_endless_column_are_one_line(tmp_path):
+    file = recorded.write_colmap(tmp_path / "cameras.txt")
+    file.with_name("rigs.txt").write_text("# no rig\n")
+    with pytest.raises(TwinError, match=r"rigs.txt:1: is not the rig of two cameras"):
+        read_calibration(file)
+    file.write_text("1," + "9" * 200_000)
+    with pytest.raises(TwinError, match=r"cameras.txt: cannot be read: field larger"):
+        read_calibration(file)
+
+
 def raw_calibration(kind):
     """A stereo rig with distortion, convergence and different focal lengths."""
     size, pose = (320, 240), geometry.exp(np.array([0.01, 0.03, -0.02, -0.15, 0.004, 0.002]))
@@ -209,6 +220,23 @@ def test_a_frame_that_cannot_be_used_is_skipped_and_counted(euroc):
         "time not after that of the frame before": 1,
         "left image: another size": 1,
     }
+
+
+def test_an_image_of_too_many_pixels_is_not_called_one_of_another_size(monkeypatch):
+    data = cv2.imencode(".png", GRAY)[1].tobytes()
+    monkeypatch.setattr(image_files, "_MOST_PIXELS", GRAY.size - 1)
+    with pytest.raises(image_files.UnreadableImage, match=f"more than {GRAY.size - 1} pixels"):
+        image_files.decoded(data, (GRAY.shape[1], GRAY.shape[0]))
+
+
+def test_true_positions_without_attitude_are_not_used_and_a_note_says_so(euroc):
+    """leica0 of EuRoC has three columns after the time: the position of a prism."""
+    (euroc / "mav0" / "state_groundtruth_estimate0").rename(euroc / "other")
+    (euroc / "mav0" / "leica0").mkdir()
+    (euroc / "mav0" / "leica0" / "data.csv").write_text("#timestamp [ns],x [m],y [m],z [m]\n0,1.0,2.0,3.0\n")
+    dataset, _ = read_dataset(euroc)
+    assert dataset.truth is None
+    assert dataset.notes == ("The true positions (leica0) are not used: they have no attitude.",)
 
 
 def test_an_euroc_folder_is_read_as_it_was_written(euroc):

@@ -56,6 +56,8 @@ def bag(frames, tmp_path_factory):
 def read(path, topics=None):
     """Returns the data set in a bag and its frames."""
     dataset = BagReader(topics).read(path)
+    if isinstance(dataset.calibration, TwinError):
+        raise dataset.calibration
     found = RecordedFrames(dataset, dataset.calibration)
     return dataset, found, list(found)
 
@@ -236,6 +238,16 @@ def test_swapped_projections_and_parts_of_images_are_named(frames, tmp_path):
         stereo_calibration(left, right, False, None, FILE)
 
 
+def test_another_calibration_replaces_one_in_the_bag_that_cannot_be_used(frames, tmp_path):
+    messages = bags.stereo(frames[:1], p=np.column_stack([RIG.matrix, np.zeros(3)]).ravel())
+    path = bags.write(tmp_path / "bag", messages)
+    with pytest.raises(TwinError, match="has no baseline"):
+        open_dataset(path, ReplayOptions())
+    file = recorded.write_colmap(tmp_path / "cameras.txt")
+    opened = open_dataset(path, ReplayOptions(calibration=file))
+    assert opened.frames.rectification.rig.baseline_m == pytest.approx(RIG.baseline_m)
+
+
 def names(*topics):
     """Returns image topics with their calibrations; a topic that ends with ! has none."""
     kinds = {}
@@ -295,6 +307,15 @@ def test_a_truth_of_a_body_that_is_not_joined_to_the_camera_is_one_line(frames, 
     messages = [*bags.stereo(frames[:1]), ("/truth", START_NS, bags.ROS.odometry(START_NS, np.eye(4), np.zeros(6)))]
     with pytest.raises(TwinError, match=r"tf_static does not join the frame 'base_link' .* 'left_camera_optical"):
         read(bags.write(tmp_path / "bag", messages), BagTopics(truth="/truth"))
+
+
+def test_a_truth_of_a_body_is_noted_if_the_images_name_no_frame(frames, tmp_path):
+    messages = [*bags.stereo(frames[:1]), ("/truth", START_NS, bags.ROS.odometry(START_NS, np.eye(4), np.zeros(6)))]
+    for topic, _, message in messages:
+        if topic == "/left/image_rect":
+            message.header.frame_id = ""
+    dataset = BagReader(BagTopics(truth="/truth")).read(bags.write(tmp_path / "bag", messages))
+    assert dataset.notes == ("The left images name no frame; the poses were taken as those of the left camera.",)
 
 
 def damage(path, at, data=b""):

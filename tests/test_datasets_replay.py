@@ -70,6 +70,7 @@ def test_the_run_folder_is_that_of_a_survey(replayed):
     assert {"dem", "dem_sigma", "mosaic"} <= run.rasters.keys() and "dem_truth" not in run.rasters
     aligned = run.trajectories["truth"].positions - run.trajectories["final"].positions
     assert np.abs(aligned).max() < 0.003
+    np.testing.assert_array_equal(run.keyframes.map_from_world, replayed.elevation.map_from_world)
     page = survey_page.write_report(replayed.folder).read_text()
     assert "frames of recorded stereo data" in page and "reference plane" not in page
     assert recording.write_recording(replayed.folder).is_file()

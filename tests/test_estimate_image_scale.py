@@ -56,6 +56,14 @@ def test_a_binned_rig_projects_a_point_to_its_pixel_in_the_binned_image(by):
     assert np.average(rows, weights=small) == pytest.approx(binned_v, abs=1e-3)
 
 
+@pytest.mark.parametrize("by", [2, 3])
+def test_the_default_principal_point_of_a_size_that_is_no_multiple_keeps_its_place_in_the_image(by):
+    """Binning cuts off the last column and row: the centre of the binned image is not that of the full image."""
+    rig, point = StereoRig(319, 241, 343.0, 0.3), np.array([[0.31, -0.2, 2.0]])
+    expected = (rig.project(point)[0] + 0.5) / by - 0.5
+    np.testing.assert_allclose(rig.binned(by).project(point)[0], expected, atol=1e-12)
+
+
 def test_binning_by_four_reduces_the_noise_to_a_quarter():
     noise = np.random.default_rng(1).standard_normal((240, 320)).astype(np.float32)
     assert matching.binned(noise, 4).std() == pytest.approx(0.25, rel=0.02)

@@ -161,7 +161,8 @@ def test_calibration_files_are_read_back(contents, name, tmp_path):
 
 
 def test_nerfstudio_poses_project_points_into_the_image_that_sees_them(contents, tmp_path):
-    (file,) = nerfstudio.export(replace(contents, true=None), tmp_path)
+    file, images = nerfstudio.export(replace(contents, true=None), tmp_path)
+    assert images == tmp_path / "images" and images.is_dir()
     frame = next(f for f in json.loads(file.read_text())["frames"] if f["file_path"] == "images/right_000003.png")
     point = np.array([0.3, 0.4, 0.1])
     x, y, z = np.linalg.solve(np.array(frame["transform_matrix"]), np.append(point, 1.0))[:3]

@@ -115,7 +115,7 @@ def test_a_malformed_line_is_reported_with_its_number(tmp_path, line, problem):
     [
         (b"", ": has no vertex and no edge"),
         (b"\n# only a comment\n", ": has no vertex and no edge"),
-        (b"\nVERTEX_SE2 0 0 0 0\n", ":2: 1 lines with the unknown tag 'VERTEX_SE2'"),
+        (b"\nVERTEX_SE2 0 0 0 0\n", ":2: 1 line with the unknown tag 'VERTEX_SE2' is ignored"),
         (b"\n\xff\xff\n", ":2: is not UTF-8"),
         ("VERTEX3 0 0 0 0 0 0 0\n".encode("utf-16"), ":1: is UTF-16"),
     ],

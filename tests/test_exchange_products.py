@@ -11,7 +11,9 @@ import trimesh
 from exported_run import GRID
 
 from twin.core.georeference import Georeference
-from twin.exchange import geotiff
+from twin.core.orthomosaic import OrthoTile
+from twin.core.records import MapGrid
+from twin.exchange import geotiff, textured_mesh
 from twin.exchange.formats import FORMATS
 from twin.report.run_folder import read_raster
 
@@ -143,6 +145,17 @@ def test_trimesh_reads_the_mesh_with_its_texture(run, name, texture, tmp_path):
     image = material.baseColorTexture if name == "glb" else material.image
     difference = sampled(image, np.asarray(read.visual.uv)) - made.colours(x, y)
     assert np.abs(difference).max() <= 4  # a vertex at a corner of four pixels: half a pixel is 1.25 and 1.9 levels
+
+
+@pytest.mark.parametrize(("rows", "cols", "shape"), [(3, 100, (1, 20, 3)), (100, 3, (20, 1, 3))])
+def test_the_texture_of_a_very_long_orthomosaic_has_one_pixel_across(rows, cols, shape, tmp_path, monkeypatch):
+    grid = MapGrid(0.0, 0.0, 0.1, rows, cols)
+    with geotiff.OrthomosaicFile(tmp_path / "mosaic.tif", grid) as file:
+        file.write(OrthoTile(grid, 0, 0, np.full((rows, cols, 4), [90, 60, 30, 255], np.uint8)))
+    monkeypatch.setattr(textured_mesh, "_MOST_TEXTURE_PX", 20)
+    texture, reduced = textured_mesh._texture(tmp_path / "mosaic.tif")
+    assert texture.shape == shape and (texture == [90, 60, 30]).all()
+    assert (reduced.rows, reduced.cols, reduced.cell_m) == (*shape[:2], pytest.approx(0.5))
 
 
 def test_the_mesh_states_where_its_origin_lies(run, tmp_path):

@@ -1,10 +1,13 @@
 """Recorded frames are kept without loss, read back from the run folder, and their truth is that of the images."""
 
 import json
+from dataclasses import replace
 
 import cv2
+import exported_run as made
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from terrains.terrain import Terrain
@@ -14,6 +17,7 @@ from twin.core import geometry
 from twin.core.records import Frame, Readings, StereoRig, Trajectory
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
+from twin.exchange import geotiff
 from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
@@ -65,11 +69,34 @@ def test_recorded_frames_are_read_back_without_loss(tmp_path):
     assert poses.shape == (4, 4, 4) and poses[1, 2, 3] == 1 / 3
 
 
+@pytest.mark.parametrize("tilt_deg", [None, 60.0])
+def test_exported_points_are_in_world_axes_for_a_map_in_the_plane_of_a_tilted_rig(tilt_deg, tmp_path):
+    """None: a run folder without the pose of its map, whose frame is then the world."""
+    pose = geometry.pose(geometry.so3_exp(np.array([np.deg2rad(tilt_deg or 0), 0, 0])), np.array([0.3, -0.2, 1.0]))
+    folder = run_folder(tmp_path / "run", Scenario())
+    geotiff.write_map(folder, replace(made.elevation(), map_from_world=pose))
+    index = {"frames": [0, 2], "tracks": [1, 1]} | ({} if tilt_deg is None else {"map_from_world": pose.tolist()})
+    (folder / "keyframes" / "index.json").write_text(json.dumps(index))
+    written = export(folder, ["ply", "obj"], tmp_path / "out")
+    map_from_world = np.eye(4) if tilt_deg is None else pose
+    for name, path in (("ply", written["ply"][0]), ("obj", tmp_path / "out" / "obj" / "map.obj")):
+        vertices = trimesh.load(path, process=False).vertices
+        x, y, z = geometry.transform(map_from_world, np.asarray(vertices)).T
+        np.testing.assert_allclose(z, made.height_at(x, y), atol=1e-5, err_msg=name)
+
+
 def test_an_image_that_cannot_be_written_is_an_error_at_a_later_frame(tmp_path):
-    with FrameRecorder(tmp_path, "all") as recorder, pytest.raises(OSError, match="left"):
+    with pytest.raises(OSError, match="left"), FrameRecorder(tmp_path, "all") as recorder:
         (tmp_path / "frames" / "left").rename(tmp_path / "frames" / "moved")
         for k in range(20):
             recorder.add(frame(k, False), np.eye(4), np.zeros(6))
+
+
+def test_a_last_image_that_cannot_be_written_is_an_error_at_the_end(tmp_path):
+    with pytest.raises(OSError, match="left"), FrameRecorder(tmp_path, "all") as recorder:
+        (tmp_path / "frames" / "left").rename(tmp_path / "frames" / "moved")
+        recorder.add(frame(0, False), np.eye(4), np.zeros(6))
+    assert (tmp_path / "frames" / "truth.npz").is_file()
 
 
 def test_nothing_is_recorded_on_request(tmp_path):

@@ -3,6 +3,7 @@
 import importlib
 import sys
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import twin.gym
+from twin.core import geometry
+from twin.core.records import Readings
 from twin.errors import TwinError
 from twin.simulate.autopilot import nominal_controller
 
@@ -78,6 +81,21 @@ def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
         assert reward == pytest.approx(-info["truth"]["cross_track_m"])
     assert terminated and info["ended"] == "the camera touched the floor"
     assert info["truth"]["world_from_camera"][2, 3] < 0.1 < info["truth"]["cross_track_m"]
+    env.close()
+
+
+@pytest.mark.parametrize(("status", "corrected_m"), [("ok", 0.5), ("too few matches", 0.0)])
+def test_a_position_that_was_predicted_without_vision_is_not_corrected(status, corrected_m):
+    """As in a survey: the deviation of a predicted position from the reference is unknown."""
+    env = make()
+    env.reset(seed=3)
+    inner, seen = env.unwrapped, []
+    pose = inner._estimate.world_from_camera + geometry.pose(np.eye(3), np.array([0.5, 0, 0])) - np.eye(4)
+    inner._estimate = inner._estimate._replace(world_from_camera=pose, status=status)
+    inner._frame = replace(inner._frame, readings=Readings())
+    inner._steer = lambda estimate, target: seen.append(estimate.world_from_camera[:3, 3] - target.position)
+    inner._command(np.zeros(4))
+    np.testing.assert_allclose(seen[0], [corrected_m, 0, 0], atol=1e-5)  # noise of the first estimate
     env.close()
 
 

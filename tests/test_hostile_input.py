@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hostile_scenarios import BASE, LOOSE, ODD, attempt, draw, mutations, write_case, write_inline
 from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from judge_synthetic import write_folder
 
 from twin import cli
@@ -29,13 +30,11 @@ LIMIT_S = 15.0
 
 
 @settings(max_examples=25, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
-@given(mutations())
-def test_a_mutated_scenario_is_accepted_or_refused(tmp_path_factory, changes):
-    folder = tmp_path_factory.mktemp("case")
-    for write in (write_case, write_inline):
-        start = time.process_time()
-        attempt(*write(folder, changes))
-        assert time.process_time() - start < LIMIT_S
+@given(mutations(), st.sampled_from((write_case, write_inline)))
+def test_a_mutated_scenario_is_accepted_or_refused(tmp_path_factory, changes, write):
+    start = time.process_time()
+    attempt(*write(tmp_path_factory.mktemp("case"), changes))
+    assert time.process_time() - start < LIMIT_S
 
 
 @pytest.mark.parametrize("line", LOOSE, ids=[line[:20] + f"_{len(line)}" for line in LOOSE])

@@ -9,14 +9,14 @@ import pytest
 from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging import caustics as caustics_module
-from twin.imaging.caustics import CELLS, TILE_DEPTHS, WATER_INDEX, Caustics, scattering_blur
+from twin.imaging.caustics import CELLS, TILE_DEPTHS, Caustics, scattering_blur
 from twin.imaging.illumination import Daylight, Illumination, daylight_at, illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.phase_function import petzold, tabulate
 from twin.imaging.sun_sky import SunSky
 from twin.imaging.water import Medium, medium
 from twin.imaging.waves import GRAVITY_MPS2, slope_variance
-from twin.scenario.model import Scenario, SunConfig, WaterConfig
+from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
 
 CLEAR = medium(WaterConfig(jerlov="clear"))
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)
@@ -127,7 +127,7 @@ def test_in_shallow_water_caustics_follow_the_curvature_of_the_surface():
         along = k[None] if axis == 1 else k[:, None]
         return np.fft.ifft2(1j * along * np.fft.fft2(values)).real
 
-    per_slope_m = (1 - 1 / WATER_INDEX) * depth_m
+    per_slope_m = (1 - 1 / SEA_WATER_INDEX) * depth_m
     det = (1 - per_slope_m * gradient(east, 1)) * (1 - per_slope_m * gradient(north, 0))
     det -= per_slope_m**2 * gradient(east, 0) * gradient(north, 1)
     assert det.min() > 0.5

@@ -24,12 +24,12 @@ from twin.imaging.reference.pixel_light import (
     plane_light,
 )
 from twin.imaging.shadows import Shadows
-from twin.imaging.sun_sky import CRITICAL_COSINE, WATER_INDEX, SunSky, direction_to_sun, sky_radiance
+from twin.imaging.sun_sky import CRITICAL_COSINE, SunSky, direction_to_sun, sky_radiance
 from twin.imaging.water import downwelling_per_m, medium
 from twin.imaging.water_tables import water_spectrum
 from twin.reproduce.light_cell import green_of, looking_down
 from twin.scenario.file import load_scenario
-from twin.scenario.model import Scenario, SunConfig, WaterConfig
+from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
 
 RIG = StereoRig(96, 64, 80.0, 0.1)
 CENTRE = (RIG.height_px // 2, RIG.width_px // 2)
@@ -66,7 +66,7 @@ def plane(slope_x, slope_y):
 def test_the_sun_is_refracted_by_snells_law_and_keeps_its_azimuth(elevation_deg, azimuth_deg):
     east, north, up = direction_to_sun(elevation_deg, azimuth_deg)
     sine = np.hypot(east, north)
-    assert WATER_INDEX * sine == pytest.approx(np.sin(np.deg2rad(90 - elevation_deg)), abs=1e-12)
+    assert SEA_WATER_INDEX * sine == pytest.approx(np.sin(np.deg2rad(90 - elevation_deg)), abs=1e-12)
     assert sine**2 + up**2 == pytest.approx(1.0)
     if sine > 1e-9:
         assert np.rad2deg(np.arctan2(north, east)) == pytest.approx(azimuth_deg)
@@ -80,8 +80,8 @@ def test_the_sky_appears_in_a_cone_and_gives_one_lux():
     assert SunSky(sky_share=1.0).mean_cosine == pytest.approx((light * mu).sum() / light.sum(), rel=1e-4)
     assert np.rad2deg(np.arccos(CRITICAL_COSINE)) == pytest.approx(48.3, abs=0.1)
     assert not sky_radiance(np.array([CRITICAL_COSINE - 1e-6, 0.1, -0.5])).any()
-    # Fresnel at normal incidence: 1 - ((n - 1) / (n + 1))^2; at 60 deg in air 0.941 (n = 1.34)
-    overhead, slanted = sky_radiance(np.array([1.0, np.sqrt(1 - (np.sin(np.pi / 3) / WATER_INDEX) ** 2)]))
+    # Fresnel at normal incidence: 1 - ((n - 1) / (n + 1))^2; at 60 deg in air 0.941
+    overhead, slanted = sky_radiance(np.array([1.0, np.sqrt(1 - (np.sin(np.pi / 3) / SEA_WATER_INDEX) ** 2)]))
     assert slanted / overhead == pytest.approx(0.9407 / 0.97889, rel=2e-3)
 
 
@@ -124,7 +124,7 @@ def test_the_shadow_of_a_wall_is_its_height_over_the_tangent_of_the_refracted_el
     to_sun = np.array(direction_to_sun(30.0, 180.0))  # in the west
     lit = Shadows(wall(0.5), RIG, [np.zeros((0, 3))] * 2, to_sun).lit(depth, pose, 0)[0]
     x = rays()[..., 0] * 2.0
-    end_m, pixel_m = 0.5 * np.tan(np.arcsin(np.cos(np.deg2rad(30.0)) / WATER_INDEX)), 2.0 / RIG.focal_px
+    end_m, pixel_m = 0.5 * np.tan(np.arcsin(np.cos(np.deg2rad(30.0)) / SEA_WATER_INDEX)), 2.0 / RIG.focal_px
     dark = (x > 0.06) & (x < end_m - pixel_m)
     assert dark.sum() > 500 and not lit[dark].any() and lit[(x > end_m + pixel_m) | (x < -0.06)].all()
 

@@ -202,6 +202,16 @@ def test_a_beam_table_shapes_the_light_and_is_dark_beyond_its_last_angle():
     assert not optics_with(WaterConfig(jerlov="II"), (sideways,), DARK).radiance(*floor(2.0), 0)[40:].any()
 
 
+@pytest.mark.parametrize("scattering", ["none", "single", "full"])
+def test_a_lamp_gives_no_light_to_points_behind_it_even_if_its_beam_reaches_90_deg(scattering):
+    even = AT_CAMERA.model_copy(update={"beam": ((0.0, 1.0), (90.0, 1.0))})
+    water = medium(WaterConfig(jerlov="II"), scattering)
+    light = LampLight(light_sources_in_camera(RIG, (even,), NO_DAYLIGHT, 0), water)
+    lux, _ = light.lux(0, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1e-6], [1.0, 0.0, -1e-6], [0.0, 0.0, -1.0]]))
+    assert (lux[:2] > 100).all() and not lux[2:].any()
+    np.testing.assert_array_equal(beam_share(np.array([1.0, 0.0, -1e-9, -1.0]), np.array(even.beam)), [1, 1, 0, 0])
+
+
 def test_the_colour_of_a_lamp_follows_planck_at_equal_luminance():
     np.testing.assert_allclose(colour(6500.0), 1.0, rtol=1e-12)
     warm = colour(3000.0)

@@ -12,10 +12,12 @@ from twin.imaging.phase_function import (
     molecular,
     molecular_scattering_per_m,
     petzold,
-    sea_water,
+    table_of,
     tabulate,
 )
 from twin.imaging.reference.sampling import density_at, sample_angle, sample_cosine
+from twin.imaging.water import scatterers
+from twin.scenario.model import WaterConfig
 
 FORMULAS = {
     "molecular": molecular,
@@ -61,8 +63,10 @@ def test_a_mixture_has_the_weighted_mean_cosine():
 def test_molecules_scatter_all_light_of_the_clearest_water_and_little_of_turbid_water():
     """Morel (1974) gives 0.00193 /m at 550 nm for sea water (Mobley 1994, Table 3.8)."""
     assert molecular_scattering_per_m(np.array(550.0)) == pytest.approx(0.00193, rel=0.02)
-    assert tabulate(sea_water(0.001, 550.0)).mean_cosine == pytest.approx(0, abs=1e-6)
-    assert tabulate(sea_water(0.98, 550.0)).mean_cosine == pytest.approx((1 - 0.00191 / 0.98) * 0.92417, abs=1e-4)
+    settings = WaterConfig(phase_function="sea")
+    clearest, turbid = (table_of(scatterers(settings, np.full(3, b))[1]).mean_cosine for b in (0.001, 0.98))
+    assert clearest == pytest.approx(0, abs=1e-6)
+    assert turbid == pytest.approx((1 - 0.00215 / 0.98) * 0.92417, abs=1e-4)  # 0.00215 /m at 535 nm
 
 
 @pytest.mark.parametrize("name", FORMULAS)

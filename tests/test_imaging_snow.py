@@ -285,3 +285,15 @@ def test_drawing_does_not_depend_on_the_number_of_bands(monkeypatch):
         snow.draw(light, np.full(SHAPE, 2.0, np.float32), POSE, 0, 0.0, motion)
         images.append(light)
     np.testing.assert_array_equal(*images)
+
+
+def test_particles_get_the_daylight_of_the_actual_depth_of_the_camera():
+    """The reference plane is 20 m deep and the camera 2 m above it; the planned altitude does not matter."""
+    water, sun = medium(WaterConfig(jerlov="III"), "single"), SunConfig(illuminance_lx=1e4, depth_m=20.0)
+    keys, lit = SnowConfig(density_per_m3=20.0), []
+    for planned_m in (2.0, 4.0):
+        sources = light_sources_in_camera(RIG, (), daylight_at(sun, water, planned_m), 0)
+        snow = MarineSnow(keys, np.zeros(3), RIG, water, [LampLight(sources, water)] * 2, np.random.default_rng(0))
+        lit.append(snow.visible_particles(POSE, 0, 0.0).radiance)
+    assert len(lit[0]) > 10 and lit[0].max() > 0
+    np.testing.assert_allclose(lit[1], lit[0], rtol=1e-9)

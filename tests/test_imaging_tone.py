@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
+from twin.imaging.bands import band_weights
 from twin.imaging.lamps import colour
+from twin.imaging.light_spectra import spectrum_of
 from twin.imaging.photo_sensor import PhotoSensor
 from twin.imaging.photons import electrons_per_cd
 from twin.imaging.tone import LOG_STOPS, linear_of, tone
 from twin.imaging.water import downwelling_per_m, medium
-from twin.imaging.white_balance import MOST
+from twin.imaging.water_tables import water_spectrum
+from twin.imaging.white_balance import MOST, WhiteBalance
 from twin.scenario.model import Scenario
 
 GREY = np.full((30, 40, 3), 20.0, np.float32)
@@ -94,8 +97,18 @@ def test_a_temperature_preset_makes_a_surface_in_that_light_grey(kelvin):
 def test_a_water_preset_makes_a_floor_at_the_planned_altitude_grey():
     preset, here = sensor_with(white_balance="water"), Scenario()
     path_m = 2 * here.plan.altitude_m
-    light = 20 * np.exp(-path_m * downwelling_per_m(medium(here.water)))
+    light = 20 * np.exp(-path_m * downwelling_per_m(medium(here.water, path_m=path_m, light="daylight")))
     assert light[0] / light[1] < 0.7 and np.ptp(image_of(preset, light)) <= 2
+
+
+@pytest.mark.parametrize(("lamps", "light"), [([], "daylight"), ([{"position_m": [0.2, 0, 0]}], "led")])
+def test_without_scattering_a_water_preset_compensates_the_absorption_over_the_path(lamps, light):
+    keys = {"sensor": {"white_balance": "water"}, "imaging": {"scattering": "none"}, "lamps": lamps}
+    here = Scenario.model_validate(keys)
+    absorption, _, _ = water_spectrum(here.water.jerlov, here.water.source)
+    left = band_weights(spectrum_of(light)) @ np.exp(-2 * here.plan.altitude_m * absorption)
+    factors = WhiteBalance(here, np.ones(3)).factors(np.ones(3), 0.0)
+    np.testing.assert_allclose(factors, left.max() / left, rtol=1e-9)
 
 
 def test_gains_multiply_the_raw_signals():

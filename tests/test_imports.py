@@ -1,6 +1,7 @@
 """The architecture: who imports whom, read from the source of every module and compared with docs/architecture.md."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -13,8 +14,15 @@ OURS = ("terrains", "scenes", "controllers", "twin")
 DOCUMENT = (ROOT / "docs" / "architecture.md").read_text()
 
 
+@functools.cache
 def modules():
     return [path for name in OURS for path in sorted((ROOT / name).rglob("*.py"))]
+
+
+@functools.cache
+def tree_of(path):
+    """Returns the syntax tree of a module."""
+    return ast.parse(path.read_text())
 
 
 def dotted(path):
@@ -68,10 +76,11 @@ def is_forbidden(module, imported):
     return room != target and (target is None or short(target) not in ROOMS[room])
 
 
+@functools.cache
 def arrows():
     """Returns the imports between modules of the project: {module: {imported}}."""
     return {
-        module: {name for name in imports(ast.parse(path.read_text()), module) if name in NAMES and name != module}
+        module: {name for name in imports(tree_of(path), module) if name in NAMES and name != module}
         for path, module in ((path, dotted(path)) for path in modules())
     }
 
@@ -108,7 +117,7 @@ def circle(graph):
 def test_every_import_is_in_the_table(path):
     module = dotted(path)
     assert room_of(module) is not None, f"{module} is in no room of docs/architecture.md"
-    wrong = [name for name in imports(ast.parse(path.read_text()), module) if is_forbidden(module, name)]
+    wrong = [name for name in imports(tree_of(path), module) if is_forbidden(module, name)]
     assert not wrong, f"{module} may not import {', '.join(wrong)}"
 
 
@@ -161,7 +170,7 @@ def test_the_diagram_is_that_of_the_imports():
 
 def test_estimators_do_not_use_the_truth():
     for path in (ROOT / "twin" / "estimate").rglob("*.py"):
-        names = {node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)}
+        names = {node.id for node in ast.walk(tree_of(path)) if isinstance(node, ast.Name)}
         assert not names & {"Truth", "Mission", "World"}, f"{dotted(path)} uses the truth"
 
 
@@ -173,11 +182,7 @@ def test_the_estimators_load_neither_simulator_nor_scenario():
 
 
 def test_rerun_is_imported_by_one_module():
-    importers = {
-        dotted(path)
-        for path in modules()
-        if any(within(name, "rerun") for name in imports(ast.parse(path.read_text())))
-    }
+    importers = {dotted(path) for path in modules() if any(within(name, "rerun") for name in imports(tree_of(path)))}
     assert importers == {"twin.report.recording"}
 
 
@@ -193,7 +198,7 @@ def test_no_function_outside_compiled_kernels_has_more_than_seven_parameters():
     wide = [
         f"{dotted(path)}.{node.name}"
         for path in modules()
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(tree_of(path))
         if isinstance(node, ast.FunctionDef)
         and len(parameters(node)) > 7
         and not any(name in ast.unparse(decorator) for decorator in node.decorator_list for name in exempt)
@@ -204,7 +209,7 @@ def test_no_function_outside_compiled_kernels_has_more_than_seven_parameters():
 def test_every_class_name_has_one_meaning():
     found = {}
     for path in modules():
-        for node in ast.parse(path.read_text()).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 found.setdefault(node.name, []).append(dotted(path))
     assert {name: places for name, places in found.items() if len(places) > 1} == {}

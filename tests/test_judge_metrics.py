@@ -204,6 +204,8 @@ def test_requirements_bound_errors_from_above_and_quality_from_below():
     verdicts = {name: row["passed"] for name, row in metrics["require"].items()}
     assert verdicts == {"map.le90_m": True, "map.completeness": False, "map.max_m": False}
     assert more_is_better("overlap.across_p05") and not more_is_better("timing.wall_s")
+    assert more_is_better("orthomosaic.coverage_area") and more_is_better("orthomosaic.matched")
+    assert not more_is_better("orthomosaic.ce90_m") and not more_is_better("orthomosaic.edge_width_m")
 
 
 @pytest.mark.parametrize(

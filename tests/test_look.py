@@ -130,6 +130,14 @@ def test_with_every_effect_the_light_is_still_the_sum_of_its_layers():
     np.testing.assert_allclose(layers.total, total, rtol=1e-4)
 
 
+@pytest.mark.parametrize("gain", [0.7, 0.1])
+def test_a_panel_states_that_its_brightness_is_that_before_tone_curve_and_white_balance(gain):
+    layer = np.ones((2, 2, 3), np.float32)
+    notes = [look_sheet._light("direct", "cd/m2", layer, gain, one).note for one in (True, False)]
+    assert notes[0].endswith("as bright as in the image")
+    assert notes[1] == notes[0] + "\nbefore tone curve and white balance"
+
+
 @pytest.mark.parametrize("settings", [["water.jerlov=clear"], ["water.jerlov=9C"], [*EFFECTS, *PHYSICAL]])
 def test_the_sheet_is_a_picture(tmp_path, settings):
     here = mission(*settings)

@@ -1,6 +1,8 @@
 """Orthomosaic: placement, seams, exposure, occlusion, restored colours, its file and its errors, on scenes with known
 answers."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import rasterio
@@ -18,6 +20,7 @@ from twin.estimate.mapping.orthomosaic import Views, heights_of, ortho_grid
 from twin.estimate.mapping.orthophoto import footprint
 from twin.exchange.geotiff import OrthomosaicFile
 from twin.imaging.illumination import illumination_of
+from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.optics import Optics
 from twin.imaging.restoration import Restoration, estimated_floor, linear_signal
 from twin.judge.colour_difference import ciede2000, lab_of
@@ -157,6 +160,16 @@ def test_exposures_cannot_be_estimated_without_patches_and_stay_equal():
     nothing = exposure_balance.PatchColours(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)))
     np.testing.assert_array_equal(exposure_balance.estimated_factors([nothing, nothing]), np.ones((2, 3)))
     assert exposure_balance.reported_factors([(1, 1, 1), None]) is None
+
+
+def test_an_image_may_show_more_patches_than_opencv_can_resample_at_once():
+    x = np.linspace(-0.2, 0.2, 40000)
+    levels = np.linspace(50, 200, RIG.height_px).astype(np.uint8)
+    image = np.tile(levels[:, None, None], (1, RIG.width_px, 3))
+    colours = exposure_balance.patch_colours(image, pose(0, 0), RIG, np.column_stack([x, 0 * x, 0 * x]))
+    assert len(colours.patch) == 40000  # cv2.remap refuses arrays of 32767 rows
+    rows = RIG.cy_px - RIG.focal_px * x  # the top of the image is to the east
+    np.testing.assert_allclose(np.exp(colours.log_colour[:, 1]), np.interp(rows, np.arange(120), levels), atol=1)
 
 
 def test_floor_behind_a_block_is_not_shown_by_the_camera_that_cannot_see_it():
@@ -320,6 +333,33 @@ def test_the_restored_colour_of_a_card_is_its_albedo(jerlov):
     assert np.median(difference[inner]) < 1.0 and np.percentile(difference[inner], 90) < 3.0
     uncorrected = ciede2000(lab_of(image / 255.0), lab_of(albedo / 255.0))
     assert np.median(uncorrected[inner]) > (1 if jerlov == "clear" else 5)
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_albedo_in_the_shadow_of_the_sun_is_restored(turn):
+    """The sun is in the west of a wall along y; a quarter of the light reaches the shadow. -1: the map is turned."""
+    sun = {"illuminance_lx": 900.0, "elevation_deg": 30.0, "azimuth_deg": 180.0, "sky_share": 0.25}
+    sections = {"water": {"jerlov": "clear"}, "sun": sun, "imaging": {"shadows": True}, "lamps": []}
+    scenario = Scenario.model_validate(sections)
+    rig, illumination = scenario.believed_rig(), illumination_of(scenario)
+    elevation, camera = flat(0.0, MapGrid(-1.5, 1.5, 0.05, 60, 60)), pose(0.0, 0.0, 1.5)
+    elevation.height_m[:, 30] = 0.2
+    formation = ImageFormation(scenario, illumination, estimated_floor(elevation), np.random.default_rng(0), rig)
+    albedo, shape = 128, (rig.height_px, rig.width_px)
+    depth = np.full(shape, 1.5, np.float32)
+    light = formation.radiance(np.full((*shape, 3), albedo, np.uint8), depth, 0, StampedPose(camera, 0.0))
+    gain = 0.9 / float(light.max())
+    image = np.clip(255 * gain * light + 0.5, 0, 255).astype(np.uint8)
+    turned = np.diag([turn, turn, 1.0, 1.0])
+    height = np.ascontiguousarray(elevation.height_m[:: int(turn), :: int(turn)])
+    believed = dataclasses.replace(elevation, height_m=height, map_from_world=turned)
+    restored = Restoration(scenario, illumination, rig, believed)(image, (gain,) * 3, turned @ camera)
+    x = (rig.cy_px - np.arange(rig.height_px)) / rig.focal_px * 1.5  # the top of the image is to the east
+    dark = (x > 0.1) & (x < 0.17)  # the wall is at x = 0.025 m and its shadow ends at 0.19 m
+    assert dark.sum() > 5 and image[dark, 100].max() < 0.3 * image[x < -0.1, 100].min()
+    # levels of 57 (a quarter of 230) are rounded by half a level, 1 %
+    np.testing.assert_allclose(restored[dark, 100], albedo, rtol=0.02)
+    np.testing.assert_allclose(restored[x < -0.1, 100], albedo, rtol=0.02)
 
 
 def test_a_tone_curve_is_inverted():

@@ -85,6 +85,13 @@ def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors
     assert "different floors" not in same and "Differences of the scenarios" not in same
 
 
+def test_runs_without_truth_are_compared_by_their_paths_alone(runs):
+    for run in runs[:2]:
+        (run.folder / "trajectory_truth.tum").unlink()
+    page = comparison.render(comparison.load_runs([run.folder for run in runs[:2]]))
+    assert page.count("data:image/png;base64,") == 1  # paths; there are no errors
+
+
 def test_runs_that_cannot_be_compared_are_refused(tmp_path, runs):
     folder = runs[0].folder
     with pytest.raises(TwinError, match="RUN: 1 runs .allowed: 2 to 8"):

@@ -25,8 +25,12 @@ def write_surface(file: Path, height_m: np.ndarray) -> Path:
     return file
 
 
-def test_the_picture_has_the_colours_of_the_mosaic_with_west_on_the_left(tmp_path):
-    picture = mesh_picture.surface_picture(write_surface(tmp_path / "mesh.glb", np.zeros((60, 80))))
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory):
+    return mesh_picture.surface_picture(write_surface(tmp_path_factory.mktemp("map") / "mesh.glb", np.zeros((60, 80))))
+
+
+def test_the_picture_has_the_colours_of_the_mosaic_with_west_on_the_left(picture):
     assert picture is not None
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
     columns = np.arange(picture.shape[1])
@@ -60,10 +64,12 @@ def test_an_outlier_of_the_height_does_not_change_the_scale():
     np.testing.assert_allclose(mesh_picture.camera_pose(outlier), mesh_picture.camera_pose(plain), atol=0.01)
 
 
-def test_the_report_shows_the_surface_unless_rendering_fails(tmp_path, monkeypatch):
-    write_surface(tmp_path / "mesh.glb", np.zeros((60, 80)))
+def test_the_report_shows_the_surface_unless_rendering_fails(picture, tmp_path, monkeypatch):
+    mesh_file = write_surface(tmp_path / "mesh.glb", np.zeros((60, 80)))
     (tmp_path / "scenario.resolved.toml").write_text("")
-    assert '<section id="surface">' in write_report(tmp_path).read_text()
+    with monkeypatch.context() as patch:
+        patch.setattr("twin.report.survey_page.surface_picture", {mesh_file: picture}.__getitem__)
+        assert '<section id="surface">' in write_report(tmp_path).read_text()
     monkeypatch.setenv("PYOPENGL_PLATFORM", "no such platform")
     page = write_report(tmp_path).read_text()
     assert "unfinished" in page and 'id="surface"' not in page

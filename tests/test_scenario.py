@@ -29,6 +29,8 @@ SENSOR_KEYS = (
     "white_gains, white_temperature_k"
 )
 
+SCENES = sorted(file.stem for file in (Path(__file__).parent.parent / "scenes").glob("*.toml"))
+
 BAD_FILES = [
     ('nme = "x"', [f"1: nme: unknown key (did you mean name?) (allowed: {TOP_KEYS})"]),
     ("[plan]\naltitude = 2.0", [f"2: plan.altitude: unknown key (did you mean altitude_m?) (allowed: {PLAN_KEYS})"]),
@@ -114,7 +116,14 @@ BAD_FILES = [
         ["2: terrain.kind: 'lava': not allowed (allowed: 'flat', 'ripples', 'fractal', 'reef', 'cliffs' or 'file')"],
     ),
     ('[require]\n"map.le90_m" = "x"', ["2: require.map.le90_m: 'x': not allowed (allowed: a number)"]),
-    ('extends = "none.toml"', ["1: extends: no such file 'none.toml'"]),
+    (
+        'extends = "none.toml"',
+        [
+            "1: extends: no such file 'none.toml' (allowed: a path relative to this file, or one of "
+            + ", ".join(SCENES)
+            + ")"
+        ],
+    ),
     ('extends = "bad.toml"', ["1: extends: the file extends itself (allowed: another file)"]),
     ("seed = 3\n[calibration]\nfocal_error = 0.1", ["2: calibration: renamed to calibration_error"]),
     ("calibration.focal_error = 0.1", ["1: calibration: renamed to calibration_error"]),
@@ -155,8 +164,6 @@ BAD_FILES = [
     ),
     ('name = "a"\nseed = = 1', ["2: not TOML: Invalid value (at line 2, column 8)"]),
 ]
-
-SCENES = sorted(file.stem for file in (Path(__file__).parent.parent / "scenes").glob("*.toml"))
 
 BAD_OVERRIDES = [
     ("plan.tracks", "--set plan.tracks: not of the form key=value (for instance plan.tracks=2)"),
@@ -274,6 +281,13 @@ def test_a_scenario_extends_another_key_by_key(tmp_path):
     scenario = load_scenario(written(tmp_path, 'extends = "base.toml"\nseed = 4\n[plan]\naltitude_m = 2.5', "top.toml"))
     assert (scenario.name, scenario.seed, scenario.water.jerlov) == ("base", 4, "II")
     assert (scenario.plan.altitude_m, scenario.plan.speed_mps) == (2.5, 0.5)
+
+
+def test_a_scenario_extends_a_built_in_scene_by_name_unless_a_file_has_this_name(tmp_path):
+    top = written(tmp_path, 'extends = "reef"\nseed = 4', "top.toml")
+    assert load_scenario(top).model_dump() == load_scenario("reef", ["seed=4"]).model_dump()
+    (tmp_path / "reef").write_text('name = "mine"')
+    assert load_scenario(top).name == "mine"
 
 
 def test_overrides_replace_values_of_the_file_and_are_read_as_toml():

@@ -13,7 +13,7 @@ from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Traje
 from twin.errors import SurveyAborted
 from twin.estimate.alignment import _mean_chi2
 from twin.scenario.file import load_scenario
-from twin.session.conclusion import _identity
+from twin.session.conclusion import _identity, plugin_notes
 from twin.session.monitor import SurveyMonitor
 from twin.session.survey_check import calibration_notes, off_course_limit_m, survey_findings
 from twin.world.mission import prepare
@@ -48,9 +48,23 @@ def checks(result, heights, reference):
     return [finding.check for finding in survey_findings(mission(), result, heights, reference)]
 
 
+def test_plugins_of_the_same_name_have_a_note_each():
+    scenario = load_scenario("reef", ["control.plugin=other:Package", "estimate.plugin=other:Package"])
+    assert [note.split(" by ")[0].split(" of ")[0] for note in plugin_notes(scenario)] == [
+        "The vehicle was steered", "The trajectories are those"
+    ]  # fmt: skip
+
+
 def test_a_survey_on_its_path_that_maps_the_area_has_no_findings():
     path = np.zeros((90, 3))
     assert checks(result_at(path), elevation(0.95), path) == []
+
+
+def test_an_area_without_a_cell_centre_is_not_checked():
+    tiny, path = mission("plan.area_m=[0.01, 0.01]"), np.zeros((90, 3))
+    height = np.zeros((tiny.grid.rows, tiny.grid.cols), np.float32)
+    heights = ElevationMap(tiny.grid, height, np.ones_like(height), np.zeros((*height.shape, 3), np.uint8))
+    assert survey_findings(tiny, result_at(path), heights, path) == []
 
 
 def test_an_area_with_a_tenth_missing_is_a_finding():

@@ -90,7 +90,11 @@ def test_the_document_has_the_verdict_the_command_and_the_figure(tmp_path):
     analysis = analyse(tmp_path, 0.5)
     write_document(analysis, tmp_path)
     text = (tmp_path / "agreement.md").read_text()
-    assert "FAIL: 40 pairs" in text and "`twin study study`" in text
+    assert "FAIL: 40 pairs" in text and "`twin study study` flies 40 pairs" in text
+    sampling = analysis.study.sampling.model_copy(update={"seeds": 2})
+    analysis.study = analysis.study.model_copy(update={"sampling": sampling})
+    write_document(analysis, tmp_path)
+    assert "`twin study study` flies 80 pairs" in (tmp_path / "agreement.md").read_text()
     assert all(" | ".join(row) in text for row in (HEADER, *table(agreement(analysis))))
     assert (tmp_path / "agreement.png").read_bytes().startswith(b"\x89PNG")
     assert summary(analysis, {})["agreement"]["metrics"]["map.le90_m"]["agrees"] is False

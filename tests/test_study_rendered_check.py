@@ -1,5 +1,7 @@
 """Rendered surveys that check a surrogate study: which ones are flown, and when they agree."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from study_surveys import study_of
@@ -96,6 +98,33 @@ def test_rendered_surveys_have_scenario_and_seed_of_their_surrogate_surveys_and_
     assert again.flown == []
 
 
+class Interrupted(Calls):
+    """Engine in which Ctrl-C is pressed after two surveys."""
+
+    def run_many(self, function, tasks, limits):
+        yield from islice(super().run_many(function, tasks, limits), 2)
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_check_is_marked_as_incomplete_with_the_exit_status_of_ctrl_c(tmp_path):
+    study, analysis = analysed(tmp_path)
+    engine = Interrupted(lambda survey: row_with(survey, 0.0199))
+    checked = check(study, analysis, 6, tmp_path, engine, StudyProgress())
+    assert len(checked.rows) == 2 and checked.exit_status == 130
+    assert summary(checked)["interrupted"] and "interrupted and is incomplete" in checked.sentence()
+    again = Calls(lambda survey: row_with(survey, 0.0199))
+    finished = check(study, analysis, 6, tmp_path, again, StudyProgress())
+    assert len(again.flown) == 4 and not finished.interrupted and "incomplete" not in finished.sentence()
+
+
+def test_a_study_without_limits_has_nothing_to_check_and_does_not_fail(tmp_path):
+    study, log = study_of(tmp_path, STUDY[: STUDY.index("[require]")]), ResultsLog(tmp_path)
+    for survey in surveys(study, tmp_path):
+        log.add(row_of(survey, "complete", "") | {"map.le90_m": 0.01})
+    checked = check(study, StudyAnalysis(log.table(), study), 6, tmp_path, Calls(None), StudyProgress())
+    assert checked.exit_status == 0 and "the study has no limit" in checked.sentence()
+
+
 @pytest.mark.parametrize(
     ("rendered", "surrogate", "agrees"), [(6, 6, True), (6, 8, True), (6, 11, False), (1, 6, False)]
 )
@@ -108,4 +137,4 @@ def test_the_surrogate_agrees_if_its_pass_rate_lies_in_the_interval_of_the_rende
 
 def test_without_surveys_near_the_limits_nothing_agrees():
     checked = RenderedCheck(np.zeros(0, bool), np.zeros(0, bool), [])
-    assert not checked.agrees and "No survey" in checked.sentence()
+    assert not checked.agrees and checked.exit_status == 1 and "No survey" in checked.sentence()

@@ -8,6 +8,8 @@ from study_surveys import STUDY, study_of
 
 from twin.study.design import design_points, samples, seeds_of_sample
 from twin.study.distribution import Distribution
+from twin.study.runner import refusal_notice
+from twin.study.study_file import n_planned_surveys
 
 PROBABILITIES = (np.arange(2000) + 0.5) / 2000
 
@@ -83,6 +85,20 @@ def test_a_grid_is_combined_with_every_design_point(tmp_path):
             (t, a) for t in (1, 2, 3) for a in (1.8, 2)
         }
         assert len({v["water.turbidity"] for v in cells}) == 1
+
+
+@pytest.mark.parametrize("method", ["random", "saltelli"])
+@pytest.mark.parametrize("vary", ["", "[vary]\nwater.turbidity = { uniform = [1.0, 2.0] }"])
+def test_the_number_of_planned_surveys_is_that_of_the_surveys(method, vary, tmp_path):
+    text = f'scenario = "reef"\n{vary}\n[sampling]\nmethod = "{method}"\nseeds = 3\nsamples = {4 if vary else 1}'
+    study = study_of(tmp_path, text)
+    assert n_planned_surveys(study) == 3 * len(list(samples(study)))
+
+
+def test_a_single_refused_sample_is_reported_in_the_singular():
+    assert refusal_notice({4: "too low"}) == "1 sample cannot be flown and is left out: sample 4: too low"
+    expected = "2 samples cannot be flown and are left out, e.g. sample 4: too low"
+    assert refusal_notice({7: "too high", 4: "too low"}) == expected
 
 
 def test_samples_share_their_seeds_unless_paired_is_false(tmp_path):

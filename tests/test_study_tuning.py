@@ -124,6 +124,14 @@ def evaluate(tmp_path):
     return evaluate_plan
 
 
+def test_a_plan_without_sampled_keys_is_confirmed_with_as_many_different_surveys(tmp_path):
+    text = TUNING.replace("water.turbidity = { uniform = [4.0, 6.0] }", "").replace("samples = 2", "samples = 1")
+    study = study_of(tmp_path, text)
+    confirmation = CandidateSurveys(study, tuning_config(study), tmp_path, ()).confirmation(())
+    surveys = list(confirmation.surveys(0, {"plan.altitude_m": 2.0, "estimate.node_stride": 1}))
+    assert len({survey.scenario_hash for survey in surveys}) == len(surveys) == 4  # tune.confirm
+
+
 def test_failed_surveys_are_not_counted_and_flown_again(evaluate):
     failed = {"status": "failed", "map.le90_m": 1.0, "require.map.le90_m.passed": False}
     candidate, again = evaluate({}, failed, {}, {}, {})

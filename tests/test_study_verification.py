@@ -128,6 +128,19 @@ def test_the_recommended_plan_passed_rendered_and_is_the_cheapest_that_did(searc
     assert result.recommended.objectives[0] == min(passed)
 
 
+def quick_when_rendered(survey):
+    """Flies a survey that always passes, is more accurate at low altitude and takes half as long when rendered."""
+    row = flown(survey, 0.003 * survey.values["plan.altitude_m"])
+    return row | {"timing.simulated_s": row["timing.simulated_s"] * (0.5 if is_rendered(survey) else 1.0)}
+
+
+def test_a_plan_that_is_more_expensive_than_a_verified_one_is_not_flown_rendered(tmp_path):
+    """The correction halves the costs near the verified plan: half the cost of a plan is less than its full cost."""
+    result = search(study_of(tmp_path, TUNING), tmp_path / "out", quick_when_rendered)
+    costs_s = [verification.surrogate.objectives[0] for verification in result.verifications]
+    assert costs_s and max(costs_s) == costs_s[0]
+
+
 def test_no_cheaper_plan_of_the_final_front_is_left_untried(searched):
     """A cheaper plan of the corrected front would have been flown next, unless the number of plans was reached."""
     study, result, _ = searched

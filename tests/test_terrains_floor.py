@@ -145,6 +145,7 @@ def test_height_at_the_nodes_is_the_grid_value_and_outside_it_is_nan() -> None:
     ("change", "field"),
     [
         ({"kind": "lunar"}, "terrain.kind"),
+        ({"texture": TextureSource(0.01, cover="lunar")}, "terrain.cover"),
         ({"grid_m": 0.0011}, "terrain.grid_m"),
         ({"texture": TextureSource(0.0001)}, "terrain.texture_px_m"),
     ],

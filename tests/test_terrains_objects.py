@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import struct
 from typing import get_args
 
@@ -21,8 +22,15 @@ from twin.world.objects import load_objects
 
 FIELD = "objects.0.mesh_file"
 CUBE = trimesh.creation.box((2.0, 1.0, 0.5))
-FLOOR = terrains.generate("reef", (8.0, 6.0), 1.2, 0.0, 0.04, terrains.TextureSource(0.04), 5)
-PLANE = terrains.generate("flat", (6.0, 4.0), 0.0, 0.0, 0.5, terrains.TextureSource(0.05), 1)
+
+
+@functools.cache
+def reef():
+    """Returns a floor with relief, 8 m x 6 m."""
+    return terrains.generate("reef", (8.0, 6.0), 1.2, 0.0, 0.04, terrains.TextureSource(0.2), 5)
+
+
+PLANE = terrains.Terrain(np.zeros((9, 13), np.float32), 0.5, -3.0, -2.0, np.zeros((4, 4, 3), np.uint8), 1.0)
 
 
 def read(file, **options):
@@ -132,9 +140,9 @@ CONE = model_of(mesh_file._mesh(*(lambda c: (c.vertices, c.faces, np.full((len(c
     trimesh.creation.cone(0.5, 1.0))))  # fmt: skip
 
 
-def scattered(floor=FLOOR, seed=1, taken=(), **keys):
+def scattered(seed=1, taken=(), **keys):
     config = ObjectConfig(shape="boulder", **({"per_m2": 1.0, "size_m": 0.3} | keys))
-    return placement.place(2, config, [CONE], floor, taken, seed)
+    return placement.place(2, config, [CONE], reef(), taken, seed)
 
 
 def test_scattered_objects_have_the_density_and_do_not_overlap():
@@ -164,7 +172,7 @@ def test_scattered_objects_stand_on_their_ground(ground, steep):
     for item in scattered(on=ground):
         x, y = item.world_from_object[:2, 3, None]
         reach_m = 0.3 / np.sqrt(2) / 2
-        assert (placement.slope_deg(FLOOR, x, y, reach_m)[0] >= placement.STEEP_DEG) == steep
+        assert (placement.slope_deg(reef(), x, y, reach_m)[0] >= placement.STEEP_DEG) == steep
 
 
 def test_placement_is_seeded():
@@ -184,7 +192,7 @@ def test_objects_of_an_entry_stand_in_the_same_places_whatever_other_entries_the
 
     def placed(*entries):
         scenario = Scenario.model_validate({"seed": 5, "objects": entries})
-        return [poses_of([i for i in load_objects(scenario, FLOOR, lambda build: build()) if i.group == k])
+        return [poses_of([i for i in load_objects(scenario, reef(), lambda build: build()) if i.group == k])
                 for k in range(len(entries))]  # fmt: skip
 
     both, denser = placed(west, east), placed(west, east | {"per_m2": 1.0})

@@ -137,6 +137,13 @@ def test_a_damaged_geojson_file_is_an_error(dem, tmp_path, content):
     assert caught.value.field == "plan.polygon"
 
 
+def _with_datum(folder, datum):
+    """Writes a small georeferenced layer whose vertical datum is known, and returns its path."""
+    origin = Georeference(0.0, 0.0, vertical_datum=datum)
+    geotiff.write_layer(folder / "datum.tif", np.zeros((2, 2), np.float32), MapGrid(0, 0, 1.0, 2, 2), "", origin)
+    return folder / "datum.tif"
+
+
 @pytest.mark.parametrize("metres_per_unit", [1.0, 0.3048])
 def test_a_georeferenced_map_is_read_back_in_scene_coordinates(tmp_path, metres_per_unit):
     crs = rasterio.crs.CRS.from_user_input(UTM if metres_per_unit == 1 else "EPSG:2222").to_wkt()
@@ -154,6 +161,8 @@ def test_a_georeferenced_map_is_read_back_in_scene_coordinates(tmp_path, metres_
         east, north = origin.from_scene(-3.09, 4.69)  # the centre of the north-western cell
         assert next(file.sample([(float(east), float(north))]))[0] == pytest.approx(float(height[0, 0]) - 3000.123456)
         assert file.tags()["SCENE_ORIGIN_ELEVATION_M"] == "-3000.123456"
+    assert geotiff.read_georeference(tmp_path / "dem.tif").vertical_datum == ""
+    assert geotiff.read_georeference(_with_datum(tmp_path, "EGM96 height")).vertical_datum == "EGM96 height"
 
 
 def test_a_survey_over_a_dem_returns_its_maps_in_the_coordinates_of_the_dem(dem, tmp_path):

@@ -57,6 +57,7 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
+        TwinError: the run folder cannot be written, or the world cannot be created.
     """
     from twin import survey
 

@@ -53,7 +53,7 @@ QuickOption = Annotated[bool, typer.Option("--quick", help="Smaller plans, image
 WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Most random walks per cell of the Monte Carlo.")]
 PhaseOption = Annotated[
     str,
-    typer.Option("--phase", help="Phase function of both: a value of water.phase_function."),
+    typer.Option("--phase", help="Phase function for lamps, in model and reference: a value of water.phase_function."),
 ]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="results.json of `twin reproduce all`.")]
 ReadmeOption = Annotated[Path | None, typer.Option("--readme", help="README whose chapter is replaced.")]
@@ -118,7 +118,7 @@ CheckOption = Annotated[
         min=0,
         max=1000,
         metavar="N",
-        help="Fly the N surrogate surveys whose results are closest to the limits also rendered. Default: none.",
+        help="Also fly rendered surveys for the N surrogate surveys closest to the limits. Default: none.",
     ),
 ]
 ExtrapolateOption = Annotated[

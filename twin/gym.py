@@ -17,7 +17,7 @@ from twin.core.records import Array, Frame
 from twin.errors import SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
 from twin.session.stepped_world import SteppedWorld
-from twin.world.pilot import make_pilot
+from twin.world.pilot import make_pilot, without_feedback
 
 try:
     import gymnasium
@@ -176,7 +176,8 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         forward, left, up = values[:3] * self._most_mps
         velocity = np.array([c * forward - s * left, s * forward + c * left, up])
         self._target = Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
-        return self._steer(self._estimate, self._target)
+        estimate = without_feedback(self._estimate, self._target, self._frame.readings)
+        return self._steer(estimate, self._target)
 
     def _observation(self) -> Observation:
         """Returns the observation at the current frame."""

@@ -50,6 +50,7 @@ def run(
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
+        TwinError: the run folder cannot be written, or the world cannot be created.
     """
     mission = prepare(scenario)
     stopwatch, guard = Stopwatch(), StageGuard()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from terrains.objects.mesh import Mesh
 
-FEWEST_FACES = 64  #: a level with fewer triangles is the last one
+FEWEST_FACES = 64  #: a level with at most this many triangles is the last one
 
 
 class Level(NamedTuple):
@@ -30,9 +30,10 @@ class Level(NamedTuple):
 
 
 def levels_of(mesh: Mesh) -> tuple[Level, ...]:
-    """Returns the levels of detail, finest first; from level to level, the cells grow by a factor of sqrt(2).
+    """Returns the levels of detail, finest first.
 
-    The first level is the full mesh; the side of the cells of the second is the median edge length of the full mesh.
+    The first level is the full mesh. The side of the cells of the others starts at the median edge length of the full
+    mesh and grows in steps of a factor sqrt(2); a step that removes no triangles makes no level.
     """
     corners = mesh.vertices_m[mesh.faces]
     cell_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
@@ -48,7 +49,10 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
 
 
 def clustered(mesh: Mesh, cell_m: float) -> Mesh:
-    """Returns the mesh with the vertices of each cubic cell of side `cell_m` merged to their mean."""
+    """Returns the mesh with the vertices of each cubic cell of side `cell_m` merged to their mean.
+
+    Triangles that then have two corners in one cell are removed, and of equal triangles all but one.
+    """
     cells = np.floor((mesh.vertices_m - mesh.vertices_m.min(axis=0)) / cell_m).astype(np.int64)
     _, vertex_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
     faces = vertex_of[mesh.faces]

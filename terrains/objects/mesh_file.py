@@ -14,9 +14,8 @@ from twin.core.paths import is_file
 from twin.errors import TwinError
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
-MAX_BYTES = 500_000_000  #: largest file that is read
-TEXTURED_FACES = 200_000  #: triangles into which the parts of a file are divided, so that vertices sample textures
-LARGEST_M = 1000.0
+MAX_BYTES = 500_000_000  #: size of the largest file that is read
+TEXTURED_FACES = 200_000  #: largest number of triangles of a divided mesh, whose corners sample the texture
 
 Array = NDArray[np.float64]
 

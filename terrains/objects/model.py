@@ -43,7 +43,7 @@ class PlacedObject(NamedTuple):
 
     Args:
         model: shape of the object.
-        world_from_object: (4, 4) pose times scale.
+        world_from_object: (4, 4) pose, with its rotation multiplied by the scale.
         scale: size in the world divided by the size of the model.
         group: number, from 0, of the object's entry in `[[objects]]`.
         phase: phase of its sway [rad].

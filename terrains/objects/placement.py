@@ -15,8 +15,8 @@ from twin.errors import TwinError
 Array = NDArray[np.float64]
 
 STEEP_DEG = 15.0  #: sand lies flatter than this, about half its angle of repose
-MAX_SCATTERED = 5000  #: objects of one entry
-SIZE_CUT_SIGMA = 2.0  #: of the logarithm of the size
+MAX_SCATTERED = 5000  #: largest number of objects of one entry
+SIZE_CUT_SIGMA = 2.0  #: random sizes are limited to this many standard deviations of their logarithm
 TRIES = (8, 64, 512)  #: positions that are tried for one object, batch by batch
 
 
@@ -165,7 +165,9 @@ def _free_position(
 ) -> tuple[float, float] | None:  # fmt: skip
     """Returns a random position (x, y) [m] where an object may stand; None if none is found.
 
-    The circle of the object does not overlap the circles `around` (n, 3): x, y, radius [m]."""
+    The circle of the object does not overlap the circles `around` (n, 3): x, y, radius [m]. Its centre is at least
+    `group.spacing_m` from their centres.
+    """
     if (corners[0] >= corners[1]).any():
         return None
     apart = np.maximum(around[:, 2] + radius_m, group.spacing_m)

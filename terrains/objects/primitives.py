@@ -31,13 +31,16 @@ def tube(path: Array, radius: Array, n_sides: int) -> Surface:
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.cross(tangent[0], np.eye(3)[np.abs(tangent[0]).argmin()])
-    rings = []
-    for point, along, r in zip(path, tangent, radius, strict=True):
+    acrosses = np.empty_like(tangent)
+    for k, along in enumerate(tangent):
         across = across - along * (across @ along)  # carried along the path without twist
         across /= np.linalg.norm(across)
-        angle = 2 * np.pi * np.arange(n_sides) / n_sides
-        rings.append(point + r * (np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(along, across)))
-    vertices = np.concatenate([*rings, path[:1], path[-1:]])
+        acrosses[k] = across
+    angle = 2 * np.pi * np.arange(n_sides) / n_sides
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    outwards = cos * acrosses[:, None] + sin * np.cross(tangent, acrosses)[:, None]
+    rings = path[:, None] + radius[:, None, None] * outwards
+    vertices = np.concatenate([rings.reshape(-1, 3), path[:1], path[-1:]])
     first, last = len(vertices) - 2, len(vertices) - 1
     faces = ring_faces(len(path), n_sides)
     side = np.arange(n_sides)

@@ -13,7 +13,7 @@ from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
 _N_COLUMNS = 13  # columns of the grid of directions for the fit
-_RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, in units of the planned altitude
+_RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as fractions of the planned altitude
 
 
 def believed_calibration(rig: StereoRig) -> RigCalibration:
@@ -45,7 +45,7 @@ def true_calibration(scenario: Scenario) -> RigCalibration:
 
 
 def _points(rig: StereoRig, altitude_m: float) -> Array:
-    """Returns points (n, 3) in camera axes that fill the image at several depths [m]."""
+    """Returns points (n, 3) [m] in camera axes that fill the image at the depths of `_RANGES`."""
     columns = np.linspace(0, rig.width_px - 1, _N_COLUMNS)
     rows = np.linspace(0, rig.height_px - 1, _N_COLUMNS)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)

@@ -13,7 +13,7 @@ from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.core.records import StereoRig
 from twin.surrogate import error_model_file
-from twin.surrogate.map_model import WINDOW_PX, roughness, roughness_error_px
+from twin.surrogate.map_model import WINDOW_PX, edge_roughness, relief_error_px, roughness
 from twin.surrogate.matchability import Matchability
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import FloorForecast
@@ -81,7 +81,7 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     fitted = error_model_file.load(scenario.imaging.error_model)
     model, matching = fitted.model, Matchability(scenario, mission.illumination, mission.terrain)
     rig = rig.binned(matching.binning)
-    depth, slope, rough_m = _floor_points(mission, forecast, rig)
+    depth, slope, rough_m, edge_m = _floor_points(mission, forecast, rig)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
     sigma_px = np.interp(depth, matching.depths_m, model.depth_error.sigma_px(table, matching.lamp_share))
@@ -94,18 +94,19 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     sigma_px *= np.exp(scatter * ndtri(np.clip(evenly, 1e-6, 1 - 1e-6)))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
-    rough_px = rough_m * rig.focal_px * rig.baseline_m / depth**2
-    rough_px = roughness_error_px(rough_px, model.relief_error_gain, model.relief_error_limit_px, model.edge_error_gain)
-    rough = rough_px * depth**2 / (rig.focal_px * rig.baseline_m)
-    sigma_m = np.sqrt(vertical**2 + lateral**2 + rough**2)
+    per_px = depth**2 / (rig.focal_px * rig.baseline_m)
+    relief = per_px * relief_error_px(rough_m / per_px, model.relief_error_gain, model.relief_error_limit_px)
+    sigma_m = np.sqrt(vertical**2 + lateral**2 + relief**2 + (model.edge_error_gain * edge_m) ** 2)
     return ExpectedError(
         sigma_m, float(in_view.mean()) if len(depth) else 0.0,
         float(bound.max(initial=0.0)), model.bound_range_px[1],
     )  # fmt: skip
 
 
-def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array]:
-    """Returns depths (n,) [m], slopes (n,) [m/m] and roughness (n,) [m] at points spread evenly over the images.
+def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array, Array]:
+    """Returns the floor at points spread evenly over the images.
+
+    It returns depths (n,) [m], slopes (n,) [m/m], roughness (n,) [m] and `edge_roughness` (n,) [m].
 
     Args:
         mission: the survey.
@@ -122,7 +123,10 @@ def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig)
     heights = true_heights(grid, mission.terrain.height_at)
     down, east = np.gradient(heights, grid.cell_m)
     typical_m = float(np.median(depth)) if len(depth) else 1.0
-    rough = roughness(heights, WINDOW_PX * typical_m / matched.focal_px / grid.cell_m)
+    window_cells = WINDOW_PX * typical_m / matched.focal_px / grid.cell_m
+    rough, steepness = roughness(heights, window_cells), np.hypot(down, east)
+    edge = edge_roughness(rough, steepness, window_cells)
     rows = np.clip(((grid.north_m - y) / grid.cell_m).astype(int), 0, grid.rows - 1)
     cols = np.clip(((x - grid.west_m) / grid.cell_m).astype(int), 0, grid.cols - 1)
-    return depth, np.nan_to_num(np.hypot(down, east)[rows, cols]), rough[rows, cols].astype(float)
+    at = rows, cols
+    return depth, np.nan_to_num(steepness[at]), rough[at].astype(float), edge[at].astype(float)

@@ -54,7 +54,7 @@ def export(
     """Writes a run in several formats, each into the subfolder of `out` with the name of the format.
 
     A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`
-    beside it, which an error or an interrupt removes.
+    in `out`, which an error or an interrupt removes.
 
     Args:
         folder: the run folder.
@@ -67,8 +67,9 @@ def export(
         The files or folders written, by format.
 
     Raises:
-        TwinError: a format is unknown, the folder is not that of a run, the run lacks contents that a format needs, or
-            a subfolder is not empty or cannot be written; nothing was written. Or an image of the run is damaged.
+        TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
+            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or an image of
+            the run is damaged.
         OSError: a file cannot be written.
     """
     chosen = chosen_formats(names)
@@ -86,7 +87,7 @@ def export(
 
 @contextmanager
 def _completed(folder: Path) -> Iterator[Path]:
-    """Yields a hidden folder beside `folder`, which is renamed to `folder` at the end, or removed after an exception.
+    """Yields a hidden folder next to `folder`, which is renamed to `folder` at the end, or removed after an exception.
 
     Args:
         folder: new or empty folder.
@@ -191,7 +192,8 @@ def _elevation(run: Run) -> ElevationMap | None:
     sigma = run.rasters.get("dem_sigma")
     sigma_m = np.full(height_m.shape, np.nan) if sigma is None or sigma.grid != grid else sigma.values
     mosaic = _colours(run.rasters.get("mosaic"), run.rasters["dem"])
-    return ElevationMap(grid, height_m.astype(np.float32), sigma_m.astype(np.float32), mosaic)
+    heights = height_m.astype(np.float32), sigma_m.astype(np.float32)
+    return ElevationMap(grid, *heights, mosaic, run.keyframes.map_from_world)
 
 
 def _colours(mosaic: Raster | None, dem: Raster) -> Image:
@@ -211,7 +213,7 @@ def _colours(mosaic: Raster | None, dem: Raster) -> Image:
 
 
 def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.float32] | None:
-    """Returns a layer on the grid of the elevation map; None if there is none."""
+    """Returns a layer of a run; None if the run has no such layer on the grid of the elevation map."""
     raster = run.rasters.get(name)
     if raster is None or elevation is None or raster.grid != elevation.grid:
         return None
@@ -219,7 +221,11 @@ def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.fl
 
 
 def _frames(run: Run, rig: StereoRig) -> tuple[RecordedFrame, ...]:
-    """Returns the frames of a run whose left image was recorded, in the order of time."""
+    """Returns the frames of a run whose left image was recorded, in the order of time.
+
+    Raises:
+        TwinError: frames.csv is damaged or lacks a keyframe.
+    """
     keyframes = set(run.keyframes.frames.tolist())
     folder = run.folder / "frames"
     table = folder / "frames.csv"

@@ -54,6 +54,7 @@ def render_view(
     The cameras look straight down and the bow points along the first leg.
 
     Args:
+        mission: the survey.
         at_m: position of the left camera in the world [m]; None: above the centre of the survey area, at the
             planned altitude.
         twist_body: (6,) [angular, linear] velocity of the body in its own axes during the exposure [rad/s, m/s];

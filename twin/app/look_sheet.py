@@ -90,19 +90,24 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
         Panel("range", "m", range_m, range_m, colours=("viridis_r", *_ends(range_m))),
         Panel("albedo", "1", a.albedo / 255, a.albedo / 255),
         _light("light on the sea floor", "lx", a.components.floor_lx, 0.0),
-        _light("direct signal", "cd/m2", a.components.direct, a.gain),
-        _light("backscatter", "cd/m2", a.components.backscatter, a.gain),
+        _light("direct signal", "cd/m2", a.components.direct, a.gain, a.linear),
+        _light("backscatter", "cd/m2", a.components.backscatter, a.gain, a.linear),
         Panel("noise", "grey level", noise, noise.mean(axis=2), "mean of the bands", ("RdBu_r", -reach, reach)),
     ]
     if a.components.forward is not None:
-        panels.append(_light("forward scatter", "cd/m2", a.components.forward, a.gain))
+        panels.append(_light("forward scatter", "cd/m2", a.components.forward, a.gain, a.linear))
     if a.components.snow is not None:
-        panels.append(_light("marine snow", "cd/m2", a.components.snow, a.gain, 100.0))
+        panels.append(_light("marine snow", "cd/m2", a.components.snow, a.gain, a.linear, 100.0))
     return panels
 
 
 def _light(
-    title: str, unit: str, layer: NDArray[np.float32], gain: float, percentile: float = SHOWN_PERCENTILE
+    title: str,
+    unit: str,
+    layer: NDArray[np.float32],
+    gain: float,
+    linear: bool = True,
+    percentile: float = SHOWN_PERCENTILE,
 ) -> Panel:
     """Returns the colour panel of one light component.
 
@@ -111,18 +116,22 @@ def _light(
     or for gain 0 the value that is displayed as white.
 
     Args:
+        title, unit: name and unit of the component.
         layer: (H, W, 3) values of the component.
         gain: image brightness (fraction of full scale) per unit of the component; 0 if the image does not
             contain the component.
+        linear: whether the image is proportional to the radiance; if not, the note of the panel states that the
+            brightness is that before tone curve and white balance.
         percentile: percentile of the values that determines the scale.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:
         return Panel(title, unit, layer, np.zeros(layer.shape), "none")
     exposed = gain * top
+    image = "in the image" if linear else "in the image\nbefore tone curve and white balance"
     if 0.5 < exposed <= 1:
-        return Panel(title, unit, layer, layer * gain, "as bright as in the image")
-    note = f"{_factor(1 / exposed)} as bright as in the image" if gain else f"white = {_short(top)} {unit}"
+        return Panel(title, unit, layer, layer * gain, f"as bright as {image}")
+    note = f"{_factor(1 / exposed)} as bright as {image}" if gain else f"white = {_short(top)} {unit}"
     return Panel(title, unit, layer, layer / top, note)
 
 

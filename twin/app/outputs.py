@@ -17,6 +17,8 @@ _STEM_BYTES = 100
 def new_folder(folder: Path, option: str = "--out") -> Path:
     """Returns the folder. Raises TwinError unless it is new or empty and can be written."""
     _check_path(folder, option, "a new or an empty folder")
+    if folder.exists() and not folder.is_dir():
+        raise TwinError(option, f"{folder} is not a folder", "a new or an empty folder")
     if folder.exists() and not is_empty(folder):
         raise TwinError(option, f"{folder} is not empty", "a new or an empty folder")
     _check_writable(folder, option)

@@ -28,8 +28,10 @@ class _Coefficients(NamedTuple):
 
     Args:
         start: fixed cost of start and report.
-        frame, keyframe: cost per frame and per keyframe.
-        frame_mpx, keyframe_mpx: additional cost per frame and per keyframe for each megapixel of the image.
+        frame: cost per frame.
+        frame_mpx: additional cost per frame for each megapixel of the image.
+        keyframe: cost per keyframe.
+        keyframe_mpx: additional cost per keyframe for each megapixel of the image.
     """
 
     start: float

@@ -24,7 +24,18 @@ SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
 
 class StudyOptions(NamedTuple):
-    """Command-line options of `twin study` and `twin tune`."""
+    """Command-line options of `twin study` and `twin tune`.
+
+    Args:
+        out: folder to write; None: runs/study-NAME or runs/tune-NAME.
+        jobs: number of parallel surveys; None: one per core.
+        scheduler: where the surveys run (`open_engine`).
+        resume: run only surveys that are missing in the folder or failed.
+        live: print a line for each finished survey.
+        as_json: print only a summary, as JSON.
+        verify: number of rendered surveys that check the results or the recommended plan; None: the default.
+        extrapolate: fly surrogate surveys outside the fitted range of the error model.
+    """
 
     out: Path | None = None
     jobs: int | None = None
@@ -92,7 +103,9 @@ def run(file: str, options: StudyOptions) -> int:
         _print_result(study, result)
         if checked is not None:
             print(checked.sentence())
-    return exit_status(result) or int(checked is not None and not checked.agrees)
+    if checked is not None and checked.interrupted:
+        return checked.exit_status
+    return exit_status(result) or (0 if checked is None else checked.exit_status)
 
 
 def tune(file: str, options: StudyOptions) -> int:
@@ -126,7 +139,11 @@ def tune(file: str, options: StudyOptions) -> int:
 
 
 def load(file: str, options: StudyOptions) -> Study:
-    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it."""
+    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it.
+
+    Raises:
+        TwinError: the study file is invalid.
+    """
     study = load_study(file)
     if not options.extrapolate:
         return study

@@ -23,7 +23,7 @@ from twin.world.mission import Mission, prepare
 from twin.world.rendered_world import RenderedWorld
 
 _N_COMPARED = 3  # frames from the start whose images are rendered again with their noise
-_HIDDEN = 1.02  # a point is hidden in the next image if its depth exceeds this factor times the depth seen there
+_HIDDEN = 1.02  # a point is hidden in the next image if its depth exceeds this factor times all depths seen near it
 _LIGHT = {"lamp": "floor_lx", "direct": "direct", "forward": "forward", "veil": "backscatter", "snow": "snow"}
 
 
@@ -157,7 +157,7 @@ def floor_normals(
 
     Args:
         terrain: the floor.
-        depth_m: (H, W) depth of the floor along the optical axis; inf where there is none.
+        depth_m: (H, W) depth of the floor along the optical axis; inf where there is no floor.
         world_from_camera: (4, 4) pose of the camera.
         rig: calibration of the camera.
     """
@@ -187,7 +187,8 @@ def optical_flow(
         rig: calibration of both images.
 
     Returns:
-        Displacements; NaN where a point is outside the next image, hidden in it, or there is nothing.
+        Displacements; NaN where a point is outside the next image or there is nothing, and where the point is hidden:
+            more than 2 % deeper than all pixels of the next image in the 3 x 3 pixels around it.
     """
     shape = depth_m.shape
     known = np.isfinite(depth_m).ravel()

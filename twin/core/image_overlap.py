@@ -21,10 +21,9 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
     """Returns the overlap (n,) of pairs of images: the share of the floor in the first that the second shows too.
 
     The first image is tiled by a grid of cells. The floor point at the centre of each cell is found by ray casting; the
-    cell counts if this point projects into the second image and is not occluded there. A cell that the edge of the
-    second image cuts is weighted by its fraction inside. Cells whose ray meets no floor are left out. For two
-    down-looking images of a level floor with the same heading and altitude, the result is exactly the overlap of
-    their footprints.
+    cell is weighted by the fraction of it that projects into the second image, or by 0 if this point is occluded there.
+    Cells whose ray meets no floor are left out. For two down-looking images of a level floor with the same heading and
+    altitude, the result is exactly the overlap of their footprints.
 
     Args:
         field: the floor.
@@ -65,6 +64,10 @@ def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 
     Args:
+        field: the floor.
+        pose: (4, 4) world_from_camera of the second camera.
+        camera: fx, fy, cx, cy, width and height [px].
+        cell: width and height of a cell in the first image [px].
         x, y, z: floor point at the centre of the cell [m].
         depth: depth of this point in the first camera [m]; with the depth in the second camera, it gives the size of
             the cell in the second image.

@@ -18,6 +18,7 @@ def optional(module: str, extra: str, purpose: str) -> Any:
 
     Raises:
         TwinError: the package is not installed.
+        ModuleNotFoundError: another package, which the module imports, is not installed.
     """
     try:
         return import_module(module)

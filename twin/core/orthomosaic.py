@@ -9,7 +9,7 @@ import numpy as np
 
 from twin.core.records import Image, MapGrid
 
-#: Side of a tile [px]. A tile in progress takes 24 bytes per pixel, 110 MB.
+#: Side of a tile [px]. A tile in progress takes 24 bytes per pixel: with its margin, 114 MB.
 TILE_PX = 2048
 
 
@@ -45,9 +45,10 @@ def tile_side_px(n: int) -> int:
 
 
 def mean_colours(tile: OrthoTile, n: int) -> Image:
-    """Returns the mean colours (rows / n, cols / n, 3) of squares of n x n pixels.
+    """Returns the mean colours (rows // n, cols // n, 3) of squares of n x n pixels.
 
-    Only known pixels count; a square without known pixels is black.
+    Only known pixels count; a square without known pixels is black. Incomplete squares at the east and south edges of
+    the tile are left out.
     """
     rows, cols = (size // n for size in tile.rgba.shape[:2])
     squares = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4).astype(np.float32)

@@ -70,10 +70,10 @@ class EstimationQuality(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """A failed self-check of the estimators: a reason why the result of a survey must not be trusted.
+    """A failed check of the estimates: a reason why the result of a survey must not be trusted.
 
     Args:
-        check: short name of the check, a key of metrics.json.
+        check: short name of the check, as in log.jsonl.
         value: measured value.
         limit: largest (or smallest) value that passes the check.
         sentence: the finding in words.

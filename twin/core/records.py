@@ -82,17 +82,22 @@ class StereoRig:
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
-        """Returns the calibration of images in which blocks of `by` x `by` pixels are averaged to one pixel."""
+        """Returns the calibration of images in which blocks of `by` x `by` pixels are averaged to one pixel.
+
+        Columns at the right border and rows at the lower border that do not fill a block are cut off.
+        """
         if by == 1:
             return self
-        centre = self.principal_point_px
+        divisible = self.width_px % by == 0 and self.height_px % by == 0
+        has_default = self.principal_point_px is None and divisible
+        centre = (self.cx_px + 0.5) / by - 0.5, (self.cy_px + 0.5) / by - 0.5
         return replace(
             self,
             width_px=self.width_px // by,
             height_px=self.height_px // by,
             focal_px=self.focal_px / by,
             focal_y_px=None if self.focal_y_px is None else self.focal_y_px / by,
-            principal_point_px=centre and ((centre[0] + 0.5) / by - 0.5, (centre[1] + 0.5) / by - 0.5),
+            principal_point_px=None if has_default else centre,
         )
 
     def with_square_pixels(self) -> StereoRig:
@@ -105,7 +110,7 @@ class StereoRig:
         return replace(self, height_px=height, focal_y_px=None, principal_point_px=centre)
 
     def project(self, points: Array) -> Array:
-        """Returns the projections (n, 2) [px] of points (n, 3) [m] in the left camera; NaN for points behind it."""
+        """Returns the projections (n, 2) [px] of points (n, 3) [m] in the left camera; NaN for depths up to 1 mm."""
         depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
         return points[:, :2] / depth_m * self.focals_px + [self.cx_px, self.cy_px]
 
@@ -273,9 +278,9 @@ class Alignment(NamedTuple):
     Args:
         track: last track of the window.
         ms: wall time [ms].
-        nodes, edges: number of nodes (including fixed ones) and of links.
+        nodes, edges: number of nodes (including fixed ones) and of links (including rejected ones).
         dropped: number of links rejected as outliers.
-        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected.
+        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected; 0 without links.
     """
 
     track: int
@@ -294,9 +299,11 @@ class StereoObservation(NamedTuple):
         n_points: number of matched points; with the surrogate, the number predicted by its error model.
         contrast: local RMS contrast of the left image (`matching.contrast`); None without an image.
         saturated: fraction of the pixel values of the left image at full scale; None without an image.
-        row_offset_px: median row difference of the matched points, right minus left [px]; None without an image.
-        row_spread_px: robust standard deviation of the row differences [px]; None without an image.
-        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None without an image.
+        row_offset_px: median row difference of the matched points, right minus left [px]; None without points of an
+            image.
+        row_spread_px: robust standard deviation of the row differences [px]; None without points of an image.
+        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None without points of
+            an image.
         repetition: largest autocorrelation of the left image away from its main peak; None without an image.
     """
 
@@ -311,7 +318,7 @@ class StereoObservation(NamedTuple):
 
     @property
     def row_spread_ratio(self) -> float | None:
-        """Returns the scatter of the row differences / their expected standard deviation; None without an image."""
+        """Returns the spread of the row differences / their expected standard deviation; None if one is not known."""
         return self.row_spread_px / self.row_sigma_px if self.row_spread_px is not None and self.row_sigma_px else None
 
 
@@ -352,7 +359,7 @@ class SurveyResult:
 
     @property
     def step_cov(self) -> Array:
-        """(n_keyframes, 6, 6) covariance of the motion from the previous keyframe to each one; zeros without a link."""
+        """Returns the covariance (n_keyframes, 6, 6) of the link from the previous keyframe to each one, else zeros."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))
         chain = self.links.j == self.links.i + 1
         cov[self.links.j[chain]] = self.links.own_cov[chain]
@@ -401,6 +408,10 @@ class ElevationMap:
     sigma_m: NDArray[np.float32]
     mosaic: Image
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
+
+    def to_world(self, points: Array) -> Array:
+        """Returns points (n, 3) of the map frame in the world [m]."""
+        return geometry.transform(geometry.inverse(self.map_from_world), points)
 
 
 @dataclass

@@ -27,7 +27,8 @@ class EstimatorSettings:
         use_f2m: whether to register keyframes with the mosaic (F2M).
         use_ga: whether to align the network globally (GA) at the end of each track and of the survey.
         points: largest number of matched points of a keyframe.
-        patch_px: side of the matching window, the same for stereo and for motion [px]; odd.
+        patch_px: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an
+            even value, it is one pixel larger.
         keyframe_overlap: a frame becomes a keyframe if its overlap with the last keyframe is below this fraction; used
             only if the caller does not choose the keyframes.
         wide_search: whether a link that cannot be measured from the predicted poses is searched for in the whole

@@ -36,12 +36,12 @@ class Stopwatch:
         return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
 
     def summary(self) -> dict[str, dict[str, float | int | None]]:
-        """Returns count, mean and 95th percentile [ms] and total [s] of every stage."""
+        """Returns count, mean and 95th percentile [ms] and total [s] of each stage in `STAGES`."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
 
 
 def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns simulated or recorded time and wall time [s], peak memory [MiB], and the durations of the stages."""
+    """Returns wall time and simulated or recorded time [s], peak memory [MiB], and the durations of the stages."""
     return {
         "wall_s": wall_s,
         "simulated_s": simulated_s,

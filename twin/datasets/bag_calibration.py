@@ -100,7 +100,11 @@ def _ancestors(transforms: Transforms, frame: str) -> dict[str, Array]:
 
 
 def _camera(info: Any, rectified: bool, file: Path) -> RecordedCamera:
-    """Returns the camera of a message CameraInfo; raises TwinError if its lens model is not supported."""
+    """Returns the camera of a message CameraInfo.
+
+    Raises:
+        TwinError: the images are not rectified, and the lens model or a part of the images is not supported.
+    """
     size = (int(info.width), int(info.height)) if info.width and info.height else None
     if rectified:
         return RecordedCamera(size, np.array(info.p, float).reshape(3, 4)[:, :3], np.zeros(0))

@@ -75,7 +75,7 @@ class BagImage:
         return int(message.width), int(message.height)
 
     def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
-        """Returns the values of the image, (H, W) or (H, W, 3) in the order BGR, uint8 or uint16.
+        """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
 
         Args:
             size_px: (width, height) that the image must have.

@@ -19,7 +19,7 @@ from twin.datasets.bag_calibration import (
 from twin.datasets.bag_images import BagImage
 from twin.datasets.bag_topics import StereoTopics, image_topics, stereo_topics
 from twin.datasets.calibration import StereoCalibration
-from twin.datasets.dataset import Dataset, ImageTime, pair_by_time
+from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
 from twin.errors import TwinError
 
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -67,7 +67,7 @@ class BagReader:
         """Returns the data set in a bag; images are decoded only when they are used.
 
         Raises:
-            TwinError: the bag, its calibration or its true poses are damaged, or its image topics are ambiguous.
+            TwinError: the bag, its transforms or its true poses are damaged, or its image topics are ambiguous.
         """
         bag = Bag(folder)
         topics = self._stereo_topics(bag)
@@ -79,7 +79,7 @@ class BagReader:
         left, right = (_image_times(bag, index[topic]) for topic in (topics.left, topics.right))
         frames, n_right_only = pair_by_time(left, right)
         transforms = _static_transforms(bag)
-        calibration = _calibration(bag, topics, transforms)
+        calibration = value_or_error(lambda: _calibration(bag, topics, transforms))
         truth = None
         if self._topics.truth is not None:
             truth, note = _truth(bag, self._topics.truth, _frame(bag, topics.left), transforms)
@@ -109,7 +109,11 @@ def _image_times(bag: Bag, positions: list[BagMessage]) -> list[ImageTime]:
 
 
 def _calibration(bag: Bag, topics: StereoTopics, transforms: Transforms) -> StereoCalibration | None:
-    """Returns the calibration in the messages CameraInfo; None if one of the cameras has none."""
+    """Returns the calibration in the messages CameraInfo; None if one of the cameras has none.
+
+    Raises:
+        TwinError: the calibration cannot be used.
+    """
     if topics.left_info is None or topics.right_info is None:
         return None
     left, right = bag.first(topics.left_info), bag.first(topics.right_info)
@@ -174,7 +178,8 @@ def _truth(bag: Bag, topic: str, camera: str, transforms: Transforms) -> tuple[T
             f"/tf_static does not join the frame {body[:60]!r} of the poses and {camera[:60]!r} of the left camera"
         )
         raise TwinError(str(source), problem, "a truth of the left camera, or static transforms")
-    note = "" if body else f"The poses of {topic} name no frame; they were taken as those of the left camera."
+    unnamed = f"The poses of {topic}" if not body else "The left images" if not camera else ""
+    note = f"{unnamed} name no frame; the poses were taken as those of the left camera." if unnamed else ""
     times_s = np.array(times_ns)[order] * 1e-9
     return Trajectory(times_s, np.array(found)[order] @ body_from_left), note
 

@@ -100,7 +100,7 @@ def is_rigid(pose: Array) -> bool:
 def _check_baseline(file: str, calibration: StereoCalibration) -> None:
     """Raises TwinError unless the right camera lies to the right of the left one, at a possible distance."""
     baseline_m = calibration.baseline_m
-    # position of the right camera in the axes half-way between the cameras
+    # position of the right camera in the axes of the left one
     x, y, z = -(calibration.right_from_left[:3, :3].T @ calibration.right_from_left[:3, 3])
     if baseline_m < 1e-4:
         raise TwinError(file, "has no baseline: both cameras are at the same place", "a distance between the cameras")

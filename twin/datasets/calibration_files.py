@@ -20,8 +20,8 @@ _DISTORTION_KEYS = [("d1", "distcoeffs1", "leftdistortion"), ("d2", "distcoeffs2
 _SIZE_KEYS = ("imagesize", "size", "resolution")
 _FISHEYE = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannala_brandt")
 _RADTAN = ("radtan", "plumb_bob", "radial-tangential", "rational_polynomial", "pinhole", "none", "opencv")
-#: COLMAP camera models: positions of fx, fy, cx, cy in their parameters, and of the OpenCV coefficients of distortion
-#: (None: zero).
+#: COLMAP camera models: positions of fx, fy, cx, cy in their parameters, positions of the OpenCV coefficients of
+#: distortion (None: zero), and kind of distortion.
 _COLMAP: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...], str]] = {
     "SIMPLE_PINHOLE": ((0, 0, 1, 2), (), "radtan"),
     "PINHOLE": ((0, 1, 2, 3), (), "radtan"),
@@ -34,8 +34,9 @@ _COLMAP: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...], str]
 
 
 def read_calibration(file: Path) -> StereoCalibration:
-    """Returns the calibration of a file: OpenCV YAML, Kalibr camchain YAML, or COLMAP cameras.txt with rigs.txt in
-    the same folder.
+    """Returns the calibration of a file: OpenCV YAML, Kalibr camchain YAML, or COLMAP cameras.txt.
+
+    The rig of the cameras in cameras.txt is read from rigs.txt in the same folder.
 
     Raises:
         TwinError: the file cannot be read, is of an unknown kind, or its values are impossible.
@@ -145,7 +146,7 @@ def _colmap(file: Path) -> StereoCalibration:
     rigs = file.with_name("rigs.txt")
     if len(cameras) < 2 or not rigs.is_file():
         raise TwinError(str(file), "has no baseline", "two cameras, and their rig in rigs.txt beside this file")
-    number, parts = text_rows(rigs)[0]
+    number, parts = next(iter(text_rows(rigs)), (1, list[str]()))
     try:
         reference, second = int(parts[3]), int(parts[5])
         quaternion, translation = np.array(parts[7:11], float), np.array(parts[11:14], float)

@@ -16,13 +16,14 @@ from twin.datasets.calibration import StereoCalibration
 from twin.datasets.image_files import ImageSource
 from twin.errors import TwinError
 
-#: Largest time between the two images of a stereo pair, as a fraction of the median interval between left images [s].
+#: Largest time between the two images of a stereo pair: as a fraction of the median interval between left images, and
+#: absolute [s].
 _PAIR_SHARE, _PAIR_MOST_S = 0.25, 0.01
 T = TypeVar("T")
 
 
 class ImageTime(NamedTuple):
-    """An image and the time of its exposure [s], in the clock of the data set."""
+    """Time of an exposure [s], in the clock of the data set, and its image."""
 
     time_s: float
     file: ImageSource

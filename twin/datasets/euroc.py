@@ -15,11 +15,16 @@ from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_err
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
-_TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0", "leica0")
+_TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0")  # folders with true poses
+_POSITIONS = "leica0"  # folder with true positions of a prism, without attitude
 
 
 class EurocReader:
-    """Reads EuRoC/ASL folders: times in nanoseconds, sensor poses relative to the body, true poses of the body."""
+    """Reads folders in the EuRoC/ASL format.
+
+    The files have times in nanoseconds, poses of the sensors relative to the body, and true poses of the body; the data
+    set has times in seconds and true poses of the left camera.
+    """
 
     name = "euroc"
     layout = "mav0/cam0 and mav0/cam1, each with data.csv, data/ and sensor.yaml"
@@ -42,6 +47,8 @@ class EurocReader:
             truth = value_or_error(lambda: camera_truth(file, body_from_left))
         elif file is not None:
             notes = (f"The true poses ({file.parent.name}) are not used: the pose of cam0 in the body is unknown.",)
+        elif (root / _POSITIONS / "data.csv").is_file():
+            notes = (f"The true positions ({_POSITIONS}) are not used: they have no attitude.",)
         times_s = np.array([image.time_s for image in left])
         return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left)
 

@@ -14,7 +14,7 @@ from twin.datasets.image_files import Bayer, ImageSource, UnreadableImage, image
 from twin.datasets.rectification import Rectification, rectification
 from twin.errors import TwinError
 
-_NOMINAL_HZ = 1.0  # frame rate of a data set with a single frame
+_NOMINAL_HZ = 1.0  # frame rate of a data set without two frames at different times
 
 
 class RecordedFrames:
@@ -31,7 +31,7 @@ class RecordedFrames:
         skipped: number of frames or right images that could not be used, by reason, filled while the frames are read.
 
     Raises:
-        TwinError: no image can be read, or the calibration is that of images of another size.
+        TwinError: no left image can be read, or the calibration does not fit the images or cannot be rectified.
     """
 
     def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
@@ -85,7 +85,7 @@ class RecordedFrames:
         """Returns the first frame with both images.
 
         Raises:
-            TwinError: there is none.
+            TwinError: no frame has both images.
         """
         for frame in self:
             if frame.right is not None:
@@ -95,7 +95,7 @@ class RecordedFrames:
 
 
 def _first_size(dataset: Dataset) -> tuple[int, int]:
-    """Returns (width, height) of the first readable left image [px]; raises TwinError if there is none."""
+    """Returns (width, height) of the first readable left image [px]; raises TwinError if no image is readable."""
     problem = ""
     for frame in dataset.images:
         try:
@@ -106,7 +106,7 @@ def _first_size(dataset: Dataset) -> tuple[int, int]:
 
 
 def _frame_rate_hz(dataset: Dataset) -> float:
-    """Returns the frame rate, from the median of the positive intervals between the frames [Hz]."""
+    """Returns the frame rate [Hz] from the median of the positive intervals between the frames; 1 Hz without any."""
     intervals = np.diff([frame.time_s for frame in dataset.images])
     intervals = intervals[intervals > 0]
     return 1 / float(np.median(intervals)) if len(intervals) else _NOMINAL_HZ

@@ -57,7 +57,7 @@ class StoredImage(Protocol):
         ...
 
     def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
-        """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR, uint8 or uint16.
+        """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
 
         Args:
             size_px: (width, height) that the image must have.
@@ -99,7 +99,7 @@ def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) ->
         form: number of bits and Bayer pattern.
 
     Raises:
-        UnreadableImage: the file is missing, truncated, no image, or has another size.
+        UnreadableImage: the file is missing, damaged, no image, of an unknown format of values, or has another size.
     """
     pixels = _pixels(image, size_px)
     if pixels.dtype == np.uint16:
@@ -144,7 +144,7 @@ def _header(data: bytes) -> tuple[int, int, str]:
     """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it.
 
     Raises:
-        UnreadableImage: the data are no PNG, JPEG or TIFF image.
+        UnreadableImage: the data are not a PNG, JPEG or TIFF image, or the image is too large.
     """
     try:
         with warnings.catch_warnings():
@@ -156,7 +156,7 @@ def _header(data: bytes) -> tuple[int, int, str]:
 
 
 def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR, uint8 or uint16."""
+    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16."""
     return decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
 
 
@@ -168,14 +168,17 @@ def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
         size_px: (width, height) that the image must have.
 
     Returns:
-        (H, W) or (H, W, channels) in the order BGR, uint8 or uint16.
+        (H, W) or (H, W, channels) in the order BGR or BGRA, uint8 or uint16.
 
     Raises:
-        UnreadableImage: the data are truncated, no image, or have another size.
+        UnreadableImage: the data are damaged, no image, of an unknown format of values, or have another size or too
+            many pixels.
     """
     width, height, kind = _header(data)
-    if (width, height) != size_px or width * height > _MOST_PIXELS:
+    if (width, height) != size_px:
         raise UnreadableImage("another size")
+    if width * height > _MOST_PIXELS:
+        raise UnreadableImage(f"more than {_MOST_PIXELS} pixels")
     if kind in _ENDS and not data.rstrip(b"\0").endswith(_ENDS[kind].rstrip(b"\0")):
         raise UnreadableImage("truncated")
     try:

@@ -85,7 +85,8 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
         topics: topics of a ROS 2 bag that the user names.
 
     Raises:
-        TwinError: the folder is empty or has no known layout, or a file of the data set is damaged.
+        TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera, or a
+            file of the data set is damaged.
     """
     if not folder.exists():
         raise TwinError(str(folder), "does not exist", "the folder or the bag of a data set")

@@ -136,7 +136,8 @@ def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
 def _resampled(image: Image, maps: _Maps | None) -> Image:
     """Returns the image resampled at the positions of the maps by cubic interpolation, black outside the image.
 
-    Without maps, returns the image unchanged."""
+    Without maps, returns the image unchanged.
+    """
     if maps is None:
         return image
     return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -69,8 +69,15 @@ class ReplayOptions:
 
 
 class ReplayResult(NamedTuple):
-    """Outcome of a replay: status "complete", "degraded" or "aborted", its metrics (metrics.json), its run folder, the
-    result of the estimators and the map (None if none was built)."""
+    """Outcome of a replay.
+
+    Args:
+        status: "complete", "degraded" or "aborted".
+        metrics: contents of metrics.json.
+        folder: the run folder.
+        result: result of the estimators.
+        elevation: the map; None if none was built.
+    """
 
     status: str
     metrics: dict[str, Any]
@@ -120,7 +127,8 @@ def replay(
         progress: called with the stage ("replay", "map" or "report") and its completed fraction.
 
     Raises:
-        TwinError: the data set or one of its files cannot be used; nothing was written.
+        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder cannot be
+            written.
     """
     chosen = options or ReplayOptions()
     opened = open_dataset(folder, chosen)
@@ -312,6 +320,8 @@ def _timing(start_s: float, result: SurveyResult, stopwatch: Stopwatch) -> dict[
 
     Args:
         start_s: value of `time.perf_counter` at the start of the replay [s].
+        result: result of the estimators, which has the recorded times.
+        stopwatch: durations of the stages.
     """
     times_s = result.online.times_s
     recorded_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0

@@ -117,13 +117,19 @@ def text_rows(file: Path) -> list[tuple[int, list[str]]]:
     """Returns the line number and the columns of each line of a text file, without blank lines and comments (#).
 
     Columns are separated by commas or white space.
+
+    Raises:
+        TwinError: the file cannot be read, or a column is longer than 131072 characters.
     """
     lines = read_text(file).splitlines()
-    return [
-        (number, next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split())
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    try:
+        return [
+            (number, next(csv.reader([line], skipinitialspace=True)) if "," in line else line.split())
+            for number, line in enumerate(lines, 1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+    except csv.Error as error:
+        raise TwinError(str(file), f"cannot be read: {error}", "columns separated by commas or white space") from None
 
 
 def inside(folder: Path, name: str, source: Path) -> Path:

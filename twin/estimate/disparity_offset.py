@@ -1,11 +1,11 @@
 """Offset that all disparities share, estimated from the motions between keyframes.
 
-An error of a principal point along the rows of the image (or a yaw of one camera) adds the same offset to all
-disparities, and leaves all rows as they are. Depths, and with them the lengths of all motions, are then wrong. Over a
-floor with relief the offset is visible: near points must move by more pixels than far points, in proportion to their
-disparities, which they do not if there is an offset. Over a level floor the offset is not observable: errors of a
-hundredth of a pixel that all matches share then appear as an offset of several pixels, and the scatter of the links
-does not show them.
+An error of a principal point along the rows of the image adds the same offset to all disparities, and leaves all rows
+as they are; so, nearly, does a small yaw of one camera. Depths, and with them the lengths of all motions, are then
+wrong. Over a floor with relief the offset is visible: near points must move by more pixels than far points, in
+proportion to their disparities, which they do not if there is an offset. Over a level floor the offset is not
+observable: errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the
+scatter of the links does not show them.
 """
 
 from __future__ import annotations

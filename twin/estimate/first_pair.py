@@ -61,7 +61,8 @@ class FloorPlane(NamedTuple):
     def world_from_camera(self) -> Array:
         """Returns the pose (4, 4) of the camera in a world whose plane z = 0 is the floor plane.
 
-        The origin is the foot of the perpendicular from the camera; x is the direction of the image rows.
+        The origin is the foot of the perpendicular from the camera; x is the direction of the image rows, projected
+        onto the plane.
         """
         along = np.array([1.0, 0, 0]) - self.normal[0] * self.normal
         x = along / np.linalg.norm(along)
@@ -78,7 +79,7 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
     Args:
         frame: frame with both images.
         rig: believed calibration.
-        settings: settings of the estimators, for the number of points and the patch size.
+        settings: settings of the estimators, for the number of points and the patch size; None: the defaults.
     """
     assert frame.right is not None
     chosen, square, scale = settings or EstimatorSettings(), rig.with_square_pixels(), rig.fx_px / rig.fy_px
@@ -102,10 +103,11 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
     """Returns the plane of the floor through the matched points of a pair; None for too few points.
 
-    The plane through three points with the smallest median distance of all points (least median of squares,
-    Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard deviations. Where the points
-    scatter by more than 15 % of their median depth, or the plane is seen at more than 45 degrees from its normal (a
-    wall, a horizon), the plane perpendicular to the optical axis at the median depth takes its place.
+    Of the planes through 300 random triples of points, that with the smallest median distance of all points (least
+    median of squares, Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard
+    deviations. Where the points scatter by more than 15 % of their median depth, or the optical axis is more than 45
+    degrees from the normal of the plane (a wall, a horizon), the plane perpendicular to the optical axis at the median
+    depth is returned instead.
 
     Args:
         points: matched points (`PairInspection.points`).

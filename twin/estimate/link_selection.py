@@ -73,8 +73,8 @@ def choose_links(
 
     Up to `max_links` candidates with sufficient overlap are selected, in this order of priority: the two previous
     nodes; the oldest node of the same swath, for the greatest distance along the path; the oldest node of all other
-    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, with direct neighbours of already
-    selected ones at the end.
+    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, except that those whose keyframe
+    number differs by 1 from that of an already selected one of them come last.
 
     Args:
         node: the new node.
@@ -157,8 +157,12 @@ def _unbroken(linked: list[int], newest: int) -> list[int]:
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
     """Returns up to `count` of the indices `others` in their order, except that neighbours of chosen nodes come last.
 
+    Neighbours are nodes whose keyframe numbers differ by 1.
+
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
+        earlier: candidate nodes in chronological order.
+        count: largest number of indices.
     """
     chosen: list[int] = []
     for k in others:

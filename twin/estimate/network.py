@@ -84,11 +84,12 @@ class AlignmentHistory:
         after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
         link_residuals: for each attempted link measurement, the residual of the points divided by the expected one;
             NaN where the measurement failed.
-        nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
-            failed), because the link could not be measured.
-        disparity_offsets: for each measured link, the offset of all disparities that its points imply.
+        disparity_offsets: for each measured link, the offset of all disparities that its points imply; links that do
+            not determine an offset are left out.
         frame_sigmas_m: for each keyframe after the first, the standard deviation (3-D) of the translation since the
             previous keyframe, from frame-to-frame motion alone [m].
+        nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
+            failed), because the link could not be measured.
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -150,7 +151,11 @@ class KeyframeNetwork:
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
 
     def link_to_last_node(self, node: Keyframe) -> Link | None:
-        """Returns the measured link from the last node to a new one; None for the first node or if matching fails."""
+        """Returns the measured link from the last node to a new one; None for the first node or if matching fails.
+
+        Raises:
+            OSError: images could not be read or written.
+        """
         if not self.nodes:
             return None
         last = self.nodes[-1]
@@ -197,17 +202,18 @@ class KeyframeNetwork:
 
         Returns:
             (6, 6) marginal covariance of the pose of the last node [rotation, translation] (rad, m), in its camera
-            axes; None if the global alignment is switched off or there are fewer than two nodes.
+            axes; None if the global alignment is switched off, there are fewer than two nodes, or none of them lies in
+            the window.
 
         Raises:
             SurveyAborted: the alignment failed.
             OSError: images could not be read or written.
         """
-        if not self.settings.use_ga or len(self.nodes) < 2:
+        first = track - self.settings.window_tracks
+        if not self.settings.use_ga or len(self.nodes) < 2 or self.nodes[-1].track < first:
             return None
         self.history.before_ga.append(self.poses[:, :3, 3].copy())
         self._collect_links()
-        first = track - self.settings.window_tracks
         with self.stopwatch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
         self.vision.rebuild_mosaic([k for k in self.keyframes if k.track >= track])
@@ -218,7 +224,7 @@ class KeyframeNetwork:
         return aligned.covs[-1]
 
     def align_all(self) -> Array | None:
-        """Aligns all nodes.
+        """Aligns all nodes by the links measured so far; `truncate` waits for those in progress.
 
         Returns:
             (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the pose of the latest node up to this
@@ -243,7 +249,8 @@ class KeyframeNetwork:
     def truncate(self, n_frames: int) -> None:
         """Removes the keyframes, nodes and links of all frames after the first `n_frames`.
 
-        Keyframes of later frames exist if an interrupt stopped the processing of a frame.
+        Waits for the link measurements in progress. Keyframes of later frames exist if an interrupt stopped the
+        processing of a frame.
 
         Raises:
             OSError: images could not be read or written; the network is incomplete and `align_all` returns None.

@@ -79,7 +79,8 @@ class Navigator:
             origin with its optical axis along -z of the world. If the frames have readings of height or attitude, the
             z axis of the world must point up.
         readings_noise: believed noise of the navigation sensors whose readings come with the frames.
-        vision: source of the visual measurements; by default, these are computed from the images of the frames.
+        vision: source of the visual measurements, closed by the caller; by default, they are computed from the images
+            of the frames.
         folder: folder for keyframe images and the mosaic while the survey runs; by default a temporary folder.
         stopwatch: returns the context manager that times the stage of a given name.
     """
@@ -125,7 +126,7 @@ class Navigator:
         last keyframe is below `settings.keyframe_overlap`. A pair with too few matched points does not become one.
 
         Args:
-            frame: images and sensor readings of the frame.
+            frame: images and sensor readings of the frame; later than all previous frames.
             track: number of the track, from 1; `align_track` aligns a window of tracks.
 
         Raises:
@@ -211,6 +212,9 @@ class Navigator:
 
         Returns:
             The map, or None if there is no keyframe.
+
+        Raises:
+            OSError: an image could not be read.
         """
         n_keyframes = len(result.keyframe_rows)
         if n_keyframes == 0:
@@ -241,6 +245,9 @@ class Navigator:
             elevation: map of the survey (`build_map`).
             restore: removes the effects of lamps and water from an image; None: colours as seen, at equal exposure.
             progress: called with the finished fraction, 0 to 1.
+
+        Raises:
+            OSError: an image could not be read; also while the tiles are computed.
         """
         rows = result.keyframe_rows
         if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
@@ -263,7 +270,7 @@ class Navigator:
         failed = np.isnan(residuals)
         nodes = self.network.nodes
         poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
-        n_views = disparity_offset.mean_views(poses, depth_m, self.rig)
+        n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
         return EstimationQuality(
             frames_lost=self.log.n_lost,
             nodes_bridged=history.nodes_bridged,
@@ -304,7 +311,10 @@ class Navigator:
         return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
 
     def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s]; the nominal interval if the two differ by rounding only."""
+        """Returns the time since the last frame [s].
+
+        The nominal interval is returned at the first frame, and where the two differ by rounding only.
+        """
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
@@ -320,7 +330,8 @@ class Navigator:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
 
         Returns:
-            `status`, or the reason why the frame did not become a keyframe.
+            `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
+            motion of a frame that tracking has lost is measured by the link from the last node.
         """
         row = len(self.log)
         points = self.vision.observe_stereo(frame, row)

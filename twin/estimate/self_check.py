@@ -45,7 +45,7 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Checks the fractions of lost frames and failed links, and that every node is linked to the previous one."""
+    """Yields a finding for lost frames, one for nodes not linked to the previous node, and one for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -61,7 +61,7 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:
-    """Yields a finding if stereo pairs have too few matched points, and if the texture repeats."""
+    """Yields a finding if stereo pairs have too few matched points, and one if the texture repeats."""
     pairs = result.stereo_observations
     if not pairs:
         return

@@ -118,7 +118,7 @@ class StereoVision:
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
     def _interval_s(self, time_s: float) -> float | None:
-        """Returns the time since the last frame [s]; None at the first frame."""
+        """Returns the time since the last frame [s]; None at the first frame, or if the time has not increased."""
         last, self._last_s = self._last_s, time_s
         return time_s - last if time_s > last else None
 
@@ -283,6 +283,6 @@ def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
 
 
 def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Returns the depth (H, W) [m]; NaN where the disparity is unknown or below one pixel."""
+    """Returns the depth (H, W) [m]; NaN where the disparity is unknown or not above one pixel."""
     usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
     return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)

@@ -21,6 +21,8 @@ from twin.estimate.vision.two_view_motion import Motion
 class Vision(Protocol):
     """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
 
+    The methods raise OSError if images or the mosaic could not be read from disk or written to it.
+
     Attributes:
         stereo_observations: image quality and number of matched points of every stereo pair so far.
         runs_in_background: whether `measure_motions` takes long enough to justify a separate thread.
@@ -101,8 +103,5 @@ class Vision(Protocol):
         """Returns the left image (H, W, 3) of the keyframe at frame index `row`, with square pixels.
 
         None if the implementation has no images.
-
-        Raises:
-            OSError: the image could not be read.
         """
         ...

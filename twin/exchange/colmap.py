@@ -66,12 +66,7 @@ def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
     z, colours = elevation.height_m[::stride, ::stride].astype(np.float64), elevation.mosaic[::stride, ::stride]
     known = np.isfinite(z)
     points = np.column_stack([x[::stride, ::stride][known], y[::stride, ::stride][known], z[known]])
-    return points @ geometry.inverse(elevation.map_from_world)[:3, :3].T + _origin(elevation), colours[known]
-
-
-def _origin(elevation: ElevationMap) -> Array:
-    """Returns the origin (3,) of the map frame in the world [m]."""
-    return geometry.inverse(elevation.map_from_world)[:3, 3]
+    return elevation.to_world(points), colours[known]
 
 
 def _views(

@@ -94,7 +94,9 @@ class EurocWriter:
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes images, calibration, sensor readings and the truth, if known, into `folder`/mav0; returns that path.
+    """Writes images, calibration, sensor readings and the truth, if known, into `folder`/mav0.
+
+    Returns the path of mav0, as a list of one.
 
     The readings are those of the pressure sensor, AHRS, DVL and USBL that were recorded. The truth consists of the
     poses of the body at all frames of the survey, including those without a recorded image.

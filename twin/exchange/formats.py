@@ -29,7 +29,7 @@ def chosen_formats(names: Sequence[str]) -> list[str]:
     Each element of `names` is the name of a format, or several names separated by commas.
 
     Raises:
-        TwinError: a name is unknown, or there is none.
+        TwinError: a name is unknown, or no format is named.
     """
     parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
     for part in parts:

@@ -32,6 +32,7 @@ LOCAL_METRES = CRS.from_wkt(
 
 _ORIGIN_TAGS = ("SCENE_ORIGIN_EASTING", "SCENE_ORIGIN_NORTHING", "SCENE_ORIGIN_ELEVATION_M")
 _UNIT_TAG = "SCENE_METRES_PER_UNIT"
+_UNKNOWN_DATUM = "same as the source DEM"  # tag of a vertical datum that the source does not name
 _ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include the elevation of the scene origin
 _DECIMALS = 6  # to which scene coordinates [m] are rounded; CRS coordinates have up to seven digits before the point
 
@@ -161,14 +162,15 @@ def read_georeference(path: Path) -> Georeference | None:
         if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
             return None
         easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
-        unit_m, datum = float(tags[_UNIT_TAG]), tags.get("VERTICAL_DATUM", "")
+        unit_m, datum = float(tags[_UNIT_TAG]), tags.get("VERTICAL_DATUM", _UNKNOWN_DATUM)
     except (OSError, ValueError) as error:
         raise TwinError(str(path), f"cannot be read: {error}", "a map file, written by `twin run`") from None
+    datum = "" if datum == _UNKNOWN_DATUM else datum
     return Georeference(easting, northing, elevation_m, None if crs is None else crs.to_wkt(), unit_m, datum)
 
 
 def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeference:
-    """Returns the georeference of a scene whose origin lies at given coordinates of a projected CRS.
+    """Returns the georeference of a scene, given the coordinates of its origin in a projected CRS.
 
     Args:
         crs: CRS as `EPSG:CODE`, WKT or PROJ text, with metres or another unit of length.
@@ -215,5 +217,5 @@ def placement_tags(georeference: Georeference | None) -> dict[str, str]:
         return {}
     origin = (georeference.easting, georeference.northing, georeference.elevation_m)
     tags = {name: repr(value) for name, value in zip(_ORIGIN_TAGS, origin, strict=True)}
-    datum = georeference.vertical_datum or "same as the source DEM"
+    datum = georeference.vertical_datum or _UNKNOWN_DATUM
     return tags | {_UNIT_TAG: repr(georeference.metres_per_unit), "VERTICAL_DATUM": datum}

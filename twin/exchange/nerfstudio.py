@@ -15,8 +15,9 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes transforms.json and `images`, with the true poses, or the final ones without a truth.
+    """Writes transforms.json and `images`, and returns the paths of both.
 
+    The poses are the true ones, or the final ones without a truth.
     Images of both cameras are listed with their own intrinsics. If the true calibration is known, the intrinsics and
     the pose of the right camera relative to the left one are the true ones, otherwise the believed ones. nerfstudio has
     the corner of the first pixel at (0, 0), so the principal point is larger by 0.5 px than in OpenCV.
@@ -45,4 +46,4 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         contents.progress((k + 1) / len(contents.frames))
     file = folder / "transforms.json"
     file.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1), encoding="utf-8")
-    return [file]
+    return [file, folder / "images"]

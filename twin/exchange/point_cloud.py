@@ -18,7 +18,7 @@ from twin.core.records import ElevationMap, Image
 from twin.exchange import geotiff
 from twin.exchange.run_contents import RunContents
 
-_FINEST_M, _STEPS = 1e-6, 2**30  # resolution of LAS coordinates, and the largest integer that is used for them
+_FINEST, _STEPS = 1e-6, 2**30  # resolution of LAS coordinates [unit of the CRS], and largest integer for an extent
 _POINT_FORMAT = 7  # LAS 1.4 with RGB
 _EIGHT_TO_SIXTEEN_BITS = 257  # 255 * 257 = 65535
 
@@ -61,9 +61,10 @@ def point_cloud(elevation: ElevationMap, georeference: Georeference | None = Non
     known = np.isfinite(elevation.height_m)
     x, y = np.meshgrid(*elevation.grid.centres())
     origin = georeference or Georeference(0.0, 0.0)
-    easting, northing = origin.from_scene(x[known], y[known])
-    height_m = elevation.height_m[known].astype(np.float64) + origin.elevation_m
-    points = np.column_stack([easting, northing, height_m])
+    cells = np.column_stack([x[known], y[known], elevation.height_m[known].astype(np.float64)])
+    east, north, up = elevation.to_world(cells).T
+    easting, northing = origin.from_scene(east, north)
+    points = np.column_stack([easting, northing, up + origin.elevation_m])
     return PointCloud(points, elevation.mosaic[known], elevation.sigma_m[known].astype(np.float32))
 
 
@@ -89,7 +90,8 @@ def write_ply(path: Path, cloud: PointCloud, georeference: Georeference | None =
 def write_laz(path: Path, cloud: PointCloud, georeference: Georeference | None = None) -> None:
     """Writes LAZ (LAS 1.4, point format 7) with the extra dimension `sigma` and the CRS as WKT.
 
-    Coordinates are integers: their resolution is 1e-6 m, or coarser by powers of ten for maps wider than 1 km.
+    Coordinates are integers: their resolution is 1e-6 units of the CRS, or coarser by powers of ten for extents above
+    1074 units.
 
     Raises:
         TwinError: the package laspy is not installed.
@@ -98,7 +100,7 @@ def write_laz(path: Path, cloud: PointCloud, georeference: Georeference | None =
     header: Any = laspy.LasHeader(point_format=_POINT_FORMAT, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams("sigma", np.float32, "standard deviation [m]"))
     extent = np.ptp(cloud.points, axis=0).max() if len(cloud.points) else 0.0
-    header.scales = np.full(3, _FINEST_M * 10 ** np.ceil(max(0.0, np.log10(max(extent, 1e-9) / (_FINEST_M * _STEPS)))))
+    header.scales = np.full(3, _FINEST * 10 ** np.ceil(max(0.0, np.log10(max(extent, 1e-9) / (_FINEST * _STEPS)))))
     header.offsets = np.floor(cloud.points.mean(axis=0)) if len(cloud.points) else np.zeros(3)
     known = optional("laspy.vlrs.known", "exchange", "--to laz")
     header.vlrs.append(known.WktCoordinateSystemVlr(geotiff.crs_of(georeference).to_wkt()))

@@ -93,7 +93,9 @@ def read(path: Path) -> PoseGraph:
 
 def ignored_warning(path: Path, lines: IgnoredLines) -> str:
     """Returns a sentence that reports the ignored lines of an unknown tag."""
-    return f"{path}:{lines.first_line}: {lines.n_lines} lines with the unknown tag {lines.tag[:40]!r} are ignored"
+    tag = f"with the unknown tag {lines.tag[:40]!r}"
+    ignored = f"1 line {tag} is ignored" if lines.n_lines == 1 else f"{lines.n_lines} lines {tag} are ignored"
+    return f"{path}:{lines.first_line}: {ignored}"
 
 
 def _check_once(path: Path, part: Rows, poses: Mapping[int, Array]) -> None:
@@ -127,6 +129,7 @@ def _links(path: Path, part: Rows, i_from_j: Array, jacobian: Array) -> list[Lin
     """Returns the links of all edges of a tag, with the covariances of [rotation vector, translation] in vertex j.
 
     Args:
+        path: the file, for messages.
         part: the edges; the last 21 values are the upper triangle of the information matrix of [translation, rotation
             parameters of the file].
         i_from_j: (n, 4, 4) motions.

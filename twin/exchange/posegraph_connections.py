@@ -14,7 +14,11 @@ _Nodes = NDArray[np.int64]
 
 
 def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tuple[_Nodes, _Nodes]) -> list[str]:
-    """Returns one warning for all nodes without an edge, one for all without a vertex, and one per separate component.
+    """Returns the warnings about the connections of a graph.
+
+    There is one warning for all vertices without an edge, one for all nodes that edges name but no vertex defines, and
+    one for each component that is not connected to the first edge; from the sixth such component on, they are counted
+    in one warning.
 
     Args:
         path: file of the graph.

@@ -113,7 +113,7 @@ def _rows(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[lis
 
 
 def _line_error(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[list[str]]) -> TwinError:
-    """Returns the error of the first malformed line of a tag."""
+    """Returns the error of the first malformed line of a tag; raises AssertionError if no line is malformed."""
     allowed = f"{tag} followed by {layout.n_nodes} node number(s) and {layout.n_values} finite numbers"
     for line, row in zip(lines, rows, strict=True):
         words = " ".join(row[1:]).split()

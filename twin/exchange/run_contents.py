@@ -97,9 +97,10 @@ class FrameTruth(NamedTuple):
             camera; zero where there is neither.
         albedo: (H, W, 3) uint8, 255 = white.
         clean: (H, W, 3) uint8 image in clear water without marine snow, by the same lamps and sensor, without noise.
-        light: radiances (H, W, 3) float32 by name: "lamp" (illuminance of the floor by lamps and daylight [lx]),
-            "direct" (light of the floor that was not scattered), "forward" (light of the floor that was scattered),
-            "veil" (backscatter) and "snow", all [cd/m2]. The last three exist only where the scenario has them.
+        light: components (H, W, 3) float32 by name: "lamp" (illuminance of the floor by lamps and daylight [lx]; NaN
+            where too little of it reaches the camera to compute it), and the radiances [cd/m2] "direct" (light of the
+            floor that was not scattered), "forward" (light of the floor that was scattered), "veil" (backscatter) and
+            "snow" (change by marine snow). "forward" and "snow" exist only if the scenario has them.
         labels: (H, W) uint16, number of the object at each pixel, from 1; 0: the floor, or nothing.
         flow_px: (H, W, 2) float32 displacement (columns, rows) of each point to the next recorded image; NaN where it
             is outside the next image, hidden in it, or belongs to a swaying object; None for the last frame.
@@ -147,9 +148,9 @@ class RunContents:
         trajectories: by name, those of "truth", "f2f", "online", "final" and "reference" that exist.
         keyframe_rows: (n_keyframes,) row of each keyframe in the trajectories.
         frames: recorded frames in the order of time; empty if no images were kept.
-        elevation: elevation map with sigma and the colours of the orthomosaic at its cells; None if there is none.
+        elevation: elevation map with sigma and the colours of the orthomosaic at its cells; None without a map.
         error_m: (rows, cols) estimated minus true elevation, NaN where unknown; None without truth.
-        orthomosaic: file of the orthomosaic (GeoTIFF, RGBA or RGB); None if there is none.
+        orthomosaic: file of the orthomosaic (GeoTIFF, RGBA or RGB); None if the run has no such file.
         georeference: position of the scene in a CRS, from the measured DEM or the options of the export; None: local
             coordinates.
         true_layers: renders the world again and returns its true layers; None without a simulated world.

@@ -65,7 +65,7 @@ def textured_mesh(elevation: ElevationMap, texture_grid: MapGrid, max_vertices: 
     Args:
         elevation: the map.
         texture_grid: position of the texture's pixels; row 0 is the northernmost.
-        max_vertices: largest number of vertices.
+        max_vertices: approximate largest number of vertices.
     """
     stride = max(1, int(np.ceil(np.sqrt(elevation.height_m.size / max_vertices))))
     x, y = (values[::stride] for values in elevation.grid.centres())
@@ -77,7 +77,7 @@ def textured_mesh(elevation: ElevationMap, texture_grid: MapGrid, max_vertices: 
     u = (points[used, 0] - texture_grid.west_m) / width_m
     v = 1 - (texture_grid.north_m - points[used, 1]) / height_m
     visual = TextureVisuals(np.column_stack([u, v]))
-    return trimesh.Trimesh(points[used], faces.reshape(-1, 3), visual=visual, process=False)
+    return trimesh.Trimesh(elevation.to_world(points[used]), faces.reshape(-1, 3), visual=visual, process=False)
 
 
 def _mesh(contents: RunContents) -> tuple[trimesh.Trimesh, PillowImage.Image]:
@@ -101,12 +101,12 @@ def _uv(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 
 def _texture(file: Path) -> tuple[NDArray[np.uint8], MapGrid]:
-    """Returns the orthomosaic (H, W, 3), averaged to at most `_MOST_TEXTURE_PX` px per side, and its grid."""
+    """Returns the orthomosaic (H, W, 3), averaged to 1 to `_MOST_TEXTURE_PX` px per side, and its grid."""
     with rasterio.open(file) as source:
         grid, _ = geotiff.scene_placement(source)
         step = int(np.ceil(max(source.width, source.height) / _MOST_TEXTURE_PX))
-        rows, cols = source.height // step, source.width // step
-        whole = (0, rows * step), (0, cols * step)
+        rows, cols = max(1, source.height // step), max(1, source.width // step)
+        whole = (0, min(rows * step, source.height)), (0, min(cols * step, source.width))
         bands = source.read((1, 2, 3), window=whole, out_shape=(3, rows, cols), resampling=Resampling.average)
     pixels = MapGrid(grid.west_m, grid.north_m, grid.cell_m * step, rows, cols)
     return np.ascontiguousarray(np.moveaxis(bands, 0, 2)), pixels

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 #: Rows and columns of the grid of pixels for wide beams, and for beams that fall to half intensity within `NARROW_DEG`.
 GRID, NARROW_GRID, NARROW_DEG = (16, 20), (48, 64), 25.0
-RANGES, SUBSTEPS = 48, 2
+RANGES, SUBSTEPS = 48, 2  # number of steps of range in the table, and of integration steps in each of them
 FINE = 0.4  # blurs narrower than this fraction of the grid spacing are ignored
 MARGIN = 6  # rows and columns outside each side of the image, up to its size away; their light is blurred into it
 
@@ -54,7 +54,8 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
     """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
 
-    The daylight is assumed to travel along the optical axis, away from the camera.
+    The daylight is assumed to travel along the optical axis, away from the camera. The arguments are those of
+    `LampLight.scattered_once_per_m`, with the `points` (..., n, 3) on `ray` (..., 3).
     """
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
@@ -90,14 +91,20 @@ def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
     """Returns the numbers of rows and columns of the pixel grid on which the backscatter of lamps is computed.
 
     Args:
-        beams: for each lamp, (m, 2) angle from the beam axis [deg] and intensity; narrow beams need a finer grid.
+        beams: for each lamp, (m, 2) angle from the beam axis [deg] and relative intensity; narrow beams need a finer
+            grid.
     """
     half_deg = [float(beam[beam[:, 1] >= beam[0, 1] / 2, 0].max()) for beam in beams]
     return NARROW_GRID if min(half_deg, default=90.0) < NARROW_DEG else GRID
 
 
 def grid_rays(rig: StereoRig, grid: tuple[int, int]) -> Array:
-    """Returns the unit directions (rows, cols, 3) of the grid of the table, in the axes of the camera."""
+    """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera.
+
+    Args:
+        rig: the camera.
+        grid: rows and columns, see `grid_of`.
+    """
     return _rays(rig, *(_grid_px(n, size, 0) for n, size in zip(grid, _size(rig), strict=True)))
 
 

@@ -51,8 +51,8 @@ class DecomposedImage(NamedTuple):
     """A left image without noise, with the intermediate results of its computation.
 
     Args:
-        albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
-        depth: (H, W) depth along the optical axis [m].
+        albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
+        depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
         components: direct signal, backscatter and other components of the radiance.
         setting: exposure, metered on this image.
         noise_free: (H, W, 3) image without noise.
@@ -73,12 +73,12 @@ class DecomposedImage(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Image signal per unit of radiance on the optical axis [1 / (cd/m2)]; the image saturates at a signal of 1."""
+        """Image signal per unit of radiance on the optical axis [1 / (cd/m2)], see `ExposureSetting.gain`."""
         return self.setting.gain
 
 
 class _View(NamedTuple):
-    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and the objects in view, None without objects.
+    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and its objects, None without objects.
 
     `pose` is that of the left camera, with the time.
     """
@@ -100,8 +100,10 @@ class StereoCamera:
         left_rng, right_rng: random streams of the image noise.
         stopwatch: timer of the stages "render" and "optics".
         true_cameras: geometry of the true cameras; None = as defined by the scenario.
+
     Raises:
-        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`.
+        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`; or the water
+            is invalid, see `sensor_of`.
     """
 
     def __init__(
@@ -223,7 +225,10 @@ class StereoCamera:
         return self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
 
     def _metered(self, view: _View) -> tuple[Radiance, Radiance, ExposureSetting]:
-        """Returns the light of floor and water in the left view, this light with marine snow, and the exposure."""
+        """Returns the light of floor and water in the left view, this light with marine snow, and the exposure.
+
+        The light with marine snow is metered for the later frames.
+        """
         floor = self._floor(view)
         at_rest = self._with_snow(floor, view.depth, view.pose)
         return floor, at_rest, self._meter(self._sensor, at_rest, view.depth)
@@ -246,7 +251,7 @@ class StereoCamera:
         return light
 
     def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
-        """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
+        """Returns this frame's exposure, and meters the light (H, W, 3) in the left camera at rest for later frames."""
         every_px = 1 if self._cameras.sampling is None else METERED_PX
         return sensor.meter(self._cameras.sample(light, depth, 0, every_px), every_px)
 
@@ -259,7 +264,9 @@ class StereoCamera:
         motion: ExposureMotion | None,
         at_rest: Radiance | None = None,
     ) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water, which may be changed.
+        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water.
+
+        The array `floor` may be modified.
 
         Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
         with its own blur afterwards. `at_rest` is the light with marine snow in a camera at rest, if it is known.

@@ -5,8 +5,8 @@ surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the ref
 floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
 side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
 
-- waves shorter than two cells: the mean over their phases is a Gaussian blur by their slopes, as they focus far above
-  the floor;
+- waves that the cells do not resolve: the mean over their phases is a Gaussian blur by their slopes, as they focus far
+  above the floor;
 - the angular size of the sun;
 - scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
   `scattering_blur`).
@@ -29,14 +29,15 @@ from twin.imaging.illumination import Illumination
 from twin.imaging.phase_function import PhaseTable, table_of
 from twin.imaging.water import Medium
 from twin.imaging.waves import angular_frequency, slope_density, slope_variance
+from twin.scenario.model import SEA_WATER_INDEX
 
 Array = NDArray[np.float64]
 
 CELLS = 256  # number of cells per side of the tile, a power of two
 TILE_DEPTHS = 1.5  # side of the tile in units of the depth
-RESOLVED = 0.95  # wave number of the shortest waves, in units of the Nyquist wave number of the cells
-WATER_INDEX = 1.339  # refractive index of sea water
-SUN_RAD = 0.00465 / 2 / WATER_INDEX  # standard deviation of directions within the solar disc along one axis, in water
+RESOLVED = 0.95  # wave number of the shortest resolved waves, in units of the Nyquist wave number of the cells
+#: Standard deviation of directions within the solar disc along one axis, in water.
+SUN_RAD = 0.00465 / 2 / SEA_WATER_INDEX
 STREAM = 1 << 16  # key of the random stream for the waves
 _HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scattering_blur`
 
@@ -52,6 +53,9 @@ class Caustics:
             that the waves focus; the rest of the daylight is diffuse and uniform.
         wind_mps: wind speed 10 m above the sea.
         seed: seed of the scenario.
+
+    Attributes:
+        tile_m: side of the tile.
     """
 
     def __init__(self, illumination: Illumination, wind_mps: float, seed: int):
@@ -70,7 +74,7 @@ class Caustics:
         waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
         self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
         self._omega = angular_frequency(k)
-        self._cells_per_slope = np.float32((1 - 1 / WATER_INDEX) * depth_m * self.cells_per_m)
+        self._cells_per_slope = np.float32((1 - 1 / SEA_WATER_INDEX) * depth_m * self.cells_per_m)
         self._blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest)).astype(np.float32)
         self._share = np.float32(daylight.focused_share)
         self._cached: tuple[float, NDArray[np.float32]] | None = None
@@ -104,22 +108,22 @@ class Caustics:
         return east, north
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
-        """Computes the illuminance (CELLS, CELLS) divided by its mean, see `pattern`."""
+        """Returns the illuminance (CELLS, CELLS) divided by its mean, see `pattern`."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
         blurred = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))
         return 1 + self._share * (blurred - 1)
 
     def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
-        """Returns the modulation transfer function of the blur by the sun, the water and the unresolved waves.
+        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves.
 
         Args:
             depth_m: depth of the plane below the surface.
-            water: optical properties of the water.
+            water: optical properties of the water, of which those of the green band are used.
             unresolved: variance of the slopes along and across the wind due to waves that the cells do not resolve.
         """
         kx, ky = _wave_numbers(self.tile_m)
-        along, across = (SUN_RAD**2 + (1 - 1 / WATER_INDEX) ** 2 * variance for variance in unresolved)
+        along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
         rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
         green = float(water.absorption_per_m[1]), float(water.scattering_per_m[1])
         phase = table_of(water.scatterers[1])
@@ -167,8 +171,8 @@ def _trace_rays(east, north, cells_per_slope, light):
 
     Args:
         east, north: (n, n) slopes of the surface.
-        cells_per_slope: displacement of a ray on the floor per unit of slope [cells].
-        light: (n, n) illuminance relative to its mean, modified in place.
+        cells_per_slope: displacement of a ray on the floor per unit of slope, against the slope [cells].
+        light: (n, n) illuminance relative to its mean, initially 0; filled in place. n is a power of two.
     """
     n, one = light.shape[0], np.float32(1.0)
     for i in range(n):

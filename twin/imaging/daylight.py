@@ -23,11 +23,11 @@ from twin.imaging.water import Medium
 
 Array = NDArray[np.float64]
 
-MODES = 8  # terms of the azimuth series of the upwelling light; its mean error is below 1 %
+MODES = 8  # terms of the azimuth series of the upwelling light; the mean error of the series is below 1 %
 VIEW_STEPS, LARGEST_VIEW_DEG = 24, 86.0  # angles of the lines of sight from straight down, and their limit
 FLOOR_STEPS, FLOOR_SCALE_M = 96, 2.0  # table of vertical distances h of the floor, even in h / (h + scale)
 FIT_DEPTHS = 9  # number of depths, from the cameras to below the reference plane, at which light is computed
-LEAST_LX = 1e-12  # lower limit of the diffuse illuminance, per lux at the surface
+LEAST_LX = 1e-12  # lower limit of the illuminance by all light but the beam, per lux at the surface
 
 
 class FloorDaylight(NamedTuple):
@@ -43,7 +43,7 @@ class FloorDaylight(NamedTuple):
     Args:
         to_sun: (3,) unit direction to the refracted sun, east, north, up.
         beam_lx: (3,) illuminance by the beam just below the surface on a plane that faces the sun.
-        beam_per_m: (3,) attenuation of the beam with depth.
+        beam_per_m: (3,) attenuation of the beam with depth [1/m].
         rest_lx: (3, 4, 4) illuminance by all other light at the reference depth, a quadratic form in (n, 1).
         rest_per_m: (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the logarithm of the other light.
         reference_depth_m: depth below the surface at which `rest_lx` applies.
@@ -62,8 +62,8 @@ class FloorDaylight(NamedTuple):
 def floor_daylight(daylight: Daylight) -> FloorDaylight:
     """Returns the daylight on the floor.
 
-    With single scattering, beam and diffuse light keep their shares, and both decrease with the diffuse attenuation;
-    with multiple scattering the beam turns into diffuse light on its way.
+    With single scattering or without a surface, beam and diffuse light keep their shares, and both decrease with the
+    diffuse attenuation; with multiple scattering the beam turns into diffuse light on its way.
 
     Args:
         daylight: sun, sky, depth and properties of the water.
@@ -88,8 +88,8 @@ def floor_daylight(daylight: Daylight) -> FloorDaylight:
 def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, Array]:
     """Returns the illuminance of the floor by all light except the beam of the sun, in one band.
 
-    It is the quadratic form (4, 4) in the floor normal at the depth `deep_m`, and the coefficients (2,) of its change
-    with depth, fitted at `depths_m`; see `FloorDaylight.rest_lx` and `rest_per_m`.
+    It is the quadratic form (4, 4) in the floor normal at the depth `deep_m`, per lux at the surface, and the
+    coefficients (2,) of its change with depth, fitted at `depths_m`; see `FloorDaylight.rest_lx` and `rest_per_m`.
     """
     light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
     square, slope, level = np.polyfit(depths_m - deep_m, light, 2)
@@ -119,7 +119,8 @@ class DaylightVeil:
         Args:
             ray: (..., 3) unit directions of sight, east, north, up; those more than `LARGEST_VIEW_DEG` from straight
                 down get the radiance at that angle.
-            depth_m: depth of the camera below the surface.
+            depth_m: depth of the camera below the surface; the radiance tabulated at the planned depth is scaled with
+                the attenuation of the illuminance there.
         """
         flat = ray.reshape(-1, 3)
         modes, views = self._terms.shape[:2]

@@ -21,7 +21,7 @@ UNIT = 32767  # integer that represents 1 in a stored normal
 
 
 class Heights(Protocol):
-    """Grid of floor heights; row 0 = south, column 0 = west."""
+    """Grid of floor heights; row 0 = south, column 0 = west. Its south-west node is at `west_m`, `south_m`."""
 
     @property
     def height_m(self) -> NDArray[np.float32]: ...
@@ -37,12 +37,12 @@ class FacetView(NamedTuple):
     """Facets of the floor relative to a camera.
 
     Args:
-        normals: (rows, cols, 2) stored normals of the two triangles of each cell, south-east and north-west of the
-            diagonal from the cell's south-west to its north-east node.
+        normals: (rows, cols, 2) int32 stored normals of the two triangles of each cell, south-east and north-west of
+            the diagonal from the cell's south-west to its north-east node.
         origin: (2,) column and row of the cell near the camera to which `grid_from_camera` refers, so that single
             precision suffices.
         grid_from_camera: (2, 4) map from a point in the axes of the camera [m] to column and row relative to `origin`.
-        camera_from_world: (3, 3) rotation.
+        camera_from_world: (3, 3) rotation from world axes to those of the camera.
     """
 
     normals: NDArray[np.int32]

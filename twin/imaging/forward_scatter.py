@@ -6,9 +6,9 @@ pyramid: each level doubles the width, and its weights depend on band and range.
 own range: its ray receives light from the floor around it. The kernel is a function of angle. At the angle theta from
 the optical axis, a small angle covers more pixels by the factor k = 1 / cos(theta)^1.5, the geometric mean of 1 / cos^2
 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of the light of each level moves to the next, wider
-level. Much of the tail lies outside the image. There the floor is taken to be the plane that fits the depth of the
-image, with the mean albedo of the image; the coarse levels of the pyramid cover it. The fine levels are mirrored at the
-borders of the image.
+level, except for the widest levels (`WIDENED_TAN`). Much of the tail lies outside the image. There the floor is taken
+to be the plane that fits the depth of the image, with the mean albedo of the image; the coarse levels of the pyramid
+cover it. The fine levels are mirrored at the borders of the image.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Depth: TypeAlias = NDArray[np.float32]
 Place: TypeAlias = NDArray[np.float32]
 
 SHARE_STEPS = 512  # number of steps of r / (r + RANGE_SCALE_M) from 0 to 1
-SURROUNDINGS_TAN = 1.6  # extent of the surroundings, as the tangent of the angle from the axis
+SURROUNDINGS_TAN = 1.6  # half the extent of the surroundings along the longer side of the image, as a tangent
 SURROUNDINGS_STEP_TAN = 0.035  # side of a pixel of the surroundings, as a tangent, within a factor of 1.4
 WIDENING = 1.5  # exponent of 1 / cos(theta) in the pixels that an angle covers
-WIDENED_TAN = 0.1  # largest standard deviation of a level that is widened; cos(theta) is nearly constant across it
-WIDEST_TAN = 1.2  # largest standard deviation of a level
-PLANE_STEP_PX = 8  # spacing of the pixels to which the plane is fitted
+WIDENED_TAN = 0.1  # largest standard deviation of a level that is widened, as a tangent; cos(theta) hardly varies in it
+WIDEST_TAN = 1.2  # upper limit of the standard deviation of a level, as a tangent
+PLANE_STEP_PX = 8  # spacing of the pixels to whose depth the plane is fitted
 
 
 class Surroundings(NamedTuple):
@@ -110,7 +110,8 @@ class ForwardScatter:
         Args:
             floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
             place: fractional row index into `kept` for every second pixel in both directions, see `place_of`.
-            around: light and row index into `kept` of the surroundings; pixels inside the image are overwritten.
+            around: light and fractional row index into `kept` of the surroundings; their pixels inside the image are
+                overwritten.
             light: (H, W, 3) image to which the light is added.
         """
         grid = self.surroundings
@@ -137,11 +138,11 @@ class ForwardScatter:
         cv2.add(light, cv2.pyrUp(images[0], dstsize=(width, height)), dst=light)
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
-        """Returns all light (H, W, 3) that was scattered between floor and camera [cd/m2].
+        """Returns all light (H, W, 3) of the floor that was scattered between floor and camera [cd/m2].
 
         Args:
             floor, around: see `add`.
-            range_m: (H, W) distance of the floor from the camera.
+            range_m: (H, W) distance of the floor from the camera; inf is valid.
         """
         light = (floor * self.core(range_m)).astype(np.float32)
         self.add(floor, np.ascontiguousarray(place_of(range_m)[::2, ::2]), around, light)
@@ -154,7 +155,7 @@ class ForwardScatter:
 
 
 def place_of(range_m: Array) -> Place:
-    """Returns the row of the table `ForwardScatter.kept` that belongs to a range [m]; inf is valid."""
+    """Returns the fractional row of the table `ForwardScatter.kept` for ranges of any shape [m]; inf is valid."""
     near = np.minimum(range_m, FAR_M)
     return (SHARE_STEPS * near / (near + RANGE_SCALE_M)).astype(np.float32)
 
@@ -227,7 +228,7 @@ def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
 
 
 def _moved(weights: Array, focal_px: float) -> Array:
-    """Returns the change (levels, n, 3) of the weights if the light of each narrow level moves to the next wider one.
+    """Returns the change (levels, n, 3) of the weights if all light of each narrow level moves to the next wider one.
 
     Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths.
 
@@ -249,7 +250,9 @@ def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
 
 
 def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
-    """Returns the share of the light that moves to the next level, (rows, cols) for each level of the pyramid.
+    """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid.
+
+    The share is computed for each pixel (rows, cols) of a level.
 
     Args:
         rig: the camera.
@@ -273,8 +276,8 @@ def _weigh(image, place, table, widening, wider):
     Args:
         image: (rows, cols, 3) light of the floor at this level.
         place: (rows, cols) fractional row of `table` for each pixel.
-        table: (n, 8) weights of this level for R, G, B and a zero, then their change if the light of each level moves
-            to the next one, and a zero.
+        table: (n, 8) weights of this level for R, G, B and a zero, then their change if all light of each narrow level
+            moves to the next one, and a zero.
         widening: (rows, cols) share of the light that moves, for each pixel.
         wider: (rows, cols, 3) weighted light of the wider levels.
     """

@@ -21,7 +21,7 @@ class Daylight(NamedTuple):
     Args:
         surface_lx: (3,) illuminance just below the water surface, or on the floor if there is no surface.
         illuminance_lx: (3,) illuminance on a horizontal plane at the planned altitude.
-        attenuation_per_m: (3,) diffuse attenuation with depth, Kd; 0 where there is no surface.
+        attenuation_per_m: (3,) diffuse attenuation with depth, Kd [1/m]; 0 where there is no surface.
         reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
         camera_depth_m: depth of the cameras below the surface at the planned altitude; 0 where there is no surface.
         focused_share: fraction of the daylight that the surface waves focus into caustics.
@@ -58,12 +58,11 @@ def illumination_of(scenario: Scenario) -> Illumination:
     the surface to the floor and up to the camera.
 
     Raises:
-        TwinError: the water is incomplete or its spectrum cannot be read, the planned altitude is above the surface, or
-            caustics are requested without a surface.
+        TwinError: the water is invalid (see `medium`), the planned altitude is not below the surface, or caustics are
+            requested without a surface.
     """
     altitude_m, sun, scattering = scenario.plan.altitude_m, scenario.sun, scenario.imaging.scattering
-    light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
-    water = medium(scenario.water, scattering, path_m=2 * altitude_m, light=light)
+    water = water_to_floor_and_back(scenario)
     down_m = sun.depth_m / _source(sun).mean_cosine
     above = medium(scenario.water, scattering, path_m=down_m or altitude_m, light="daylight")
     if not down_m:
@@ -71,6 +70,18 @@ def illumination_of(scenario: Scenario) -> Illumination:
     whole = medium(scenario.water, scattering, path_m=down_m + altitude_m, light="daylight").absorption_per_m
     from_floor = (whole * (down_m + altitude_m) - above.absorption_per_m * down_m) / altitude_m
     return Illumination(water, daylight_at(sun, above, altitude_m, from_floor))
+
+
+def water_to_floor_and_back(scenario: Scenario) -> Medium:
+    """Returns the optical properties of the water on a path from the planned altitude to the floor and back.
+
+    The light is that of LED lamps; without lamps of an intensity above 0, it is daylight.
+
+    Raises:
+        TwinError: the water is invalid, see `medium`.
+    """
+    light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
+    return medium(scenario.water, scenario.imaging.scattering, path_m=2 * scenario.plan.altitude_m, light=light)
 
 
 def _source(sun: SunConfig) -> SunSky:
@@ -90,7 +101,7 @@ def daylight_at(
         absorption_from_floor_per_m: (3,) absorption coefficient between floor and camera; None: that of `water`.
 
     Raises:
-        TwinError: the altitude is above the surface, or caustics are requested without a surface.
+        TwinError: the altitude is not below the surface, or caustics are requested without a surface.
     """
     surface_lx = np.full(3, sun.illuminance_lx)
     source = _source(sun)

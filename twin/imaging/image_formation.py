@@ -17,7 +17,7 @@ from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.object_shadows import ObjectShadows
 from twin.imaging.object_view import ObjectRenderer, Objects
 from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface, calm_surface
-from twin.imaging.shadows import Shadows
+from twin.imaging.shadows import Shadows, direction_to_casting_sun
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.snow import MarineSnow
 from twin.scenario.model import Scenario
@@ -59,13 +59,16 @@ class ImageFormation:
     """Model of the light that reaches each camera of the stereo camera, given albedo and depth of the floor.
 
     Args:
-        scenario: settings of lamps, marine snow and current, and which effects are enabled.
+        scenario: settings of lamps, material, wind, marine snow and current, and which effects are enabled.
         illumination: optical properties of the water, and daylight.
-        floor: heights of the floor, which has facets and casts shadows; None = a smooth floor without shadows, whose
-            normals follow from its depth.
+        floor: heights of the floor, which has facets and, with `imaging.shadows`, casts shadows; None = a smooth floor
+            without shadows, whose normals follow from its depth.
         snow_rng: random stream of the particle positions.
         rig: the rendered cameras; None = the believed rig.
         objects: objects on the floor; None = none.
+
+    Raises:
+        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(
@@ -88,8 +91,7 @@ class ImageFormation:
         self._reference_depth_m, self._daylight_on = daylight.reference_depth_m, bool(daylight.surface_lx.any())
         waves = bool(daylight.focused_share)
         self._caustics = Caustics(illumination, scenario.sun.wind_mps, scenario.seed) if waves else None
-        slanted = self._daylight_on and daylight.source.sun_cosine < 1
-        to_sun = np.array(daylight.source.to_sun) if slanted else None
+        to_sun = direction_to_casting_sun(daylight)
         positions_m = [source.position_m for source in sources]
         shaded = floor if imaging.shadows else None
         self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
@@ -114,8 +116,8 @@ class ImageFormation:
         """Returns the light (H, W, 3) that reaches a camera, per colour band in photometric units [cd/m2].
 
         Args:
-            albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
-            depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
+            albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
+            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
             pose: pose of the left camera, and time since the start of the survey.
             objects: the objects that were drawn into `albedo` and `depth`; None: the image shows the floor alone.

@@ -4,9 +4,10 @@ A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular 
 
     (I(theta) exp(-c d) + S(theta, d)) / d^2,
 
-where S is the beam convolved with the kernel of `spread.lamp_mixture`: the scattered light is not lost, but makes the
-beam wider and its edge softer. In water without scattering, or with single scattering, S is 0. Light that the
-floor reflects and the water scatters back to it is neglected, and so are the shadows of the floor in scattered light.
+where S is exp(-a d) times the beam convolved with the kernel of `spread.lamp_mixture`: the scattered light is not lost,
+but makes the beam wider and its edge softer. In water without scattering, or with single scattering, S is 0. Light that
+the floor reflects and the water scatters back to it is neglected, and so are the shadows of the floor in scattered
+light.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ Beam: TypeAlias = tuple[tuple[float, ...], ...]
 LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
 ANGLE_STEPS, SOFT_STEPS = 256, 64  # steps of sqrt(1 - cos(angle)) from 0 to 1, for all light and for scattered light
 PATH_STEPS = 96  # number of steps of d / (d + RANGE_SCALE_M) from 0 to 1
-RINGS, AZIMUTHS = 120, 24  # rings and directions on each ring around the straight path
+RINGS, AZIMUTHS = 120, 24  # rings around the straight path, and directions on one half of each ring
 
 
 class LampLight:
-    """Light of all lamps at points in the axes of one camera.
+    """Light of the lamps on particles in the water, at points in the axes of one camera; for the floor: `floor_tables`.
 
     Args:
         sources: lamps in the axes of the camera.
@@ -84,15 +85,15 @@ class LampLight:
 
 
 def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray[np.float32] | None:
-    """Returns the light of each lamp on a floor (lamps, n, m, 4), relative to the intensity on its axis.
+    """Returns the light of each lamp on a floor (lamps, n, m, 4), relative to `LightSources.intensity_cd`.
 
-    Axes: lamp, even steps of sqrt(1 - cos(angle)), even steps of d / (d + RANGE_SCALE_M), and R, G, B, 0. None in water
-    without multiple scattering.
+    Axes: lamp, even steps of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1, and R, G, B, 0.
+    None in water without multiple scattering, and without lamps.
 
     Args:
         sources: lamps in the axes of a camera.
         water: optical properties of the water.
-        shadows: return only the scattered light S, which the floor is assumed not to block; else all light.
+        shadows: whether to return only the scattered light S, which the floor is assumed not to block; else all light.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None
@@ -106,7 +107,12 @@ def with_a_zero(table: Array) -> NDArray[np.float32]:
 
 
 def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns I exp(-c d) + S, all light of a lamp on a floor, relative to the intensity on its axis.
+    """Returns I exp(-c d) + S, all light of a lamp, relative to `LightSources.intensity_cd`.
+
+    Args:
+        beam: (m, 2) beam table of the lamp.
+        water: optical properties of the water.
+        receiver: floor or particle that the light meets, which determines S.
 
     Returns:
         (ANGLE_STEPS + 1, PATH_STEPS + 1, 3), with the axes of `floor_tables`.
@@ -121,7 +127,10 @@ def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
 
 
 def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns the scattered light S of a beam (SOFT_STEPS + 1, PATH_STEPS + 1, 3), see `floor_tables`."""
+    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2).
+
+    S is relative to `LightSources.intensity_cd`; the axes are those of `floor_tables`.
+    """
     return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
 
 
@@ -152,7 +161,7 @@ def _on_rings(beam: Beam) -> Array:
     azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi
     ring = ((edges[1:] + edges[:-1]) / 2)[:, None]
     along = cosine * np.cos(ring) + np.sqrt(1 - cosine**2) * np.sin(ring) * np.cos(azimuth)
-    mean = np.where(along > 0, beam_share(along, np.array(beam)), 0.0).mean(-1)
+    mean = beam_share(along, np.array(beam)).mean(-1)
     return mean @ ring_shares(edges, LAMP_SIGMA_RAD)
 
 
@@ -162,7 +171,7 @@ def _from_table(points, position, axis, strength, table, lux, from_lamp):
 
     Args:
         position, axis: those of the lamp.
-        strength: (3,) intensity on the axis for R, G, B.
+        strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
         table: (n, m, 3) light of the lamp, see `_all_light`.
     """
     rows, cols = table.shape[0] - 1, table.shape[1] - 1

@@ -36,7 +36,7 @@ class LightSources(NamedTuple):
         axis: (n, 3) unit vectors of the beam axes of the lamps.
         intensity_cd: (n,) luminous intensity of each lamp on its beam axis.
         colour: (n, 3) factors of the intensity for R, G, B.
-        beam: for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to that on the axis.
+        beam: for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to `intensity_cd`.
         daylight: daylight in the water.
     """
 
@@ -51,7 +51,13 @@ class LightSources(NamedTuple):
 def light_sources_in_camera(
     rig: StereoRig, lamps: Sequence[LampConfig], daylight: Daylight, camera: int
 ) -> LightSources:
-    """Returns the lamps, which are fixed to the body, in the axes of a camera (0 left, 1 right).
+    """Returns the lamps, which are fixed to the body, in the axes of a camera, with the daylight.
+
+    Args:
+        rig: the cameras, with their pose in the axes of the body.
+        lamps: lamps in the axes of the body.
+        daylight: daylight, which is returned unchanged.
+        camera: 0 left, 1 right.
 
     Raises:
         TwinError: the angles of a beam table do not start at 0, or do not increase.
@@ -84,17 +90,24 @@ def _beam(number: int, lamp: LampConfig) -> Array:
 
 
 def beam_share(cos_angle: Array, table: Array) -> Array:
-    """Returns the intensity of a lamp relative to that on its axis; 0 beyond the last angle of the table.
+    """Returns the relative intensity of a lamp by its beam table.
+
+    It is 0 beyond the last angle of the table, and behind the lamp: at angles above 90 deg from the beam axis.
 
     Args:
         cos_angle: cosine of the angle from the beam axis, of any shape.
         table: (m, 2) angle [deg] and relative intensity, interpolated linearly.
     """
-    return np.interp(np.rad2deg(np.arccos(np.clip(cos_angle, 0.0, 1.0))), *table.T, right=0.0)
+    angle_deg = np.rad2deg(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
+    return np.where(np.asarray(cos_angle) < 0, 0.0, np.interp(angle_deg, *table.T, right=0.0))
 
 
 def colour(temperature_k: float) -> Array:
-    """Returns the intensities (3,) of a black body in R, G, B, relative to one at 6500 K of equal luminance."""
+    """Returns the intensities (3,) of a black body in R, G, B, relative to those of one at 6500 K with equal luminance.
+
+    Args:
+        temperature_k: colour temperature.
+    """
     power, white = _black_body(temperature_k), _black_body(WHITE_K)
     against_white = band_weights(white) @ (power / white)
     return against_white / (against_white @ LUMINANCE_SHARES)

@@ -32,7 +32,7 @@ class Distortion(NamedTuple):
 
 
 def true_lens(lens: LensConfig) -> Distortion:
-    """Returns the true distortion of the lens."""
+    """Returns the true distortion of both lenses."""
     return Distortion(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2)
 
 
@@ -72,7 +72,7 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
 
 def fold(lens: Distortion) -> float:
-    """Returns the normalised radius r beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) decreases; inf if it never does."""
+    """Returns the normalised radius r of the first maximum of r (1 + k1 r^2 + k2 r^4 + k3 r^6); inf if it has none."""
     # The derivative of r (1 + k1 r^2 + ...), divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1,
     # so distortion coefficients of zero cause no division by zero.
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])

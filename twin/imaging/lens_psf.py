@@ -36,10 +36,10 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels a side; an even number
+REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; REACH_PX must be even
+TAPS = 4  # taps of cubic interpolation
 GRID = 64  # samples of the MTF from which the kernel is computed
-MTF_ERROR = 5e-3  # separable terms of the kernel are added until the MTF is within this of the closed form
-PATTERN_PX = 64  # pixels for which the weights of a row, which repeat for R, G, B, are stored
+MTF_ERROR = 5e-3  # separable terms are added until their transform is within this of that of the kernel
 NEAREST_FOCUS_M = 0.05  # nearest depth in focus
 SMALL_PX = 3.0  # largest circle of confusion for the 3 x 3 kernel
 NEGLIGIBLE_PX = 0.1  # circles of confusion up to this diameter are ignored: their variance is below 0.001 px^2
@@ -73,7 +73,13 @@ def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
 
 
 def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorConfig) -> Array:
-    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px]."""
+    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px].
+
+    Args:
+        cycles_per_px: spatial frequencies.
+        wavelength_nm: wavelength of the light in air.
+        sensor: f-number and size of the pixels.
+    """
     s = np.abs(cycles_per_px) / sensor.pixel_um * wavelength_nm * 1e-3 * sensor.f_number
     s = np.minimum(s, 1.0)
     return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
@@ -90,15 +96,15 @@ class LensPsf:
     def __init__(self, scenario: Scenario, rig: StereoRig):
         lens = scenario.lens
         self._defocus, self._focal_px = defocus_of(scenario, rig), rig.focal_px
-        self._taps = _taps(lens, scenario.sensor, rig.width_px)
-        self._scales = _Magnified(lens, rig) if any(lens.lateral_colour) else None
+        self._taps = _taps(lens, scenario.sensor)
+        self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
 
     def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
-        """Returns the radiance (H, W, 3) with the blur due to the depth of field.
+        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is negligible.
 
         Args:
             light: (H, W, 3) radiance.
-            depth: (H, W) depth [m].
+            depth: (H, W) depth along the optical axis [m]; inf is valid.
         """
         if self._defocus is None:
             return light
@@ -113,13 +119,21 @@ class LensPsf:
 
     def transfer(self, light: Radiance) -> Radiance:
         """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour."""
-        rows = len(light)
-        if self._taps is not None:
-            out, taps = np.empty_like(light), self._taps
-            flat, filled = np.ascontiguousarray(light).reshape(rows, -1), out.reshape(rows, -1)
-            in_row_bands(lambda first, end: _convolve(flat, taps[0], taps[1], filled, first, end), rows)
-            light = out
-        return light if self._scales is None else self._scales.apply(light)
+        if self._taps is None and self._scales is None:
+            return light
+        rows, width, taps = *light.shape[:2], self._taps
+        flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
+        if taps is None:
+            in_row_bands(lambda first, end: _split_rows(flat, bands, first, end), rows)
+        else:
+            in_row_bands(lambda first, end: _convolve(flat, *taps, bands, first, end), rows)
+        out = np.empty((rows, 3 * width), np.float32)
+        if self._scales is None:
+            in_row_bands(lambda first, end: _join_rows(bands, out, first, end), rows)
+        else:
+            tables = self._scales
+            in_row_bands(lambda first, end: _magnify(bands, *tables, out, first, end), rows)
+        return out.reshape(rows, width, 3)
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
@@ -128,22 +142,20 @@ def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px:
     return share * diffraction_mtf(cycles_per_px, CENTRE_NM[band], sensor) if lens.diffraction and sensor else share
 
 
-def _taps(
-    lens: LensConfig, sensor: SensorConfig | None, width_px: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Returns the kernels of the MTF as separable terms: weights along columns and rows, (terms, REACH_PX + 1, 3 W).
+def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Returns the kernels of the MTF as separable terms: weights along columns and rows, (3, terms, REACH_PX + 1).
 
-    The last axis repeats the weights of R, G, B for all pixels of a row. None if the lens does not blur.
+    The first axis is that of the bands R, G, B. None if the lens does not blur.
     """
     if not lens.diffraction and not any(lens.blur_px):
         return None
     bands = [_separable(_kernel(lens, sensor, band)) for band in range(3)]
     terms = max(len(band) for band in bands)
-    down, across = np.zeros((2, terms, REACH_PX + 1, 3))
+    down, across = np.zeros((2, 3, terms, REACH_PX + 1), np.float32)
     for k, band in enumerate(bands):
         for i, (value, vector) in enumerate(band):
-            down[i, :, k], across[i, :, k] = value * vector[REACH_PX:], vector[REACH_PX:]
-    return np.tile(down, (1, 1, width_px)).astype(np.float32), np.tile(across, (1, 1, width_px)).astype(np.float32)
+            down[k, i], across[k, i] = value * vector[REACH_PX:], vector[REACH_PX:]
+    return down, across
 
 
 def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
@@ -161,10 +173,10 @@ def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
 
 
 def _separable(kernel: Array) -> list[tuple[float, Array]]:
-    """Returns the largest eigenvalues and their eigenvectors of a symmetric kernel.
+    """Returns the eigenvalues of largest magnitude, and their eigenvectors, of a symmetric kernel.
 
-    The sum of eigenvalue times outer product of the eigenvector approximates the kernel within `MTF_ERROR` of its
-    transform. The eigenvalues are scaled so that all elements of this sum add up to 1.
+    The sum of the outer products of the eigenvectors with themselves, times the eigenvalues, has a transform within
+    `MTF_ERROR` of that of the kernel. The eigenvalues are then scaled so that all elements of this sum add up to 1.
     """
     values, vectors = np.linalg.eigh(kernel)
     order, n = np.argsort(-np.abs(values)), 1
@@ -176,24 +188,34 @@ def _separable(kernel: Array) -> list[tuple[float, Array]]:
         n += 1
 
 
-class _Magnified:
-    """Lateral colour: the images of the red and the blue band are magnified relative to the green one."""
+class _Magnification(NamedTuple):
+    """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
 
-    def __init__(self, lens: LensConfig, rig: StereoRig):
-        red, blue = lens.lateral_colour
-        scales = 1 + np.array([red, 0.0, blue])
-        first, across = _taps_of(rig.width_px, rig.cx_px, scales)
-        starts = np.flatnonzero(np.diff(first, prepend=first[0] - 1))  # runs of pixels with the same taps
-        runs = np.column_stack([starts, np.append(starts[1:], rig.width_px), first[starts]])
-        lines, down = _taps_of(rig.height_px, rig.cy_px, scales)
-        self._tables = runs, np.ascontiguousarray(across.swapaxes(0, 1).reshape(len(across[0]), -1)), lines, down
+    Args:
+        runs: (k, 4) band, first and end column of each run of pixels with the same taps, and their first tap.
+        across: (3, TAPS, W) weights along the rows, for each band.
+        lines: (3, H) first tap of each row.
+        down: (3, H, TAPS) weights along the columns.
+    """
 
-    def apply(self, light: Radiance) -> Radiance:
-        """Returns the radiance (H, W, 3) with the magnified red and blue bands."""
-        out, tables = np.empty_like(light), self._tables
-        flat, filled = np.ascontiguousarray(light).reshape(len(light), -1), out.reshape(len(light), -1)
-        in_row_bands(lambda first, end: _magnify(flat, *tables, filled, first, end), len(light))
-        return out
+    runs: NDArray[np.int64]
+    across: NDArray[np.float32]
+    lines: NDArray[np.int64]
+    down: NDArray[np.float32]
+
+
+def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
+    """Returns the taps of lateral colour."""
+    red, blue = lens.lateral_colour
+    scales = 1 + np.array([red, 0.0, blue])
+    first, across = _taps_of(rig.width_px, rig.cx_px, scales)
+    runs = []
+    for band, taps in enumerate(first):
+        starts = np.flatnonzero(np.diff(taps, prepend=taps[0] - 1))
+        ends = np.append(starts[1:], rig.width_px)
+        runs.append(np.column_stack([np.full(len(starts), band), starts, ends, taps[starts]]))
+    across = np.ascontiguousarray(across.swapaxes(1, 2))
+    return _Magnification(np.concatenate(runs), across, *_taps_of(rig.height_px, rig.cy_px, scales))
 
 
 def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -201,11 +223,12 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
 
     Args:
         n: number of pixels.
-        middle_px: pixel that all bands share.
+        middle_px: position that the magnification does not move.
         scales: (3,) magnification of the bands.
 
     Returns:
-        First tap of each pixel (n,) relative to it [px]; weights (n, taps, 3) of consecutive pixels for R, G, B.
+        For R, G, B, the first tap of each pixel (3, n) relative to it [px], and weights (3, n, TAPS) of consecutive
+        pixels.
     """
     at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
     whole = np.floor(at)
@@ -213,103 +236,143 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
     cubic = np.array(
         [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2]
     )
-    offset = whole.astype(np.int64) - 1 - np.arange(n)  # of the first of the four taps of each band
-    first = offset.min(axis=0)
-    weights = np.zeros((n, int((offset - first).max()) + 4, 3))
-    for band in range(3):
-        for i in range(4):
-            weights[np.arange(n), offset[band] - first + i, band] = cubic[i, band]
-    return first, weights.astype(np.float32)
+    return whole.astype(np.int64) - 1 - np.arange(n), np.ascontiguousarray(np.moveaxis(cubic, 0, 2), np.float32)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) with the sum of separable convolutions of `light` (H, 3 W).
-
-    `down` and `across` (terms, taps, 3 W) are the weights of `_taps` along columns and rows.
-    """
-    terms, n_taps, n = down.shape
-    rows, reach = light.shape[0], n_taps - 1
-    wide = np.empty(n + 6 * reach, np.float32)
+@njit(cache=True, nogil=True)
+def _split_rows(light, out, first, end):
+    """Fills rows `first` to `end` of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
     for v in range(first, end):
-        filled = out[v]
-        filled[:] = np.float32(0.0)
-        for i in range(terms):
-            middle = wide[3 * reach : 3 * reach + n]
-            here, weight = light[v], down[i, 0]
-            for k in range(n):
-                middle[k] = weight[k] * here[k]
-            for t in range(1, n_taps, 2):
-                above, below = light[max(v - t, 0)], light[min(v + t, rows - 1)]
-                higher, lower = light[max(v - t - 1, 0)], light[min(v + t + 1, rows - 1)]
-                _add_pairs(above, below, down[i, t], higher, lower, down[i, t + 1], middle)
-            for k in range(3 * reach):
-                wide[k] = middle[k % 3]
-                wide[3 * reach + n + k] = middle[n - 3 + k % 3]
-            weight = across[i, 0]
-            for k in range(n):
-                filled[k] += weight[k] * middle[k]
-            for t in range(1, n_taps, 2):
-                left, right = wide[3 * (reach - t) :], wide[3 * (reach + t) :]
-                _add_pairs(left, right, across[i, t], wide[3 * (reach - t - 1) :], right[3:], across[i, t + 1], filled)
-        for k in range(n):
-            filled[k] = max(filled[k], np.float32(0.0))
+        _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
+
+
+@njit(cache=True, nogil=True)
+def _join_rows(bands, out, first, end):
+    """Fills rows `first` to `end` of `out` (H, 3 W) from `bands` (H, 3, W)."""
+    for v in range(first, end):
+        _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
+
+
+@njit(cache=True, nogil=True)
+def _split_row(row, red, green, blue):
+    """Copies R, G, B, which alternate in `row` (3 W,), to one array (W,) each."""
+    for u in range(red.size):
+        red[u], green[u], blue[u] = row[3 * u], row[3 * u + 1], row[3 * u + 2]
+
+
+@njit(cache=True, nogil=True)
+def _join_row(red, green, blue, row):
+    """Fills `row` (3 W,) with alternating R, G, B, at least 0."""
+    zero = np.float32(0.0)
+    for u in range(red.size):
+        row[3 * u], row[3 * u + 1], row[3 * u + 2] = max(red[u], zero), max(green[u], zero), max(blue[u], zero)
+
+
+@njit(cache=True, nogil=True)
+def _convolve(light, down, across, out, first, end):
+    """Fills rows `first` to `end` of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
+
+    The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
+    `lines`: row v in lines[v modulo their number].
+
+    Args:
+        down, across: weights of `_taps` along columns and rows.
+    """
+    rows, _, width = out.shape
+    n, terms = 2 * REACH_PX + 1, down.shape[1]
+    lines, wide = np.empty((n, 3, width), np.float32), np.empty(width + 2 * REACH_PX, np.float32)
+    middle = wide[REACH_PX : REACH_PX + width]
+    for v in range(first - REACH_PX, end + REACH_PX):
+        line = lines[v % n]
+        _split_row(light[min(max(v, 0), rows - 1)], line[0], line[1], line[2])
+        at = v - REACH_PX
+        if at < first:
+            continue
+        for band in range(3):
+            filled = out[at, band]
+            for i in range(terms):
+                weights = down[band, i]
+                _weigh_line(lines[at % n, band], weights[0], middle)
+                for t in range(1, REACH_PX + 1, 2):
+                    above, below = lines[(at - t) % n, band], lines[(at + t) % n, band]
+                    higher, lower = lines[(at - t - 1) % n, band], lines[(at + t + 1) % n, band]
+                    _add_pairs(above, below, weights[t], higher, lower, weights[t + 1], middle)
+                for k in range(REACH_PX):
+                    wide[k], wide[REACH_PX + width + k] = middle[0], middle[width - 1]
+                _add_across(wide, across[band, i], filled, i == 0)
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _weigh_line(values, weight, out):
+    """Fills `out` (n,) with `values` (n,) times a weight."""
+    for k in range(out.size):
+        out[k] = weight * values[k]
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
 def _add_pairs(before, after, weight, earlier, later, other_weight, out):
-    """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weights (n,)."""
+    """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weight."""
     for k in range(out.size):
-        out[k] += weight[k] * (before[k] + after[k]) + other_weight[k] * (earlier[k] + later[k])
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _magnify(light, runs, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) with the magnified bands of `light`; see `_taps_of` for the taps.
-
-    Args:
-        light: (H, 3 W) radiance.
-        runs: (k, 3) first and end column of each run of pixels with the same taps, and their first tap.
-        across: (taps, 3 W) weights along the rows.
-        lines: (H,) first tap of each row.
-        down: (H, taps, 3) weights along the columns.
-        out: (H, 3 W) array to fill.
-        first, end: rows to fill.
-    """
-    rows, n = light.shape
-    pad = 3 * max(-runs[:, 2].min(), runs[:, 2].max() + across.shape[0] - 1, 0)
-    wide, pattern = np.empty(n + 2 * pad, np.float32), np.empty(3 * PATTERN_PX, np.float32)
-    for v in range(first, end):
-        between = wide[pad : pad + n]
-        for i in range(down.shape[1]):
-            red, green, blue = down[v, i, 0], down[v, i, 1], down[v, i, 2]
-            for u in range(PATTERN_PX):
-                pattern[3 * u], pattern[3 * u + 1], pattern[3 * u + 2] = red, green, blue
-            line = light[min(max(v + lines[v] + i, 0), rows - 1)]
-            for start in range(0, n, pattern.size):
-                stop = min(start + pattern.size, n)
-                _add_weighted(line[start:stop], pattern, between[start:stop], i == 0)
-        for k in range(pad):
-            wide[k], wide[pad + n + k] = between[k % 3], between[n - 3 + k % 3]
-        for r in range(runs.shape[0]):
-            start, stop = 3 * runs[r, 0], 3 * runs[r, 1]
-            filled = out[v, start:stop]
-            for i in range(across.shape[0]):
-                shift = pad + 3 * (runs[r, 2] + i)
-                _add_weighted(wide[shift + start : shift + stop], across[i, start:stop], filled, i == 0)
-            for k in range(filled.size):
-                filled[k] = max(filled[k], np.float32(0.0))
+        out[k] += weight * (before[k] + after[k]) + other_weight * (earlier[k] + later[k])
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
-def _add_weighted(values, weights, out, is_first):
-    """Adds `values` times `weights` (at least n,) to `out` (n,), or replaces it if `is_first`."""
+def _add_across(wide, weights, out, is_first):
+    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,).
+
+    If `is_first`, it replaces the values of `out`.
+    """
+    a, b, c, d, e = wide[0:], wide[1:], wide[2:], wide[3:], wide[4:]
+    f, g, h, i = wide[5:], wide[6:], wide[7:], wide[8:]
+    w0, w1, w2, w3, w4 = weights[0], weights[1], weights[2], weights[3], weights[4]
     if is_first:
         for k in range(out.size):
-            out[k] = weights[k] * values[k]
-    else:
-        for k in range(out.size):
-            out[k] += weights[k] * values[k]
+            out[k] = np.float32(0.0)
+    for k in range(out.size):
+        near = w1 * (d[k] + f[k]) + w2 * (c[k] + g[k])
+        out[k] += w0 * e[k] + near + (w3 * (b[k] + h[k]) + w4 * (a[k] + i[k]))
+
+
+@njit(cache=True, nogil=True)
+def _magnify(light, runs, across, lines, down, out, first, end):
+    """Fills rows `first` to `end` of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
+
+    The other arguments are those of `_Magnification`.
+    """
+    rows, _, width = light.shape
+    pad = max(-runs[:, 3].min(), runs[:, 3].max() + TAPS - 1, 0)
+    wide, filled = np.empty((3, width + 2 * pad), np.float32), np.empty((3, width), np.float32)
+    for v in range(first, end):
+        for band in range(3):
+            start, weights = v + lines[band, v], down[band, v]
+            a, b = light[min(max(start, 0), rows - 1), band], light[min(max(start + 1, 0), rows - 1), band]
+            c, d = light[min(max(start + 2, 0), rows - 1), band], light[min(max(start + 3, 0), rows - 1), band]
+            middle = wide[band, pad : pad + width]
+            _weighted_sum(a, b, c, d, weights[0], weights[1], weights[2], weights[3], middle)
+            for k in range(pad):
+                wide[band, k], wide[band, pad + width + k] = middle[0], middle[width - 1]
+        for r in range(runs.shape[0]):
+            band, start, stop, shift = runs[r, 0], runs[r, 1], runs[r, 2], pad + runs[r, 3]
+            a, b = across[band, 0, start:stop], across[band, 1, start:stop]
+            c, d = across[band, 2, start:stop], across[band, 3, start:stop]
+            _weigh_across(wide[band, shift + start :], a, b, c, d, filled[band, start:stop])
+        _join_row(filled[0], filled[1], filled[2], out[v])
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _weighted_sum(a, b, c, d, of_a, of_b, of_c, of_d, out):
+    """Fills `out` (n,) with the sum of four arrays (n,) times their weights."""
+    for k in range(out.size):
+        out[k] = of_a * a[k] + of_b * b[k] + of_c * c[k] + of_d * d[k]
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
+    """Fills `out` (n,) with the sums of TAPS consecutive `values` (n + TAPS - 1,) times their weights (n,)."""
+    second, third, fourth = values[1:], values[2:], values[3:]
+    for k in range(out.size):
+        left = of_first[k] * values[k] + of_second[k] * second[k]
+        out[k] = left + of_third[k] * third[k] + of_fourth[k] * fourth[k]
 
 
 @njit(cache=True, nogil=True)
@@ -318,8 +381,8 @@ def _defocus(light, near, scale, focus, out, first, end):
 
     Args:
         near: (H, W) inverse depth [1/m].
-        scale: diameter of the aperture times the focal length [px m]; this times the difference between the inverse
-            depth and `focus` is the diameter of the disc [px].
+        scale: diameter of the aperture times the focal length [px m]; this times the absolute difference between the
+            inverse depth and `focus` is the diameter of the disc [px].
         focus: inverse of the depth in focus [1/m].
     """
     rows, width = near.shape
@@ -343,6 +406,7 @@ def _defocus_row(above, here, below, diameter, out):
     """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel that has the moments of a disc.
 
     A disc of diameter c has the variance c^2 / 16 along each axis and the fourth moment <x^2 y^2> = c^4 / 384.
+    Diameters above `SMALL_PX` count as `SMALL_PX`.
     """
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
@@ -359,7 +423,10 @@ def _defocus_row(above, here, below, diameter, out):
 
 @njit(cache=True, nogil=True)
 def _gather(light, v, u, diameter, rows, width, out):
-    """Writes to `out` (3,) the mean radiance over a disc with an antialiased edge around pixel (v, u)."""
+    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u).
+
+    Beyond the image border, the pixels of the border are repeated.
+    """
     radius = np.float32(0.5) * diameter + np.float32(0.5)
     reach = int(radius)
     red = green = blue = total = np.float32(0.0)

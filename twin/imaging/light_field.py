@@ -1,4 +1,4 @@
-"""Radiance of daylight in level water by the method of discrete ordinates, for one colour band.
+"""Radiance of daylight in water with a flat surface, by the method of discrete ordinates, for one colour band.
 
 The water is homogeneous and lies between a surface, which reflects no upwelling light, and a black floor. With the
 depth z, the cosine mu of the angle of propagation from straight down and the azimuth from that of the sun's beam, the
@@ -8,7 +8,8 @@ radiance is a cosine series in the azimuth whose terms L_m obey (Chandrasekhar 1
     mu dL_m/dz = -c L_m + b integral h_m(mu, mu') L_m(mu') dmu' + beam,
     h_m = 1/2 sum_l (2 l + 1) chi_l P_l^m(mu) P_l^m(mu'),
 
-with chi_l the Legendre moments of the phase function. At the nodes of a quadrature this is a system of linear
+with chi_l the Legendre moments of the phase function, and P_l^m the associated Legendre functions multiplied by
+sqrt((l - m)! / (l + m)!). At the nodes of a quadrature this is a system of linear
 differential equations with constant coefficients, which is solved by eigenvectors. The forward peak counts as
 unscattered (delta-M+, Lin et al. 2018, J. Quant. Spectrosc. Radiat. Transf. 208, 140), and sunlight that is scattered
 once into the line of sight is computed with the phase function itself (Nakajima & Tanaka 1988, J. Quant. Spectrosc.
@@ -30,8 +31,8 @@ Array = NDArray[np.float64]
 
 ORDERS = 32  # number L of Legendre moments
 NODES = 11, 9  # quadrature nodes outside the cone of the sky, and within it
-SLOPE_MODES, SLOPE_ORDERS = 8, 14  # terms of the series in azimuth, and moments, for the light on slopes
-STEEPEST_DEG, LEVEL_WEIGHT = 75.0, 100.0  # slopes to which the light is fitted, and weight of the level floor
+SLOPE_MODES, SLOPE_ORDERS = 8, 14  # light on slopes: terms of the series in azimuth, end of the even moments
+STEEPEST_DEG, LEVEL_WEIGHT = 75.0, 100.0  # steepest slope to which the light is fitted, and weight of the level floor
 LEAST_PEAK = 1e-9  # with a smaller moment L, a phase function has no forward peak
 LEAST_ABSORPTION = 1e-6  # per unit of scattering: without absorption two eigenvalues coincide
 _SLOPES = np.deg2rad(np.linspace(0.0, STEEPEST_DEG, 16)), np.deg2rad(np.linspace(0.0, 180.0, 13))
@@ -67,7 +68,7 @@ class _Mode(NamedTuple):
         down, up: (n, n) downwelling and upwelling parts of the decaying eigenvectors; exchanged in the growing ones.
         beam_down, beam_up: (n,) particular solution at depth 0.
         sky: (n,) radiance of the sky at the surface.
-        kernel: (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes.
+        kernel: (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`.
     """
 
     decay_per_m: Array
@@ -110,7 +111,7 @@ class LightField:
 
     @property
     def beam_per_m(self) -> float:
-        """Attenuation with depth of the sun's beam, which includes light scattered within the forward peak [1/m]."""
+        """Attenuation of the sun's beam with depth [1/m]; light scattered within the forward peak counts as beam."""
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
@@ -137,8 +138,8 @@ class LightField:
     def slope_form(self, depth_m: float, floor_m: float) -> Array:
         """Returns the light without the beam on a slope as a quadratic form (4, 4) of its normal [lx].
 
-        With the unit normal n in axes towards the sun (horizontal), left of it and up, the illuminance is
-        (n, 1) Q (n, 1)'. It is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
+        With the unit normal n in the axes x horizontally towards the sun, y to the left of x, and z up, the illuminance
+        is (n, 1) Q (n, 1)'. It is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
         of the radiance and of Lambert's cosine (Ramamoorthi & Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); the
         illuminance of a level floor, which has the weight `LEVEL_WEIGHT`, is almost exact.
         """
@@ -270,9 +271,9 @@ class LightField:
 def _without_peak(water: BandOptics) -> _Scaled:
     """Returns the water without the forward peak of its phase function, a narrow Gaussian (delta-M+).
 
-    The peak has the moments f exp(-l^2 / (2 s^2)) of degree l, with f and s such that the remaining moments reach 0 at
-    l = `ORDERS` with slope 0. Moments that end with another slope (delta-M) cause oscillations of the radiance, up to
-    6 % opposite the sun.
+    The peak has the moments f exp(-l^2 / (2 s^2)) of degree l, with f and s such that the remaining moments are 0 at
+    l = `ORDERS` and `ORDERS` + 1, i.e. reach 0 with slope 0. Moments that end with another slope (delta-M) cause
+    oscillations of the radiance, up to 6 % opposite the sun.
     """
     chi, b = legendre_moments(water.phase, ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)

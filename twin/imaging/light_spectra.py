@@ -32,6 +32,9 @@ def spectrum_of(light: Light) -> Array:
 
     Args:
         light: "led": CIE illuminant LED-B5; "daylight": CIE illuminant D65.
+
+    Raises:
+        TwinError: the package `jerlov`, which has the table of D65, is not installed.
     """
     nm, power = (np.arange(400.0, 701.0, 5.0), LED_B5) if light == "led" else jerlov_package().d65()
     spectrum = np.interp(NM, nm, power)

@@ -57,7 +57,7 @@ class Target(NamedTuple):
         depth: depth along the optical axis [m]; inf where there is nothing.
         albedo: (H, W, 3) uint8; None: not drawn.
         normal: (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn.
-        label: (H, W) uint16 number of the object in each pixel; None: not drawn.
+        label: (H, W) uint16 `label` that `draw_mesh` was given for the mesh in each pixel; None: not drawn.
     """
 
     depth: Depth
@@ -78,11 +78,11 @@ def draw_mesh(
 
     Args:
         mesh: the mesh.
-        camera_from_object: (4, 4) or (3, 4) map from the axes of the mesh to those of the camera.
+        camera_from_object: (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera.
         projection: projection of the camera.
         target: images to draw into.
         label: number to write into `target.label`.
-        closed: whether the mesh is closed, so that the triangles that face away need not be drawn.
+        closed: whether the mesh is closed, so that the triangles that face away are not drawn.
     """
     matrix = np.ascontiguousarray(camera_from_object[:3], np.float64)
     _draw(*mesh, matrix, projection, *target, np.uint16(label), closed)
@@ -111,7 +111,7 @@ def _draw(vertices, faces, colours, matrix, projection, depth, albedo, normal, l
             continue
         ua, va, ub, vb, uc, vc = place[i, 0], place[i, 1], place[j, 0], place[j, 1], place[k, 0], place[k, 1]
         area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if area == 0 or (closed and area > 0):  # rows run downwards, so triangles that face the viewer are clockwise
+        if area == 0 or (closed and area > 0):  # the area is negative if the triangle faces the viewer
             continue
         first_u = max(int(np.ceil(max(min(ua, ub, uc), -1.0))), 0)
         last_u = int(np.floor(min(max(ua, ub, uc), width - 1.0)))

@@ -15,7 +15,7 @@ NORMAL_MASK = (1 << NORMAL_BITS) - 1
 
 @cache
 def normal_numbers() -> NDArray[np.float32]:
-    """Returns 2^NORMAL_BITS equally probable standard normal numbers, up to 3.7 sigma, with variance exactly 1."""
+    """Returns 2^NORMAL_BITS equally probable normal numbers, up to 3.7 in magnitude, with mean 0 and variance 1."""
     quantiles = ndtri((np.arange(1 << NORMAL_BITS) + 0.5) / (1 << NORMAL_BITS))
     return (quantiles / quantiles.std()).astype(np.float32)
 

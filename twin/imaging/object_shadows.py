@@ -26,7 +26,7 @@ Depth = NDArray[np.float32]
 STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
 MARGIN_PX = 2.0  #: of the map around these points
 WIDEST_TANGENT = 5.0  #: of half the field of view of a map; points farther off its axis count as lit
-BIAS_PX = 1.5  #: least distance between a lit point of an object and what occludes it, on a surface facing the light
+BIAS_PX = 1.5  #: least distance from an occluder to a point of an object that it shades, if the surface faces the light
 STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias grows
 
 
@@ -74,7 +74,7 @@ class ObjectShadows:
 
         Args:
             lit: 0 where the floor occludes the light, else 1; modified in place.
-            depth: (H, W) depth of floor and objects along the optical axis [m].
+            depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
             view: the objects in the image.
             world_from_camera: (4, 4) pose of this camera.
             moment: camera (0 left, 1 right), and time since the start of the survey [s].
@@ -111,7 +111,13 @@ class ObjectShadows:
 
 
 def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
-    """Returns the view of a lamp, with its axis in the mean direction of the points; None if none is in front."""
+    """Returns the view of a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
+
+    Args:
+        lamp_m: (3,) position of the lamp in the axes of the camera.
+        points: (n, 3) points that the map shows, in the axes of the camera [m].
+        shape: rows and columns of the image.
+    """
     away = points - lamp_m
     rotation = _axes_along((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0))
     seen = away @ rotation
@@ -132,7 +138,13 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
-    """Returns the parallel view of the sun, whose direction `to_sun` (3,) is in the axes of the camera."""
+    """Returns the parallel view of the sun.
+
+    Args:
+        to_sun: (3,) unit direction to the sun in the axes of the camera.
+        points: (n, 3) points that the map shows, in the axes of the camera [m].
+        shape: rows and columns of the image.
+    """
     rotation = _axes_along(-to_sun)
     seen = points @ rotation
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
@@ -145,7 +157,13 @@ def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightVie
 
 
 def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
-    """Returns the focal length or scale [px] of a shadow map of this extent with about as many pixels as the image."""
+    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image.
+
+    Args:
+        low, high: (2,) lower and upper ends of the map along columns and rows: tangents for a focal length, metres for
+            a scale.
+        shape: rows and columns of the image.
+    """
     area = np.maximum(high - low, 1e-3).prod()
     return float(np.sqrt(shape[0] * shape[1] / area))
 
@@ -165,7 +183,12 @@ def _axes_along(forward: Array) -> Array:
 
 
 def _looking(rotation: Array, position_m: Array) -> Array:
-    """Returns the transform (4, 4) from camera axes to those of a view, whose axes are the columns of `rotation`."""
+    """Returns the transform (4, 4) from the axes of the camera to those of a view.
+
+    Args:
+        rotation: (3, 3) axes of the view, as columns, in the axes of the camera.
+        position_m: (3,) origin of the view in the axes of the camera.
+    """
     return geometry.inverse(geometry.pose(rotation, position_m))
 
 
@@ -173,8 +196,9 @@ def _looking(rotation: Array, position_m: Array) -> Array:
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection):
     """Sets `lit` (H, W) to 0 where the map `nearest` shows an object that occludes the light.
 
-    A point is occluded if the map is nearer than the point minus a bias. On an object, the bias is BIAS_PX pixels of
-    the map times 1 + the tangent of the angle of incidence; on the floor, it is one pixel of the map.
+    A point is occluded if the depth in the map is less than that of the point minus a bias. On an object, the bias is
+    BIAS_PX pixels of the map times 1 + the tangent of the angle of incidence, at most STEEPEST; on the floor, it is one
+    pixel of the map. Surfaces of objects that face away from the light are not lit either.
     """
     scale, cx, cy, _, perspective = projection
     height, width = depth.shape

@@ -18,11 +18,14 @@ from twin.imaging.sway import largest_displacement_m, swayed
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-LEVEL_PX = 1.0  #: largest cell of a level of detail in the image [px]
+LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image [px]
 
 
 class DrawnMesh(NamedTuple):
-    """A mesh to draw: triangles, pose relative to the camera (4, 4), number of the object, and whether it is closed."""
+    """A mesh to draw: triangles, pose (4, 4) times scale relative to the camera, number of the object, whether closed.
+
+    The number of an object is its index in `Objects.placed`.
+    """
 
     mesh: Mesh
     camera_from_object: Array
@@ -48,7 +51,7 @@ class Objects:
         """Yields the meshes of the objects in view, nearest first.
 
         Args:
-            camera_from_world: (4, 4) transform to the axes of the camera.
+            camera_from_world: (4, 4) transform from world axes to those of the camera.
             limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
             pixel: projection, whose pixels determine the levels of detail.
             time_s: time since the start of the survey.
@@ -84,7 +87,7 @@ class ObjectRenderer:
 
         Args:
             albedo: (H, W, 3) uint8 albedo of the floor.
-            depth: (H, W) depth of the floor along the optical axis [m].
+            depth: (H, W) float32 depth of the floor along the optical axis [m]; inf where there is no floor.
             world_from_camera: (4, 4) pose of the camera.
             time_s: time since the start of the survey.
         """
@@ -107,6 +110,6 @@ def frustum(rig: StereoRig) -> Array:
 
 
 def _level(item: PlacedObject, cell_m: float) -> Mesh:
-    """Returns the coarsest level of detail of an object whose cells are at most `cell_m` in the world."""
+    """Returns the coarsest level of detail of an object whose cells have sides of at most `cell_m` in the world."""
     fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
     return fine_enough[-1].mesh

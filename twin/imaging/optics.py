@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -44,10 +44,17 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 Lit = NDArray[np.uint8]
+Value = TypeVar("Value")
 
 LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the light of the floor
-ALBEDO_STEP_PX = 16  # spacing of the pixels from whose mean the albedo of the floor around the image is computed
-_NO_BACKSCATTER = np.zeros((0, 0, 0, 4), np.float32)
+ALBEDO_STEP_PX = 16  # spacing of the pixels whose mean albedo is that of the floor around the image
+#: Arguments of `shading.shade` for effects that an image does not have.
+_NO_BACKSCATTER = _NO_SOFT_LAMPS = np.zeros((0, 0, 0, 4), np.float32)
+_NO_FACETS = FacetView(
+    np.zeros((0, 0, 2), np.int32), np.zeros(2, np.int32), np.zeros((2, 4), np.float32), np.zeros((3, 3), np.float32)
+)
+_NO_SHADOWS, _NO_CAUSTICS = np.zeros((0, 0, 0), np.uint8), np.zeros((0, 0), np.float32)
+_NO_OBJECTS = ObjectView(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.uint16))
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
 
@@ -83,8 +90,8 @@ class FloorView(NamedTuple):
 
     Args:
         facets: triangles of the floor; None = the normals are computed from the depth.
-        lit: (lamps, H, W) uint8, 0 where the floor blocks the light of the lamp, else 1; the last one is for the sun if
-            it casts shadows; None = no shadows.
+        lit: (lamps, H, W) uint8, 0 where floor or objects block the light of the lamp, else 1; the last one is for the
+            sun if it casts shadows; None = no shadows.
         material: reflection of the unscattered light of lamps; None = Lambertian.
         objects: normals of the pixels that show objects; None = the image shows the floor alone.
     """
@@ -120,7 +127,8 @@ class WhiteFloor(NamedTuple):
         core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) with single
             scattering.
         spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
-            alone, and its albedo, of which the mean is that of the floor around the image; None with single scattering.
+            alone, and its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None
+            with single scattering.
     """
 
     floor: Radiance
@@ -134,9 +142,9 @@ class _Tables(NamedTuple):
     """Lookup tables of the shading kernel (`shading.shade`) for one camera.
 
     Args:
-        beams: (lamps, n) intensity relative to that on the axis, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
-        all_light, scattered: (lamps, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; None with
-            single scattering.
+        beams: (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
+        all_light, scattered: (lamps, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; None
+            without multiple scattering or without lamps.
         transmission: (3, n) exp(-c s) at equal steps of the path length s.
         backscatter: (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of
             r / (r + `RANGE_SCALE_M`), with r the range; R, G, B and a zero.
@@ -153,9 +161,9 @@ class _Output(NamedTuple):
     """Arrays that the shading kernel fills; the arguments of `shading.shade` with the same names."""
 
     out: Radiance
-    other: Radiance | None = None
-    kept: NDArray[np.float32] | None = None
-    place: Place | None = None
+    other: Radiance = np.zeros((0, 0, 3), np.float32)
+    kept: NDArray[np.float32] = np.zeros((0, 4), np.float32)
+    place: Place = np.zeros((0, 0), np.float32)
 
 
 class Optics:
@@ -169,6 +177,9 @@ class Optics:
     Attributes:
         light_sources: lamps and daylight in the axes of the left and of the right camera.
         lamp_light: light of the lamps in the water, in the axes of the left and of the right camera.
+
+    Raises:
+        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, rig: StereoRig, illumination: Illumination, lamps: Sequence[LampConfig]):
@@ -238,7 +249,8 @@ class Optics:
     ) -> Radiance:
         """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where the transmission to the camera is too small.
 
-        It is computed from the light of a white floor, divided by the transmission from floor to camera.
+        It is computed from the light of a white Lambertian floor, divided by the transmission from floor to camera. The
+        arguments are those of `radiance`.
         """
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
@@ -304,7 +316,7 @@ class Optics:
             camera, floor, surface: see `radiance`.
             out: arrays to fill.
             focal_px: given if the image is that of the surroundings, which has this focal length and no backscatter.
-            day_loss_per_m: (3,) loss of daylight between floor and camera; None: that of the illumination.
+            day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
         """
         albedo, depth = image
         sources, focal = self.light_sources[camera], np.float32(focal_px or self._rig.focal_px)
@@ -316,9 +328,11 @@ class Optics:
         backscatter = _NO_BACKSCATTER if focal_px else self._backscatter(camera, above)
         seen = FloorView() if floor is None else floor
         soft = tables.all_light if seen.lit is None and seen.material is None else tables.scattered
-        light = lamps, tables.beams, soft, tables.transmission, backscatter, sky
+        light = lamps, tables.beams, _or(soft, _NO_SOFT_LAMPS), tables.transmission, backscatter, sky
         scene = np.ascontiguousarray(albedo), depth, focal, *light
-        in_row_bands(lambda first, end: shade(*scene, *seen, *out, first, end), len(depth))
+        facets, objects = _or(seen.facets, _NO_FACETS), _or(seen.objects, _NO_OBJECTS)
+        view = facets, _or(seen.lit, _NO_SHADOWS), seen.material, objects
+        in_row_bands(lambda first, end: shade(*scene, *view, *out, first, end), len(depth))
 
     def _backscatter(self, camera: int, surface: WaterSurface) -> NDArray[np.float32]:
         """Returns the backscatter of lamps and daylight, see `_Tables.backscatter`."""
@@ -327,6 +341,11 @@ class Optics:
             return of_lamps
         rays = grid_rays(self._rig, grid_of(self.light_sources[camera].beam)) @ _world_axes(surface)
         return of_lamps + with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
+
+
+def _or(value: Value | None, substitute: Value) -> Value:
+    """Returns the value; the substitute if the value is None."""
+    return substitute if value is None else value
 
 
 def _working_memory(rig: StereoRig) -> tuple[Radiance, Place]:
@@ -343,7 +362,7 @@ def range_of(depth: Depth, rig: StereoRig) -> Array:
 
 
 def _world_axes(surface: WaterSurface) -> Array:
-    """Returns the directions east, north and up in the axes of the camera, as columns (3, 3)."""
+    """Returns the unit vectors east, north and up in the axes of the camera, as columns (3, 3)."""
     rows = surface.from_camera[:, :3] / np.linalg.norm(surface.from_camera[:, :3], axis=1, keepdims=True)
     return np.column_stack([rows[0], rows[1], -rows[2]])
 
@@ -360,7 +379,7 @@ def _sky(daylight: FloorDaylight, loss_per_m: Array, surface: WaterSurface) -> t
     fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m])
     given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, loss_per_m
     arrays = [np.ascontiguousarray(value, np.float32) for value in given]
-    return *arrays, surface.caustics, np.asarray(surface.from_camera, np.float32)
+    return *arrays, _or(surface.caustics, _NO_CAUSTICS), np.asarray(surface.from_camera, np.float32)
 
 
 def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:
@@ -374,5 +393,5 @@ def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:
 
 
 def _transmission(per_m: Array) -> NDArray[np.float32]:
-    """Returns the transmission (3, n) at equal steps of path length, for attenuation coefficients `per_m` (3,)."""
+    """Returns the transmission (3, n) at steps of `PATH_STEP_M`, for attenuation coefficients `per_m` (3,) [1/m]."""
     return np.exp(-per_m[:, None] * np.arange(0.0, PATH_MAX_M, PATH_STEP_M)).astype(np.float32)

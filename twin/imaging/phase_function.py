@@ -17,9 +17,9 @@ Array = NDArray[np.float64]
 #: Phase function [1/sr] of the scattering angle [rad], for angles of any shape.
 PhaseFunction = Callable[[Array], Array]
 
-CELLS = 4096  # number of cells of a table
+CELLS = 4096  # number of cells of a table of `tabulate`
 _GAUSS = np.polynomial.legendre.leggauss(6)
-MOLECULAR_PER_M, MOLECULAR_NM, MOLECULAR_EXPONENT = 0.00288, 500.0, 4.32
+MOLECULAR_PER_M, MOLECULAR_NM, MOLECULAR_EXPONENT = 0.00288, 500.0, 4.32  # see `molecular_scattering_per_m`
 
 #: Phase function of Petzold's average particle: angle [deg], density [1/sr]. Mean of the volume scattering functions
 #: that Petzold (1972, SIO Ref. 72-78) measured in San Diego Harbor (NUC 2200, 2040, 2240), each without the share of
@@ -46,11 +46,12 @@ class PhaseTable(NamedTuple):
     """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4).
 
     The cells are narrow where the function is steep: with n = 4096, their width is 0.0016 deg at 0.1 deg and
-    0.017 deg at 10 deg. Evaluation and sampling use the same piecewise constant function.
+    0.017 deg at 10 deg. The Monte Carlo reference evaluates and samples this piecewise
+    constant function; `phase_at` interpolates linearly between the centres of the cells.
 
     Args:
         density_per_sr: (n,) mean of the phase function over each cell.
-        cumulative: (n + 1,) share of the light that is scattered by less than the angle of each cell boundary.
+        cumulative: (n + 1,) share of the scattered light whose scattering angle is below each cell boundary.
         cumulative_angle: (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`.
         angle_integral: integral of density times angle from 0 to pi [rad^2/sr].
     """
@@ -74,7 +75,7 @@ class PhaseTable(NamedTuple):
 
     @property
     def backscatter_fraction(self) -> float:
-        """Fraction of the light that is scattered by more than 90 deg."""
+        """Fraction of the scattered light that is scattered by more than 90 deg."""
         boundary = 0.5**0.25 * (len(self.cumulative) - 1)
         return 1 - float(np.interp(boundary, np.arange(len(self.cumulative)), self.cumulative))
 
@@ -97,7 +98,13 @@ class Scatterer(NamedTuple):
 
 
 def molecular(angle: Array) -> Array:
-    """Returns the phase function of pure sea water: 0.06225 (1 + 0.835 cos^2) (Morel 1974; Mobley 1994, eq. 3.30)."""
+    """Returns the phase function of pure sea water [1/sr].
+
+    It is 0.06225 (1 + 0.835 cos^2) (Morel 1974; Mobley 1994, eq. 3.30).
+
+    Args:
+        angle: scattering angles of any shape [rad].
+    """
     return 3 / (4 * np.pi * (3 + 0.835)) * (1 + 0.835 * np.cos(angle) ** 2)
 
 
@@ -110,6 +117,9 @@ def petzold(angle: Array) -> Array:
     """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`.
 
     Below the first angle of the table, the function is extrapolated with its first slope.
+
+    Args:
+        angle: scattering angles of any shape [rad].
     """
     log_angle, log_density = np.log(np.deg2rad([row[0] for row in PETZOLD])), np.log([row[1] for row in PETZOLD])
     wanted = np.log(np.maximum(angle, 1e-12))
@@ -156,19 +166,6 @@ def fournier_forand(index: float, slope: float) -> PhaseFunction:
 def mixture(particles: PhaseFunction, molecular_share: float) -> PhaseFunction:
     """Returns the phase function of water whose molecules cause the share `molecular_share` of its scattering."""
     return lambda angle: molecular_share * molecular(angle) + (1 - molecular_share) * particles(angle)
-
-
-def sea_water(scattering_per_m: float, wavelength_nm: float, particles: PhaseFunction = petzold) -> PhaseFunction:
-    """Returns the phase function of sea water: molecules by Morel's coefficient, the rest of b by particles.
-
-    Args:
-        scattering_per_m: scattering coefficient b of molecules and particles; if it is less than Morel's coefficient of
-            pure sea water, all scattering is molecular.
-        wavelength_nm: wavelength in air.
-        particles: phase function of the particles.
-    """
-    molecules = float(molecular_scattering_per_m(np.array(wavelength_nm)))
-    return mixture(particles, min(molecules / scattering_per_m, 1.0) if scattering_per_m else 1.0)
 
 
 def tabulate(phase: PhaseFunction) -> PhaseTable:

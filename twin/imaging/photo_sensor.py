@@ -19,7 +19,7 @@ from twin.imaging.tone import linear_of, tone
 from twin.imaging.white_balance import WhiteBalance
 from twin.scenario.model import Scenario, SensorConfig
 
-BLACK_SHARE = 1 / 64  # black level as a fraction of full scale, so that dark noise is not clipped at zero
+BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so that dark noise is not clipped at zero
 
 
 class Sensor(Protocol):
@@ -40,6 +40,9 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
     Args:
         scenario: survey scenario.
         raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
+
+    Raises:
+        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
@@ -54,6 +57,9 @@ class PhotoSensor:
         scenario: survey scenario.
         sensor: section [sensor] of the scenario.
         raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
+
+    Raises:
+        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -73,7 +79,9 @@ class PhotoSensor:
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
     def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
-        """Returns this frame's exposure, metered on the previous frames, and meters `light` for the later frames.
+        """Returns this frame's exposure, and meters `light` for the later frames.
+
+        The exposure is metered on the previous frames, that of the first frame on `light`.
 
         Args:
             light: (h, w, 3) radiance of every n-th raw pixel along columns and rows.
@@ -99,7 +107,8 @@ class PhotoSensor:
         Args:
             twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
             setting: exposure of this frame.
-            n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor.
+            n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor; the
+                read-out time of the result is that of these rows.
         """
         row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
         readout_s = row_ratio * self._sensor.readout_ms / 1000
@@ -126,7 +135,7 @@ class PhotoSensor:
         Subtracts the black level, applies white balance and tone curve, and demosaics.
 
         Args:
-            raw: digital numbers.
+            raw: digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
             white: factors of R, G, B; None = those of white light.
         """
         toned = np.empty(raw.shape, np.uint8)

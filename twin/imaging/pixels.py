@@ -20,7 +20,7 @@ from twin.imaging.row_parallel import in_row_bands
 Raw = NDArray[np.uint16]
 
 FEW_ELECTRONS = 10  # below this mean: exact Poisson numbers; above: normal numbers corrected for skewness
-MOST_ELECTRONS = 80  # largest number that `_poisson` returns; practically never reached for means below 10
+MOST_ELECTRONS = 80  # largest number that `_poisson` returns; for means below 10, the probability of more is negligible
 
 
 class PixelResponse(NamedTuple):
@@ -70,7 +70,14 @@ def read_out(
 
 @njit(cache=True, nogil=True)
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, W, 1 or 3) with digital numbers."""
+    """Fills rows `first` to `end` of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
+
+    Args:
+        response: (8,) float32 fields of `PixelResponse`, one after the other.
+        normal: table of `normal_numbers`.
+        seed: seed of the random numbers of this image.
+        noisy: whether to add noise.
+    """
     width, bands = out.shape[1:]
     n, few = width * bands, np.float32(FEW_ELECTRONS)
     expected, shot, read = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)

@@ -4,11 +4,11 @@ All quantities are in the axes of the camera with the entrance pupil of the lens
 air of refractive index 1. A ray of direction (X, Y, Z) in air is described by its normalised coordinates X / Z, Y / Z.
 
 Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a ray at a small angle
-leaves the outer face at height h and angle w, both proportional to its angle in air. The pinhole lies at a distance
-h / w from that face, on the side of the camera, and its focal length is that of the lens times the ratio of the angles
-in air and in water. For a flat pane at distance d, of thickness t and index g, in water of index n, the pinhole lies
-d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that of the lens. Treibitz et al. 2012
-(doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
+leaves the outer face at the distance h from the axis and the angle w to the axis, both proportional to its angle in
+air. The pinhole lies at a distance h / w from that face, on the side of the camera, and its focal length is that of
+the lens times the ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g,
+in water of index n, the pinhole lies d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that
+of the lens. Treibitz et al. 2012 (doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def air_coordinates(port: PortConfig, points_m: Array) -> Array:
     normalised = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
 
     def miss(at: Array) -> Array:
-        """Returns the lateral distance (..., 2) by which rays miss their points, divided by the depth of the points.
+        """Returns the vector (..., 2) across the axis by which rays miss their points, divided by the points' depth.
 
         Args:
             at: (..., 2) normalised coordinates of the rays in air.

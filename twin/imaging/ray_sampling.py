@@ -49,7 +49,7 @@ class RowMotion(NamedTuple):
 def intersect(
     depth: Depth, positions: Positions, parallax_px_m: Positions | None, motion: RowMotion | None = None
 ) -> Positions:
-    """Returns the image positions where the rays of pixels intersect the floor.
+    """Returns the image positions (h, w, 2) [px] where the rays of pixels intersect the floor.
 
     A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
     vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
@@ -57,7 +57,7 @@ def intersect(
 
     Args:
         depth: (H, W) depth [m]; inf where there is no floor.
-        positions: (h, w, 2) vanishing points of the rays.
+        positions: (h, w, 2) vanishing points of the rays [px].
         parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
         motion: motion of a camera with a rolling shutter; None = all rows are exposed together.
     """
@@ -118,8 +118,9 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
-    Rows 2 and 3 are the vanishing points of the rays, rows 4 and 5 their parallax, and row 6 the inverse depth,
-    initially that of the rays of the previous row. Row 7 is not used; `cells` (w,) int32 is working memory.
+    Rows 2 and 3 are filled with the vanishing points of the rays, rows 4 and 5 with their parallax, and row 6 with the
+    inverse depth of the floor. The iteration starts from the inverse depth of the previous row or, if `is_first`, from
+    that at the vanishing points. Row 7 is not used; `cells` (w,) int32 is working memory.
     """
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]

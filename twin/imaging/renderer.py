@@ -25,6 +25,7 @@ class Renderer:
         scene: MuJoCo model of the scene.
         width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
         znear_m, zfar_m: depths of the clipping planes.
+
     Raises:
         TwinError: OpenGL is not available.
     """
@@ -96,7 +97,10 @@ class Renderer:
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the visible tiles; removes the mesh of the others, as geoms without a mesh take almost no time."""
+        """Shows only the tiles of the mask `visible` (n,).
+
+        The others lose their mesh, as MuJoCo renders geoms without a mesh in almost no time.
+        """
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible

@@ -89,7 +89,7 @@ def _unpack(place, x, y):
 
 @njit(cache=True, nogil=True)
 def spline_row(source, x, y, weights, cells, out):
-    """Fills `out` (3 w,) with the B-splines of an image (H, 3 W) at columns x and rows y (w,).
+    """Fills `out` (3 w,) with the values of the cubic B-spline of an image (H, 3 W) at columns x and rows y (w,).
 
     `weights` (8, w) float32 and `cells` (w,) int32 are working memory.
     """
@@ -100,7 +100,7 @@ def spline_row(source, x, y, weights, cells, out):
 
 @njit(cache=True, nogil=True)
 def sum_row(source, x, y, weights, cells, out):
-    """Same as `spline_row`, for any weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
+    """Same as `spline_row`, for given weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
     rows, cols = source.shape[0], source.shape[1] // 3
     _inner_cells(x, y, rows, cols, cells)
     for u in range(x.size):
@@ -147,7 +147,7 @@ def _sum_at_border(source, x, y, weights, u, out):
 
 @njit(cache=True, nogil=True)
 def _filter_columns(image, first, end):
-    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored ends."""
+    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored borders."""
     for start in range(first, end, BLOCK):
         _filter_block(image, start, min(start + BLOCK, end))
 
@@ -183,7 +183,7 @@ def _filter_rows(image, first, end):
     """Same as `_filter_columns`, but for rows `first` to `end` of an image (H, 3 W).
 
     The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
-    |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the last pixel.
+    |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the previous pixel.
     """
     n = image.shape[1]
     width = n // 3
@@ -198,15 +198,12 @@ def _filter_rows(image, first, end):
             for band in range(3):
                 wide[3 * (TAPS - i) + band] = row[3 * before + band]
                 wide[3 * (TAPS + width - 1 + i) + band] = row[3 * after + band]
-        middle = wide[3 * TAPS : 3 * TAPS + n]
         for k in range(n):
-            row[k] = middle_weight * middle[k]
-        weight = middle_weight
-        for i in range(1, TAPS + 1):
-            weight *= pole
-            left, right = wide[3 * (TAPS - i) : 3 * (TAPS - i) + n], wide[3 * (TAPS + i) : 3 * (TAPS + i) + n]
-            for k in range(n):
-                row[k] += weight * (left[k] + right[k])
+            total, weight, at = middle_weight * wide[k + 3 * TAPS], middle_weight, np.uint32(k)
+            for i in range(1, TAPS + 1):  # the innermost loop, so that each value is written once
+                weight *= pole
+                total += weight * (wide[at + np.uint32(3 * (TAPS - i))] + wide[at + np.uint32(3 * (TAPS + i))])
+            row[k] = total
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,8 @@ is subtracted, and the rest is light without blur:
     rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
 
 The first estimate is right for all detail that is wider than the blur, so few steps suffice. Marine snow, caustics,
-blur of the lens and of motion, and saturated pixels are not restored; the floor is taken to be Lambertian.
+shadows of objects, blur of the lens and of motion, and saturated pixels are not restored; the floor is taken to be
+Lambertian.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from twin.imaging.facets import Facets
 from twin.imaging.illumination import Illumination
 from twin.imaging.optics import Depth, FloorView, Optics, Radiance, calm_surface
 from twin.imaging.photons import vignetting
-from twin.imaging.shadows import Shadows
+from twin.imaging.shadows import Shadows, direction_to_casting_sun
 from twin.imaging.tone import linear_of
 from twin.scenario.model import Scenario
 
@@ -40,7 +41,7 @@ Array = NDArray[np.float64]
 
 DEPTH_STEP_PX = 4  # spacing of the pixels whose depth is computed; light depends on depth smoothly
 STEPS = 2  # number of corrections of the blur
-_DARK = 1e-6  # least light of a white floor, relative to the brightest pixel, that is divided by
+_DARK = 1e-6  # pixels whose light of a white floor, relative to the brightest pixel, is below this get the albedo 0
 
 
 class EstimatedFloor(NamedTuple):
@@ -56,10 +57,13 @@ class Restoration:
     """Restores the images of the left camera of a survey.
 
     Args:
-        scenario: believed lamps, sensor and daylight.
+        scenario: believed lamps and sensor, and whether the floor casts shadows (`imaging.shadows`).
         illumination: believed water and daylight.
         rig: believed calibration.
-        elevation: estimated map.
+        elevation: estimated map, with at least one height.
+
+    Raises:
+        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
@@ -70,7 +74,10 @@ class Restoration:
         sources = self._optics.light_sources
         self._shadows = None
         if scenario.imaging.shadows:
-            self._shadows = Shadows(floor, rig, [source.position_m for source in sources])
+            to_sun = direction_to_casting_sun(illumination.daylight)
+            if to_sun is not None:
+                to_sun = elevation.map_from_world[:3, :3] @ to_sun
+            self._shadows = Shadows(floor, rig, [source.position_m for source in sources], to_sun)
         self._signal = linear_signal(scenario)
         power = 0.0 if scenario.sensor is None else scenario.sensor.vignetting_power
         self._vignetting = vignetting(rig, power)[..., None]
@@ -82,7 +89,7 @@ class Restoration:
         """Returns the albedo (H, W, 3) float32 of the floor in an image, 255 = white.
 
         Args:
-            image: (H, W, 3) left image.
+            image: (H, W, 3) uint8 left image.
             exposure: exposure of the image (`Frame.exposure`).
             map_from_camera: (4, 4) pose of the camera in the axes of the estimated map.
 
@@ -118,14 +125,17 @@ class Restoration:
         return albedo
 
     def _depth(self, map_from_camera: Array) -> Depth:
-        """Returns the depth (H, W) of the estimated floor [m]; outside the map, that of a fitted plane."""
+        """Returns the depth (H, W) of the estimated floor [m].
+
+        Outside the map, it is that of a plane fitted to the depth inside, but at most the largest depth inside.
+        """
         rig = self._rig
         columns = max(2, rig.width_px // DEPTH_STEP_PX)
         pixels = floor_rays.ray_grid(rig, columns)
         depth = floor_rays.cast_pixels(self._field, map_from_camera[None], rig, pixels)[0]
         terms, per_m = np.column_stack([pixels, np.ones(len(pixels))]), 1 / depth
         known = per_m > 0
-        if known.sum() < 3:  # the image shows next to nothing of the map, so its colours are not used
+        if known.sum() < 3:  # too few rays meet the map to fit a plane; these colours are not used
             known, per_m = np.ones_like(known), np.full_like(per_m, 1 / rig.focal_px)
         plane = np.linalg.lstsq(terms[known], per_m[known], rcond=None)[0]
         per_m = np.where(known, per_m, np.maximum(terms @ plane, per_m[known].min()))

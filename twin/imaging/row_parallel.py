@@ -1,4 +1,4 @@
-"""Parallel processing: an image in bands of rows, or the two images of a stereo pair side by side.
+"""Parallel processing: an image in bands of rows, or the two images of a stereo pair at the same time.
 
 The result does not depend on the number of bands. Two images at a time take a tenth less processor time than the bands
 of one image after the other, as each processor keeps the data of its image in its caches, and waits only once.
@@ -24,7 +24,7 @@ _state = threading.local()  # `whole` is set while this thread processes one ima
 
 
 def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left, Right]:
-    """Returns the results of `left` and `right`, computed at the same time if processors are available.
+    """Returns the results of `left` and `right`, computed at the same time if there are `THREADS` processors.
 
     Meanwhile, `in_row_bands` does not split images.
 
@@ -55,7 +55,9 @@ def _whole(work: Callable[[], Left]) -> Left:
 
 
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: int = 1) -> None:
-    """Runs `work(first_row, end_row)` over all rows, in parallel if the image is large and processors are available.
+    """Runs `work(first_row, end_row)` over all rows, in parallel bands if the image is large.
+
+    All rows are one band if there are fewer than `THREADS` processors, or within a call of `in_pair`.
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.

@@ -23,14 +23,14 @@ Radiance = NDArray[np.float32]
 
 EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
 
-DARK_CD_M2 = 1e-6  # lower limit of the metered light
+DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
 
 
 class AutoExposure:
-    """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest channel reaches `gray_level`.
+    """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
 
-    The brightest channel is used because water absorbs the colours unequally: if the mean of all channels were metered,
-    the least absorbed channel would saturate. The gain of a frame is computed from the previous frames, as in a real
+    The brightest band is used because water absorbs the colours unequally: if the mean of all bands were metered, the
+    least absorbed band would saturate. The gain of a frame is computed from the previous frames, as in a real
     camera; the gain of the first frame is computed from that frame itself.
 
     Args:
@@ -38,6 +38,7 @@ class AutoExposure:
         frame_rate_hz: frames per second.
         lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
         limits: smallest and largest gain [1 / (cd/m2)].
+
     Attributes:
         share: fraction by which log gain approaches its target per frame.
     """
@@ -55,13 +56,14 @@ class AutoExposure:
         self._log_gain: float | None = None
 
     def gain(self, radiance: Radiance) -> float:
-        """Returns the gain of this frame [1 / (cd/m2)]; `radiance` (H, W, 3) affects the gain of later frames."""
+        """Returns the gain of this frame [1 / (cd/m2)], and meters `radiance` (H, W, 3) as in `gain_for`."""
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
-        """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest channel [cd/m2].
+        """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest band [cd/m2].
 
-        Except for the first frame, this mean affects only the gain of later frames. Their target gain is clipped.
+        Except for the first frame, this mean affects only the gain of later frames. The target gain is clipped to the
+        limits.
         """
         least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
@@ -75,7 +77,8 @@ class ExposureSetting(NamedTuple):
     """Exposure of one frame.
 
     Args:
-        gain: image signal per unit of radiance on the optical axis [1 / (cd/m2)]; a signal of 1 saturates.
+        gain: linear image signal per unit of radiance on the optical axis, with the white balance for white light
+            [1 / (cd/m2)]; a signal of 1 saturates.
         exposure_s: exposure time; 0 for a sensor without motion blur.
         analogue_gain: amplification before digitization.
         white: (3,) factors of R, G, B by the white balance of a sensor; None = those of white light.
@@ -88,14 +91,18 @@ class ExposureSetting(NamedTuple):
 
 
 class PlainSensor:
-    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`."""
+    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`.
+
+    Args:
+        scenario: survey scenario.
+    """
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
     def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
-        """Returns this frame's exposure, and meters `light` for the later frames; `every_px` is not used.
+        """Returns this frame's exposure, and meters `light` (h, w, 3) for the later frames; `every_px` is not used.
 
         The exposure is metered on the previous frames, that of the first frame on `light`.
         """
@@ -139,7 +146,7 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
 
 @njit(cache=True, nogil=True)
 def _mean(light):
-    """Returns the mean (3,) of each band of an image (H, 3 W), summed first over rows, then over columns."""
+    """Returns the mean (3,) of each band of an image (H, 3 W); each column is averaged first, then all columns."""
     columns, total = np.zeros(light.shape[1]), np.zeros(3)
     for v in range(light.shape[0]):
         row = light[v]

@@ -15,9 +15,9 @@ from twin.imaging.materials import add_reflected
 from twin.imaging.pixel_sum import sum_of_entries
 from twin.imaging.powers import LOG2_E, two_to
 
-PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the transmission tables
+PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the paths in the transmission tables
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
-RANGE_SCALE_M = 2.0  # scale of the backscatter table, with equal steps of r / (r + scale), r the range
+RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
@@ -29,35 +29,38 @@ def shade(
 ):  # fmt: skip
     """Computes the light of the floor and the backscatter in rows `first` to `end` of an image.
 
-    The compiler removes the code for arguments that are None.
+    An empty array stands for an effect that the image does not have, so one compiled version serves all images without
+    a `material`; for `material` None, the compiler removes the code of materials.
 
     Args:
         albedo: (H, W, 3) uint8, 255 = white.
-        depth: (H, W) depth along the optical axis [m].
+        depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
         focal: focal length [px].
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
-        beams: (n, m) intensity relative to that on the axis, at even steps of sqrt(1 - cos(angle)), 0 to 1.
+        beams: (n, m) relative intensity, at even steps of sqrt(1 - cos(angle)) from 0 to 1.
         soft: (n, k, l, 4) light of each lamp on the floor, at even steps of sqrt(1 - cos(angle)) and, for a distance d,
-            of d / (d + scale): with shadows or a material, the scattered light alone, else all light; None with single
+            of d / (d + scale): with shadows or a material, the scattered light alone, else all light; empty with single
             scattering.
-        transmission: (3, m) transmission at even steps of path length.
+        transmission: (3, m) transmission at steps of PATH_STEP_M.
         scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
-        sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], light of the sky (3, 10) [lx]
-            and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy, zz,
-            2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and range of the fit (3,) [m]; attenuation with
-            range from the camera (2, 3) of lamp light and of daylight [1/m]; caustics (m + 1, m + 1) or None; (3, 4)
+        sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other daylight (3, 10)
+            [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy,
+            zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and range of the fit (3,) [m]; attenuation with
+            range from the camera (2, 3) of lamp light and of daylight [1/m]; caustics (m + 1, m + 1) or empty; (3, 4)
             map from a point in the camera axes to column and row in the caustics and depth below the surface.
-        facets: triangles of the floor (`facets.FacetView`); None = normals from the depth.
-        lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where the floor blocks the light of a lamp, else 1; None = no
-            shadows.
+        facets: triangles of the floor (`facets.FacetView`); without normals = normals from the depth.
+        lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where floor or objects block the light, else 1; empty =
+            no shadows.
         material: reflection of the unscattered light of lamps (`materials.Material`); None = Lambertian.
-        objects: normals and labels of the pixels that show objects (`object_view.ObjectView`); None = no objects.
+        objects: normals and labels of the pixels that show objects (`mesh_raster.ObjectView`); empty = no objects.
         out: (H, W, 3) image, filled with the light of the floor that reaches the camera.
         other: (H, W, 3) image for the backscatter, to which the share `kept` of the light of the floor is added; if it
-            is None, the backscatter is added to `out`.
-        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale); None
-            without blur.
-        place: array to fill with the fractional row of `kept` for every second pixel of every second row.
+            is empty, the backscatter is added to `out`.
+        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale); empty:
+            the light of the floor is not added to `other`.
+        place: array to fill with the fractional row of `kept` for every second pixel of every second row; not used if
+            `kept` is empty.
+        first, end: the rows `first` to `end` - 1 are computed.
     """
     height, width = depth.shape
     rows, cols, ranges, _ = scatter_table.shape
@@ -70,31 +73,29 @@ def shade(
     lookup = cells[0], cells[1], parts[0], parts[1]
     row_table = np.empty((cols, ranges, 4), np.float32)
     sunny = beam[:, 0].max() > 0 or diffuse.max() > 0
+    softened, shadowed, apart = soft.shape[0] > 0, lit.shape[0] > 0, other.shape[0] > 0
     for v in range(first, end):
         y = (np.float32(v) - np.float32(0.5) * np.float32(height - 1)) / focal
-        if facets is None:
+        if facets.normals.shape[0] == 0:
             _range_and_normal(depth, v, y, focal, range_m, normal)
         else:
             _range_and_facet_normal(facets, depth[v], y, focal, cells, range_m, normal)
-        if objects is not None:
+        if objects.label.shape[0] > 0:
             _take_normals(objects, v, normal)
         light[:] = np.float32(0.0)
-        if material is not None:
-            reflected[:] = np.float32(0.0)
+        reflected[:] = np.float32(0.0)
         for k in range(lamps.shape[0]):
             _illuminate(lamps[k], depth[v], y, focal, normal, lamp)
-            if soft is not None:
+            if softened:
                 _add_soft_lamp(lamps[k], soft[k], lamp, lookup, light)
-            if lit is not None:
+            if shadowed:
                 for u in range(width):
                     lamp[0, u] = lamp[0, u] if lit[k, v, u] else np.float32(0.0)
             if material is not None:
                 arriving[:] = np.float32(0.0)
                 _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, arriving)
                 add_reflected(material, lamps[k], albedo[v], depth[v], y, focal, normal, arriving, reflected)
-            elif lit is not None:
-                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
-            elif soft is None:
+            elif shadowed or not softened:
                 _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
         if lamps.shape[0]:
             _attenuate(loss[0], range_m, light)
@@ -103,27 +104,25 @@ def shade(
         if sunny:
             _sample_caustics(depth[v], y, focal, caustics, surface, lookup, lamp[0])
             _face_sun(depth[v], y, focal, to_sun, surface, normal, lamp)
-            if lit is not None and lit.shape[0] > lamps.shape[0]:
+            if lit.shape[0] > lamps.shape[0]:
                 for u in range(width):
                     lamp[1, u] = lamp[1, u] if lit[lamps.shape[0], v, u] else np.float32(0.0)
             _add_daylight((beam, diffuse, change, fitted, loss[1]), normal, range_m, lamp, light)
         if ranges:
             _interpolate_rows(scatter_table, np.float32(v) * np.float32(rows - 1) / np.float32(height - 1), row_table)
             _interpolate_backscatter(row_table, range_m, lookup, backscatter)
-        if other is None:
-            if material is None:
-                _reflect(albedo[v], light, backscatter, out[v])
-            else:
-                reflected += backscatter
-                _reflect(albedo[v], light, reflected, out[v])
-        else:
-            _reflect(albedo[v], light, reflected, out[v])
+        if not apart:
+            reflected += backscatter
+        _reflect(albedo[v], light, reflected, out[v])
+        if apart:
             _join(out[v], v, kept, place, range_m, backscatter, lookup, other[v])
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_facet_normal(facets, here, y, focal, cells, range_m, normal):
-    """Computes range and unit normal (3, W) of the facets in a row of pixels; the normals point up in the world.
+    """Computes range (W,) and unit normals (3, W) of the facets in a row of pixels.
+
+    The normals are in the axes of the camera and point up in the world.
 
     Args:
         facets: `facets.FacetView`; its docstring defines the stored normals that are unpacked here.
@@ -165,7 +164,7 @@ def _range_and_facet_normal(facets, here, y, focal, cells, range_m, normal):
 
 @njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
 def _take_normals(objects, v, normal):
-    """Replaces the unit normals (3, W) of row v by those of the objects, in pixels that show objects."""
+    """Replaces the unit normals (3, W) of row v by those of the objects, in the pixels that show objects."""
     normals, labels = objects
     for u in range(labels.shape[1]):
         if labels[v, u]:
@@ -174,10 +173,11 @@ def _take_normals(objects, v, normal):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
-    """Computes range and unit normal (3, W) of the floor in a row of pixels; the normal points towards the camera.
+    """Computes range (W,) and unit normals (3, W) of the floor in a row of pixels.
 
-    The normal is computed from the depth gradient, for a floor without facets. In each direction, the smaller of the
-    depth differences to the two neighbours is used, so a depth edge does not tilt the normals next to it.
+    The normals point towards the camera. They are computed from the depth gradient, for a floor without facets. In each
+    direction, the smaller of the depth differences to the two neighbours is used, so a depth edge does not tilt the
+    normals next to it.
     """
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
@@ -203,7 +203,8 @@ def _illuminate(lamp, here, y, focal, normal, out):
     """Computes the illumination of the floor by a lamp for a row of pixels, without beam pattern and attenuation.
 
     Fills `out` (3, W): row 0 with the illuminance that an isotropic lamp would cause in clear water, row 1 with
-    sqrt(1 - cos(angle from the beam axis)), row 2 with the distance from the lamp.
+    sqrt(1 - cos(angle from the beam axis)), row 2 with the distance from the lamp. Rows 0 and 1 are 0 and 1 where there
+    is no floor, where it faces away from the lamp, and more than 90 deg from the beam axis.
     """
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
@@ -226,7 +227,10 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, transmission, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, attenuated on the path from lamp to floor."""
+    """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp.
+
+    `lamplight` (3, W) is the output of `_illuminate`; the light is attenuated on the path from lamp to floor.
+    """
     one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
@@ -251,7 +255,10 @@ def _add_lamp(lamp, beam, transmission, lamplight, lookup, light):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`."""
+    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`.
+
+    `lamplight` (3, W) is the output of `_illuminate`.
+    """
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     rows, cols = np.float32(soft.shape[0] - 1), np.float32(soft.shape[1] - 1)
@@ -279,7 +286,7 @@ def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _attenuate(per_m, range_m, light):
-    """Attenuates `light` (3, W) on the path from the floor to the camera, with the coefficients `per_m` (3,)."""
+    """Attenuates `light` (3, W) on the path from the floor to the camera, with the coefficients `per_m` (3,) [1/m]."""
     for c in range(3):
         by_range = -np.float32(LOG2_E) * per_m[c]
         for u in range(range_m.size):
@@ -292,7 +299,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
     half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
         share[u] = one if here[u] < far else zero
-    if caustics is None:
+    if caustics.shape[0] == 0:
         return
     last, stride = np.int32(caustics.shape[0] - 2), np.uint32(caustics.shape[0])
     at, _, to_east, to_north = lookup
@@ -414,11 +421,11 @@ def _reflect(albedo, light, backscatter, out):
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
     """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept` of the floor's light (W, 3).
 
-    If `kept` is None, the light of the floor is not added. Otherwise, if v is even, the function also fills row v / 2
+    If `kept` is empty, the light of the floor is not added. Otherwise, if v is even, the function also fills row v / 2
     of `place` with the fractional row of `kept` for every second pixel.
     """
     of_row, shown = out.reshape(-1), floor.reshape(-1)
-    if kept is None:
+    if kept.shape[0] == 0:
         for u in range(range_m.size):
             red, green, blue = backscatter[0, u], backscatter[1, u], backscatter[2, u]
             of_row[3 * u], of_row[3 * u + 1], of_row[3 * u + 2] = red, green, blue

@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging.facets import Heights
+from twin.imaging.illumination import Daylight
 from twin.imaging.optics import Depth, Lit
 from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 
 BLOCK_CELLS = 8  # side of a block of cells; the highest point of each block is stored
-STRIDE_PX = 8  # spacing of the pixels that are tested besides those around shadows
+STRIDE_PX = 8  # spacing along rows and columns of the pixels that are tested besides those around shadows
 DARK, OPEN, CLEAR = np.uint8(0), np.uint8(1), np.uint8(2)  # in shadow; not tested, counts as lit; tested and lit
 SUN_M = 1e5  # distance from the camera of a lamp that stands for the sun: rays to it are parallel within 0.1 mrad
 BIAS_M = 1e-4  # the floor must be this much higher than a ray to occlude it, as depth is in single precision
@@ -59,7 +60,7 @@ class Shadows:
         floor: heights of the floor.
         rig: the rendered cameras.
         lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
-        to_sun: (3,) unit direction to the sun in world axes; None = no sun, or one that casts no shadow.
+        to_sun: (3,) unit direction to the sun in the axes of the floor; None = no sun, or one that casts no shadow.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None = None):
@@ -73,7 +74,7 @@ class Shadows:
         The last mask is that of the sun if it casts shadows.
 
         Args:
-            depth: (H, W) depth along the optical axis [m].
+            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
             world_from_camera: (4, 4) pose of this camera.
             camera: 0 left, 1 right.
             label: (H, W) not 0 where the pixel shows an object above the floor; None: all show the floor.
@@ -87,6 +88,15 @@ class Shadows:
         in_row_bands(lambda first, end: _test_facing(*scene, label, out, first, end), len(depth))
         in_row_bands(lambda first, end: _grow_shadows(*scene, out, first, end), len(lamps), len(depth))
         return out
+
+
+def direction_to_casting_sun(daylight: Daylight) -> Array | None:
+    """Returns the unit direction (3,) to the sun under water, in world axes; None if it casts no shadow.
+
+    There is no shadow without daylight, and a sun in the zenith is assumed to cast none.
+    """
+    slanted = daylight.surface_lx.any() and daylight.source.sun_cosine < 1
+    return np.array(daylight.source.to_sun) if slanted else None
 
 
 def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -124,7 +134,7 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
-    """Computes for a row of pixels whether each shows the floor, and where it is in the world [m]."""
+    """Computes for a row of pixels whether each shows the floor, and the position of that point in the world [m]."""
     a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
     d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
     g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
@@ -178,7 +188,7 @@ def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
 def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
     """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing.
 
-    A ray is cast for every `STRIDE_PX`-th open pixel along rows and columns, and for every open neighbour of a dark
+    A ray is cast for each OPEN pixel of a grid with the spacing `STRIDE_PX`, and for each OPEN neighbour of a DARK
     pixel. In the completed masks, 0 is dark and 1 is lit.
     """
     height, width = depth.shape
@@ -210,7 +220,7 @@ def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _any_dark(row):
-    """Returns whether a row (w,) of marks has dark pixels; without branches, so that the compiler can vectorize it."""
+    """Returns whether a row (w,) of marks has DARK pixels; without branches, so that the compiler can vectorize it."""
     least = OPEN
     for u in range(row.size):
         least = min(least, row[u])

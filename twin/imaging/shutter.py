@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-SHORT_PX = 2.8  # longest path for the 3 x 3 kernel; at sqrt(8) px along a row its three weights are equal
+SHORT_PX = 2.8  # largest column and row extent of a path for the 3 x 3 kernel; at sqrt(8) px its weights are equal
 
 
 class ExposureMotion(NamedTuple):
@@ -59,11 +59,13 @@ class ExposureMotion(NamedTuple):
 def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
     """Returns the radiance (H, W, 3) recorded by a moving camera, with rolling shutter and motion blur.
 
+    The rolling shutter is left out if `motion.rolls_later`.
+
     Args:
         light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
-        depth: (H, W) depth in the same image [m].
-        focal_px: focal length.
-        motion: velocity of the camera and duration of exposure and read-out.
+        depth: (H, W) depth along the optical axis in the same image [m].
+        focal_px: focal length of that image.
+        motion: velocity of the camera, exposure time and read-out time.
     """
     if motion.readout_s and not motion.rolls_later:
         light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
@@ -93,7 +95,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 
     Args:
         light, depth, focal_px, twist: see `blur_by_motion`.
-        readout_s: time from the first row to the last.
+        readout_s: time from the first row of the image to the last.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     focal, whole_s = np.float32(focal_px), np.float32(readout_s)
@@ -114,7 +116,7 @@ def _flow(x, y, near, scale, twist):
     return scale * du, scale * dv
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
     """Fills rows `first` to `end` of `out` (H, W, 3) with motion blur; compiled kernel of `blur_by_motion`.
 
@@ -122,45 +124,66 @@ def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
     """
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
-    x, near = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    x, weights = np.empty(width, np.float32), np.empty((4, width), np.float32)
+    of_bands = np.empty((4, 3 * width), np.float32)
     for u in range(width):
-        x[3 * u : 3 * u + 3] = (np.float32(u) - np.float32(0.5) * np.float32(width - 1)) / focal
+        x[u] = (np.float32(u) - np.float32(0.5) * np.float32(width - 1)) / focal
     for v in range(first, end):
         y = (np.float32(v) - np.float32(0.5) * np.float32(height - 1)) / focal
-        for u in range(width):
-            near[3 * u] = near[3 * u + 1] = near[3 * u + 2] = np.float32(1.0) / depth[v, u]
-        rows = values[max(v - 1, 0)], values[v], values[min(v + 1, height - 1)]
-        short = _blur_row(rows[0], rows[1], rows[2], near, x, y, focal * exposure_s, twist, filled[v])
+        short = _blur_weights(depth[v], x, y, focal * exposure_s, twist, weights)
+        for k in range(4):
+            _repeat_for_bands(weights[k], of_bands[k])
+        _blur_row(values[max(v - 1, 0)], values[v], values[min(v + 1, height - 1)], of_bands, filled[v])
         for u in range(0, width, max(width - 1, 1) if short else 1):
-            du, dv = _flow(x[3 * u], y, near[3 * u], focal * exposure_s, twist)
+            du, dv = _flow(x[u], y, np.float32(1.0) / depth[v, u], focal * exposure_s, twist)
             if abs(dv) >= abs(du):
                 _average_along_path(flat, dv, du, v, u, height, width, width, 1, out[v, u])
             else:
                 _average_along_path(flat, du, dv, u, v, width, height, 1, width, out[v, u])
 
 
-@njit(cache=True, nogil=True)
-def _blur_row(above, here, below, near, x, y, scale, twist, out):
-    """Blurs a row (3 W,), except its first and last pixel; returns whether all its paths are short (`SHORT_PX`).
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blur_weights(depth, x, y, scale, twist, weights):
+    """Computes the weights (4, W) of `_blur_row`; returns whether all paths of the row are short (`SHORT_PX`).
 
     The weights of the 3 x 3 kernel have the moments of a uniform distribution along a straight path (a, b) [px]:
-    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80.
+    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80. They are those of the neighbours
+    in the row, in the column, on the falling and on the rising diagonal.
     """
+    half, quarter, one, n_long = np.float32(0.5), np.float32(0.25), np.float32(1.0), 0
+    across, down, falling, rising = weights[0], weights[1], weights[2], weights[3]
+    for u in range(x.size):
+        a, b = _flow(x[u], y, one / depth[u], scale, twist)
+        n_long += max(abs(a), abs(b)) > np.float32(SHORT_PX)
+        aa, bb, ab = a * a * np.float32(1 / 12), b * b * np.float32(1 / 12), a * b * np.float32(1 / 12)
+        both = ab * ab * np.float32(144 / 80)
+        across[u], down[u] = (aa - both) * half, (bb - both) * half
+        falling[u], rising[u] = (both + ab) * quarter, (both - ab) * quarter
+    return n_long == 0
+
+
+@njit(cache=True, nogil=True)
+def _repeat_for_bands(values, out):
+    """Fills `out` (3 W,) with each of the `values` (W,) three times, for R, G, B."""
+    for u in range(values.size):
+        value = values[u]
+        out[3 * u], out[3 * u + 1], out[3 * u + 2] = value, value, value
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+def _blur_row(above, here, below, weights, out):
+    """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel of `_blur_weights`, here (4, 3 W)."""
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
     b0, b1, b2 = here[before], here[middle], here[after]
     c0, c1, c2 = below[before], below[middle], below[after]
-    x, near, out = x[middle], near[middle], out[middle]
-    half, quarter, two, n_long = np.float32(0.5), np.float32(0.25), np.float32(2.0), 0
+    across, down, falling, rising = weights[0, 3:-3], weights[1, 3:-3], weights[2, 3:-3], weights[3, 3:-3]
+    out = out[middle]
     for k in range(out.size):
-        a, b = _flow(x[k], y, near[k], scale, twist)
-        n_long += max(abs(a), abs(b)) > np.float32(SHORT_PX)
-        aa, bb, ab = a * a * np.float32(1 / 12), b * b * np.float32(1 / 12), a * b * np.float32(1 / 12)
-        both, twice = ab * ab * np.float32(144 / 80), two * b1[k]
-        total = (aa - both) * half * (b0[k] + b2[k] - twice) + (bb - both) * half * (a1[k] + c1[k] - twice)
-        total += (both + ab) * quarter * (a0[k] + c2[k] - twice) + (both - ab) * quarter * (c0[k] + a2[k] - twice)
+        twice = np.float32(2.0) * b1[k]
+        total = across[k] * (b0[k] + b2[k] - twice) + down[k] * (a1[k] + c1[k] - twice)
+        total += falling[k] * (a0[k] + c2[k] - twice) + rising[k] * (c0[k] + a2[k] - twice)
         out[k] = max(b1[k] + total, np.float32(0.0))
-    return n_long == 0
 
 
 @njit(cache=True, nogil=True, inline="always")

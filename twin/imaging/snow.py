@@ -39,7 +39,7 @@ BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible 
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
 PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
-FOOTPRINT_PX = 4096  # largest footprint whose weights are stored; those of a larger one are computed twice
+FOOTPRINT_PX = 4096  # most pixels of a footprint whose weights are stored; those of a larger one are computed twice
 BLOCK = 512  # number of particles whose positions are computed at a time
 
 
@@ -73,7 +73,7 @@ class MarineSnow:
         rig: the rendered cameras.
         water: optical properties of the water.
         lamp_light: light of the lamps, and daylight, in the axes of the left and of the right camera.
-        rng: random stream of the particle positions and sizes.
+        rng: random stream of the particle positions and diameters.
         defocus: aperture and focus of the lens; None = an aperture of `APERTURE_M`, focused at infinity.
     """
 
@@ -108,7 +108,7 @@ class MarineSnow:
             camera: 0 left, 1 right.
             time_s: time since the start of the survey.
             reach_m: distance outside the view up to which particles are included, as they may move into the view.
-            farthest_m: largest depth.
+            farthest_m: largest depth of a particle.
         """
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
@@ -123,7 +123,10 @@ class MarineSnow:
         )
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
-            rig.project(points), points, self._radiance(points, self._lamp_light[camera]), diameter_m
+            rig.project(points),
+            points,
+            self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])),
+            diameter_m,
         )
 
     def draw(
@@ -164,7 +167,10 @@ class MarineSnow:
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
 
     def _reach_m(self, motion: ExposureMotion) -> float:
-        """Returns the largest distance that a particle near the camera moves in half the exposure and read-out [m]."""
+        """Returns an upper limit of the distance that a particle moves relative to the camera [m].
+
+        The time is half the exposure time plus half the read-out time.
+        """
         speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
         speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
@@ -198,14 +204,16 @@ class MarineSnow:
         along = points[:, :2] / points[:, 2:]
         return self._rig.focal_px * (velocity[:, :2] - along * velocity[:, 2:]) / points[:, 2:]
 
-    def _radiance(self, points: Array, lamps: LampLight) -> Array:
+    def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
         """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
 
-        Light that is scattered between a particle and the camera is lost.
+        Light that is scattered between a particle and the camera is lost. At the camera, daylight has its value at the
+        height `height_m` of the camera above the reference plane z = 0; it decreases along the optical axis.
         """
         range_m = np.linalg.norm(points, axis=1)[:, None]
         day = lamps.sources.daylight
-        lux = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[:, 2:])
+        below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
+        lux = day.illuminance_lx * np.exp(-day.attenuation_per_m * (points[:, 2:] + below_plan_m))
         for lamp in range(len(lamps.sources.intensity_cd)):
             lux = lux + lamps.lux(lamp, points)[0]
         return self._snow.albedo / np.pi * lux * np.exp(-self._water.attenuation_per_m * range_m)
@@ -227,7 +235,7 @@ def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
 
 
 def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float, defocus: Defocus) -> Array:
-    """Returns the diameter of a particle's image [px], including blur."""
+    """Returns the diameter of the image of a particle with the given diameter and depth [m], including blur [px]."""
     z = np.asarray(depth_m)
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
 
@@ -246,7 +254,8 @@ def _delay_s(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
 def _in_view(start, shift, low, camera_from_world, focal, middle, size, margin_px, reach_px_m, farthest_m):
     """Returns the indices (n,) of the particles in view and their positions (n, 3) in the axes of the camera.
 
-    A particle is in view if its image is at most margin_px + reach_px_m / depth outside the image. `start` are the
+    A particle is in view if its depth is between NEAREST_M and `farthest_m`, and its image is at most margin_px +
+    reach_px_m / depth outside the image. `start` are the
     positions in the box at time 0, to which `shift` is added before they are wrapped into the box at `low`.
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
@@ -298,7 +307,8 @@ def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, 
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
     """Draws each particle into rows `first` to `end` of `light`, except where the floor is nearer.
 
-    A particle is a disc with an antialiased edge that moves along a straight path (n, 2) [px] around its centre.
+    A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
+    from the start to the end of each path, `centre` (n, 2) [px] its middle.
     """
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):

@@ -38,9 +38,9 @@ Array = NDArray[np.float64]
 Receiver = Literal["floor", "particle"]
 
 ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
-LEAST_RAD, MOST_TAN = 1e-5, 20.0  # inner and outer edge of the rings
+LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; edge of the rings of a camera, as a tangent
 STEPS = 24  # number of positions of a scattering along a ray of the camera
-MAX_GROWTH = 1.0  # upper limit of t (K - 1), the logarithm of the transform relative to exp(-a d)
+MAX_GROWTH = 1.0  # upper limit of b d (K - 1), the logarithm of the transform relative to exp(-a d)
 WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture
 #: Lengths of the path at which kernels are computed [m]; between them, values per scattered light are interpolated.
 NODES_M = tuple(np.geomspace(0.05, 30.0, 22).tolist())
@@ -64,7 +64,7 @@ class Absorbed(NamedTuple):
 
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
 def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
-    """Returns the kernel of scattered light of a lamp, relative to exp(-a d): weights (n, m) of Gaussians.
+    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), as a mixture of Gaussians.
 
     Args:
         water: one band of the water.
@@ -72,7 +72,7 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
         receiver: kind of surface at which the light arrives: the floor, or a particle in the water.
 
     Returns:
-        Weights of normalised Gaussians in the angle at the lamp, of the widths `LAMP_SIGMA_RAD`.
+        (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.
     """
     rings = _rings(np.pi)
     once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
@@ -81,12 +81,15 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
 
 @lru_cache(maxsize=64)
 def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
-    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r): weights (n, m).
+    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), as a mixture of Gaussians.
 
     Args:
         water: one band of the water.
         ranges_m: (n,) ranges of the floor.
         sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
+
+    Returns:
+        (n, m) weights of normalised Gaussians.
     """
     once = np.array([_camera_rings(water, r) for r in ranges_m])
     return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
@@ -104,7 +107,7 @@ def ring_shares(edges: Array, sigmas: Array) -> Array:
 
 
 def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
-    """Returns values (..., m) at path lengths (m,), interpolated from `share` (..., nodes) at `NODES_M`.
+    """Returns values (..., m) at path lengths (m,) [m], interpolated from `share` (..., nodes) at `NODES_M`.
 
     The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d),
     with b the scattering coefficient and d the path length.
@@ -132,8 +135,8 @@ def _middle(edges: Array) -> Array:
 def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
     """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp.
 
-    The first is the response of the receiver times the width of the cell of beta, the second the excess length of the
-    scattered path relative to the straight one, path / d - 1.
+    The first is the response of the receiver times the width of the part of the cell of beta that is below t, the
+    second the excess length of the scattered path relative to the straight one, path / d - 1.
     """
     edges = _rings(np.pi)
     t = _middle(edges)[:, None]
@@ -161,8 +164,8 @@ def _camera_geometry() -> tuple[Array, Array, Array]:
     """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera.
 
     Returns:
-        Ring of tan(beta) and excess length of the path relative to the range, each (STEPS, ANGLES) over u and t; solid
-        angles (ANGLES,) of the cells of t [sr].
+        Index of the ring of tan(beta), and excess length of the scattered path over the straight one, divided by the
+        range, each (STEPS, ANGLES) over u and t; solid angles (ANGLES,) of the cells of t [sr].
     """
     edges = _rings(np.pi / 2 * 0.999)
     t = _middle(edges)

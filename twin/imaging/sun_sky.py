@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.scenario.model import SEA_WATER_INDEX
+
 Array = NDArray[np.float64]
 
-WATER_INDEX = 1.34  # refractive index of sea water in visible light
-CRITICAL_COSINE = float(np.sqrt(1 - 1 / WATER_INDEX**2))  # cosine of the edge of the cone in which the sky appears
+CRITICAL_COSINE = float(np.sqrt(1 - 1 / SEA_WATER_INDEX**2))  # cosine of the edge of the cone in which the sky appears
 
 
 class SunSky(NamedTuple):
@@ -53,7 +54,7 @@ def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, f
         elevation_deg: elevation of the sun above the horizon, in air.
         azimuth_deg: direction to the sun, counter-clockwise from x (east).
     """
-    sine = np.cos(np.deg2rad(elevation_deg)) / WATER_INDEX if elevation_deg < 90 else 0.0
+    sine = np.cos(np.deg2rad(elevation_deg)) / SEA_WATER_INDEX if elevation_deg < 90 else 0.0
     east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))
     return float(east), float(north), float(np.sqrt(1 - sine**2))
 
@@ -73,25 +74,26 @@ def _transmitted(cosine: Array) -> Array:
     It is 0 beyond the critical angle.
     """
     under = np.asarray(cosine, np.float64)
-    above = np.sqrt(np.maximum(1 - WATER_INDEX**2 * (1 - under**2), 0.0))
+    above = np.sqrt(np.maximum(1 - SEA_WATER_INDEX**2 * (1 - under**2), 0.0))
     inside = (under > 0) & (above > 0)
     under = np.where(inside, under, 1.0)
-    across = (above - WATER_INDEX * under) / (above + WATER_INDEX * under)
-    along = (WATER_INDEX * above - under) / (WATER_INDEX * above + under)
+    across = (above - SEA_WATER_INDEX * under) / (above + SEA_WATER_INDEX * under)
+    along = (SEA_WATER_INDEX * above - under) / (SEA_WATER_INDEX * above + under)
     return np.where(inside, 1 - (across**2 + along**2) / 2, 0.0)
 
 
 def _sky_moments() -> tuple[float, float]:
-    """Returns two integrals over the light of a sky whose radiance just below the surface is the transmittance [cd/m2].
+    """Returns the illuminance by a sky, and the ratio of its scalar illuminance to this illuminance.
 
-    They are the illuminance of a horizontal plane [lx], and the ratio of scalar illuminance to this illuminance.
+    The radiance of the sky just below the surface equals the transmittance [cd/m2]; the illuminance is that of a
+    horizontal plane [lx].
     """
-    # nodes are even in the cosine in air squared, which removes the root at the edge of the cone
+    # the nodes are those of the cosine in air, which removes the root at the edge of the cone
     x, w = np.polynomial.legendre.leggauss(64)
     above = (x + 1) / 2
-    under = np.sqrt(1 - (1 - above**2) / WATER_INDEX**2)
+    under = np.sqrt(1 - (1 - above**2) / SEA_WATER_INDEX**2)
     # 2 pi under d(under) = 2 pi above d(above) / n^2
-    light = _transmitted(under) * np.pi * w * above / WATER_INDEX**2
+    light = _transmitted(under) * np.pi * w * above / SEA_WATER_INDEX**2
     return float(light.sum()), float((light / under).sum() / light.sum())
 
 

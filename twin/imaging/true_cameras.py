@@ -43,7 +43,7 @@ class CameraModel(NamedTuple):
     """Model of one camera, true or believed, in the axes of the believed camera.
 
     Args:
-        focal_px: focal length of the lens, in air.
+        focal_px: focal length of the lens, in air; in water if there is no port.
         principal_px: (2,) column and row of the principal point.
         lens: distortion coefficients.
         port: geometry and refractive indices of the port.
@@ -74,7 +74,8 @@ class CameraModel(NamedTuple):
     def pixels(self, points_m: Array) -> Array:
         """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
 
-        NaN for a point that is not imaged, or is too far off the optical axis for the distortion model.
+        The points must lie in front of the camera; whether they lie inside the image is not checked. NaN for a point
+        without a ray through the port, and for one that is too far off the optical axis for the distortion model.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
@@ -106,14 +107,14 @@ class TrueCameras:
         rendered_rig: calibration used for rendering: the believed rig with the true baseline, and images enlarged by
             the margin.
         margin_px: (columns, rows) by which the rendered image extends beyond the frame on each side.
-        raw_rig: calibration of the raw images: their size, the focal length of the lens in air, the true baseline.
+        raw_rig: calibration of the raw images: their size, the focal length of the lens, the true baseline.
         sampling: for the left and the right camera, position in the rendered image of each raw pixel; None if the
             rendered images are used as raw images.
         rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw
             images are used as frames.
         models: models of the true left and right camera.
         believed: camera model that is used to rectify the images of both cameras.
-        rectified_depth_m: depth of the points for which the rectification is exact.
+        rectified_depth_m: depth of the points for which the rectification is computed.
     """
 
     rendered_rig: StereoRig
@@ -181,7 +182,9 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points that are not imaged.
+        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points without an image.
+
+        Points outside the borders of the frame have pixel coordinates too.
 
         Args:
             points_m: (n, 3) points in the axes of the rendered camera [m].
@@ -274,7 +277,9 @@ def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], exact for points at `depth_m`.
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`.
+
+    Positions are relative to the frame's top left pixel, without the border of the raw image.
 
     Raises:
         TwinError: the port transmits no rays to a part of the frame, or the distortion folds the image onto itself.
@@ -317,7 +322,12 @@ def _or_none(parallax: Array) -> Positions | None:
 
 
 def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
-    """Returns column and row (h, w, 2) of all pixels of an image and its border; (0, 0) is its top left pixel."""
+    """Returns column and row (h, w, 2) of all pixels of an image and its border, from the top left pixel of the image.
+
+    Args:
+        rig: size of the image.
+        border: (columns, rows) of the border on each side.
+    """
     columns = np.arange(-border[0], rig.width_px + border[0])
     rows = np.arange(-border[1], rig.height_px + border[1])
     return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)

@@ -1,7 +1,7 @@
 """Spectra of absorption and scattering of Jerlov's water types, from published tables with provenance.
 
 The tables are those of the package `jerlov`, interpolated linearly between their wavelengths (25 nm apart in the first
-source, 5 nm in the second). Solonenko & Mobley (2015) derived a and b from the diffuse attenuation that Jerlov
+source, 1 nm in the second). Solonenko & Mobley (2015) derived a and b from the diffuse attenuation that Jerlov
 measured, Williamson & Hollins (2022) measured a and b. The two sources differ: at 550 nm, b of the second is 2.3 (IB),
 0.49 (II), 0.29 (III), 1.2 (1C), 0.61 (3C) and 0.89 (5C) times b of the first.
 
@@ -52,6 +52,7 @@ def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -
     Args:
         water_type: a type of the source, see `WATER_SOURCES`.
         source: key in `WATER_SOURCES`.
+
     Raises:
         TwinError: the source is unknown or does not have this type, or the package `jerlov` is not installed.
     """
@@ -92,6 +93,9 @@ def provenance_of(water: WaterConfig) -> str:
     """Returns the name and the source of a scenario's water as text.
 
     If another source has the same Jerlov type, the text also compares the scattering coefficients b of both sources.
+
+    Raises:
+        TwinError: see `water_spectrum`.
     """
     if not water.is_jerlov_type:
         return water.label

@@ -1,11 +1,11 @@
 """White balance: factors of R, G, B that make an expected or measured light appear grey.
 
-A preset divides the electrons of each band by those that a white surface yields in the expected light: white light, a
-black body of a colour temperature, or white light after the path to the floor at the planned altitude and back,
-exp(-2 Kd altitude) with the diffuse attenuation Kd. Grey world makes the means of the three bands equal (Buchsbaum
-1980, A spatial processor model for object colour perception); the factors of a frame are computed from the previous
-frames with the lag of the auto-exposure. Factors are at least 1, so that a saturated pixel is white, and at most
-`MOST`, as amplified bands are noisy.
+The factors of a preset are inversely proportional to the electrons that a white surface yields in the expected light:
+white light, a black body of a colour temperature, or white light after the path from the planned altitude to the floor
+and back, exp(-2 Kd altitude), with the diffuse attenuation Kd of `illumination.water_to_floor_and_back`. Grey world
+makes the means of the three bands equal (Buchsbaum 1980, A spatial processor model for object colour perception); the
+factors of a frame are computed from the previous frames with the lag of the auto-exposure. Factors are at least 1, so
+that a saturated pixel is white, and at most `MOST` except those for white light, as amplified bands are noisy.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.imaging.illumination import water_to_floor_and_back
 from twin.imaging.lamps import colour
-from twin.imaging.water import downwelling_per_m, medium
+from twin.imaging.water import downwelling_per_m
 from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]
@@ -28,6 +29,13 @@ class WhiteBalance:
     Args:
         scenario: survey scenario with a section [sensor].
         electrons_per_cd: (3,) electrons in a pixel at 1 cd/m2, for R, G, B, on any scale.
+
+    Attributes:
+        is_of_white_light: whether the white balance is that for white light.
+        of_white_light: (3,) factors for white light.
+
+    Raises:
+        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
 
     def __init__(self, scenario: Scenario, electrons_per_cd: Array):
@@ -39,11 +47,14 @@ class WhiteBalance:
         self._fixed = self.of_white_light if self.is_of_white_light else self._preset(scenario)
 
     def factors(self, mean: Array, share: float) -> Array:
-        """Returns the factors (3,) of this frame, measured on the previous frames, and measures this frame.
+        """Returns the factors (3,) of this frame.
+
+        With grey world, they are measured on the previous frames (those of the first frame on itself), and this frame
+        is measured for the later ones.
 
         Args:
             mean: (3,) mean radiance of this frame in photometric units.
-            share: fraction by which the factors approach those of this frame.
+            share: fraction by which the logarithm of the factors approaches that of this frame.
         """
         if self._mode != "grey_world":
             return self._fixed
@@ -57,7 +68,11 @@ class WhiteBalance:
         return 1.0 if self.is_of_white_light else factors / self.of_white_light
 
     def _preset(self, scenario: Scenario) -> Array:
-        """Returns the constant factors (3,) of a scenario."""
+        """Returns the constant factors (3,) of a scenario; with grey world, they are not used.
+
+        Raises:
+            TwinError: the water is invalid, see `water.medium`.
+        """
         sensor = scenario.sensor
         assert sensor is not None
         if sensor.white_balance == "gains":
@@ -66,7 +81,7 @@ class WhiteBalance:
         if sensor.white_balance == "temperature":
             light = colour(sensor.white_temperature_k)
         if sensor.white_balance == "water":
-            light = np.exp(-2 * scenario.plan.altitude_m * downwelling_per_m(medium(scenario.water)))
+            light = np.exp(-2 * scenario.plan.altitude_m * downwelling_per_m(water_to_floor_and_back(scenario)))
         return _limited(self._electrons * np.maximum(light, 1e-12))
 
 

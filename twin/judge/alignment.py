@@ -21,9 +21,9 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
     """Returns `tracks[]` of metrics.json: one row for each alignment at the end of a track.
 
     `result.before_ga[k]` and `result.after_ga[k]` hold the keyframe positions (n, 3) before and after
-    `result.alignments[k]`. They belong to the last n keyframes up to the end of the track: all keyframes, or those of
-    the moving window. The alignment of the whole survey at the end has no such positions and therefore no row. Errors
-    are computed after anchoring at the first true pose, as for the trajectories.
+    `result.alignments[k]`: all keyframes up to the end of the track. The alignment of the whole survey at the end has
+    no such positions and therefore no row. Errors are computed after anchoring at the first true pose, as for the
+    trajectories.
     """
     rows = zip(result.alignments, result.before_ga, result.after_ga, strict=False)
     error_m = path_errors(result.final, truth.trajectory).distance_m
@@ -61,6 +61,7 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     Args:
         track: number of the track, from 1.
         error_m: (n,) position error of each frame [m].
+        truth: source of the reference path and of the track numbers.
     """
     frames = np.flatnonzero(truth.track[: len(error_m)] == track)
     if len(frames) == 0:
@@ -84,9 +85,9 @@ def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: Surve
 
     Args:
         positions: (n, 3) estimated positions, not yet anchored [m].
-        frames: frame numbers of the keyframes.
-        result: output of the estimators.
-        truth: true trajectory.
+        frames: (m,) frame numbers of the keyframes.
+        result: output of the estimators, of which the first online pose is used.
+        truth: source of the true trajectory.
     """
     n = min(len(positions), len(frames))
     if n == 0:

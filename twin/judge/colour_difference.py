@@ -21,7 +21,7 @@ def lab_of(rgb: NDArray[np.floating]) -> Array:
 
 
 def ciede2000(first: Array, second: Array) -> Array:
-    """Returns the colour differences (...) of pairs of CIELAB colours (..., 3); 1 is barely visible."""
+    """Returns the CIEDE2000 differences (...) of pairs of CIELAB colours (..., 3); about 1 is barely visible."""
     l1, a1, b1 = np.moveaxis(np.asarray(first, np.float64), -1, 0)
     l2, a2, b2 = np.moveaxis(np.asarray(second, np.float64), -1, 0)
     mean_chroma = (np.hypot(a1, b1) + np.hypot(a2, b2)) / 2

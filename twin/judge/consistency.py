@@ -14,8 +14,8 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
     """Returns `consistency.*` of metrics.json.
 
     For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
-    within two sigma is 0.954. `within_2sigma_position` is the fraction over the three camera axes of all keyframes,
-    `within_2sigma_map` the fraction over all estimated map cells.
+    within two sigma is 0.954. `within_2sigma_position` is the fraction over the three camera axes of the keyframes that
+    `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that have a height error.
     """
     error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))

@@ -22,8 +22,8 @@ ALONG_NODES = 2
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
     """Returns `links` of metrics.json: errors of links to the two previous nodes (along) and of all others (across).
 
-    `bridged` is the number of links that consist of frame-to-frame motion because no points were matched. The errors of
-    these links are not evaluated.
+    `bridged` is the number of links that consist of frame-to-frame motion because their measurement failed. The errors
+    of these links are not evaluated.
     """
     measured = result.links.select(result.links.n_points > 0)
     near = node_distance(measured, linked_nodes(result.links)) <= ALONG_NODES

@@ -74,9 +74,9 @@ def _of_surface(name: str, size: Array) -> dict[str, float | None]:
 
 
 def completeness_metric(metric: str) -> str | None:
-    """Returns the completeness metric to report with a map metric; None for other metrics and for completeness.
+    """Returns the completeness metric to report with a statistic of the height errors; None for all other metrics.
 
-    A statistic of the height errors does not cover the cells without a height, so it is never reported alone.
+    The statistic does not cover the cells without a height, so it is never reported alone.
     """
     if not metric.startswith("map.") or metric.startswith("map.completeness") or metric == "map.cell_m":
         return None

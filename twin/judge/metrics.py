@@ -29,7 +29,7 @@ from twin.judge.warnings import metric_warnings
 SCHEMA = "twin.metrics/2"
 _IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason")
 
-_VERDICTS = ("warnings", "warning", "idealisations")  # None until `_judged` fills them in from the other metrics
+_VERDICTS = ("warnings", "warning", "idealisations")  # None until `_judged` fills them in
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,13 @@ def _judged(metrics: dict[str, Any], survey: EvaluationInput) -> dict[str, Any]:
 
 
 def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
-    """Returns the metrics of a survey that was not compared with the truth: identity and timing; all others None or 0.
+    """Returns the metrics of a survey that was not compared with the truth.
 
-    A requirement on a metric that is None fails.
+    They hold identity, timing, warnings, idealisations and requirements; all other metrics are None or 0. A requirement
+    on a metric that is None fails.
+
+    Raises:
+        TwinError: `require` names a metric that does not exist.
     """
     result, known = survey.result, {key: survey.identity.get(key) for key in _IDENTITY}
     timing = timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows))

@@ -17,15 +17,16 @@ KEYS = (
 )  # fmt: skip
 
 PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest displacement
-#: Patches without any relation reach a correlation of 0.2 at the best displacement, as it has a standard deviation
-#: of 0.06 with about 300 independent pixels.
+#: Unrelated patches reach a correlation of about 0.2 at the best displacement: the correlation of patches with about
+#: 300 independent pixels has a standard deviation of 0.06.
 LEAST_CORRELATION = 0.25
 _COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is judged
 _BINS = np.linspace(0, 100, 10001)  # of the colour differences
 _LUMINANCE = XYZ_FROM_RGB[1].astype(np.float32)
 #: Distance from 10 % to 90 % of the edge response of a Gaussian blur, in standard deviations.
 _EDGE_PER_SIGMA = 2 * 1.2815515655446004
-_HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1  # of the fit of the blur [1/px]
+#: Frequencies used to fit the blur: the highest [1/px], and the least transfer relative to the largest one.
+_HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1
 
 
 class OrthomosaicJudge:
@@ -61,7 +62,7 @@ class OrthomosaicJudge:
         self._match(tile.rgba[..., :3] @ _LUMINANCE, np.nan_to_num(albedo) @ _LUMINANCE, known)
 
     def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Adds the colour differences of every n-th pixel along rows and columns to the histogram."""
+        """Adds the colour differences of every `_COLOUR_STEP_PX`-th pixel along rows and columns to the histogram."""
         some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
         colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
         self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]

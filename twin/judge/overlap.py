@@ -63,6 +63,9 @@ def overlap_metrics(
     """Returns `overlap.*` of metrics.json.
 
     Args:
+        result: output of the estimators, of which the keyframe numbers are used.
+        truth: true and reference poses, and the true floor.
+        rig: calibration of the cameras.
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
         planned: pattern of the plan; overlap_along and overlap_across, the requested values; along_median and
             across_median, the medians forecast from the planned poses over the floor.
@@ -128,7 +131,7 @@ def _nearest_in_next(poses: KeyframePoses, swath: int) -> NDArray[np.int64]:
 
 
 def _overlaps(field: HeightField | None, pairs: ImagePairs, rig: StereoRig) -> Array:
-    """Returns the overlaps of the pairs; a pair without floor in its first image is left out."""
+    """Returns the overlaps of the pairs; a pair without floor in its first image is left out; empty without a floor."""
     if field is None:
         return np.zeros(0)
     overlap = image_overlap(field, pairs.first, pairs.second, rig)
@@ -136,7 +139,10 @@ def _overlaps(field: HeightField | None, pairs: ImagePairs, rig: StereoRig) -> A
 
 
 def _true_floor(truth: Truth, grid: MapGrid | None) -> HeightField | None:
-    """Returns the true floor, level at the mean height if there is no grid; None without heights or true poses."""
+    """Returns the true floor; None without heights or true poses.
+
+    Without a grid, or with one of a single row or column, the floor is level at the mean height.
+    """
     height, known = truth.height_m, np.isfinite(truth.height_m)
     if not known.any() or not len(truth.trajectory):
         return None

@@ -18,7 +18,7 @@ class PatchShift(NamedTuple):
 
     Args:
         right_px, down_px: displacement of the patch in the first picture from its position in the second one.
-        correlation: normalised cross-correlation at the displacement, rounded to pixels.
+        correlation: normalised cross-correlation at the displacement rounded to whole pixels.
     """
 
     right_px: float

@@ -24,11 +24,11 @@ from twin.judge.warnings import metric_warnings
 #: not at all.
 AlignmentName = Literal["se3", "first", "none"]
 ALIGNMENTS: tuple[AlignmentName, ...] = get_args(AlignmentName)
-#: Largest time difference of associated poses [s], that of evo.
+#: Largest time difference of associated poses [s]; the default of evo.
 MAX_DIFFERENCE_S = 0.01
 #: Keys of `network_residuals`.
 NETWORK_KEYS = ("links", "loops", "loop_translation_m", "loop_rotation_deg", "loop_chi2")
-_MIN_ASSOCIATED = 3  # a rigid motion has six unknowns; each position has three coordinates
+_MIN_ASSOCIATED = 3  # two positions leave the rotation about the line through them undetermined
 _MAX_AXIS_DEG, _MAX_LENGTH_RATIO = 5.0, 2.0
 
 
@@ -72,8 +72,9 @@ class ReplayEvaluation:
 def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
     """Returns the contents of metrics.json of a replayed survey, with the keys of `metrics.evaluate`.
 
-    Metrics that need a truth are None without one. The key `replay` holds the description of the data set, the
-    alignment, the number of frames with a true pose, and the consistency of the network (`network_residuals`).
+    Only the trajectories are compared with the truth; without one, their errors are None. The other metrics that need a
+    truth (map, links, etc.) are None or 0. The key `replay` holds the description of the data set, the alignment, the
+    number of frames with a true pose, and the consistency of the network (`network_residuals`).
     """
     result, truth = survey.result, survey.truth
     trajectories, warnings, n_associated = dict[str, Any](), list(survey.warnings), 0
@@ -125,7 +126,7 @@ def associate(estimated_s: Array, true_s: Array, max_difference_s: float = MAX_D
     """Associates the poses of two trajectories by time as evo does (`evo.core.sync.associate_trajectories`).
 
     Each pose of the shorter trajectory is associated with the pose of the longer one whose time is nearest, if the two
-    differ by at most `max_difference_s`.
+    times differ by at most `max_difference_s`.
 
     Args:
         estimated_s, true_s: (n,) and (m,) times of the poses [s].
@@ -159,7 +160,7 @@ def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
     Args:
         estimate, truth: poses that are associated row by row.
-        alignment: "none": identity; "first": the first poses coincide; otherwise the best rigid fit of all positions.
+        alignment: "se3": best rigid fit of all positions; "first": the first poses coincide; "none": identity.
     """
     if alignment == "none":
         return np.eye(4)
@@ -169,7 +170,10 @@ def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> PathErrors:
-    """Returns the errors of an estimate at the frames that have a true pose, after the alignment."""
+    """Returns the errors of an estimate at the frames that have a true pose, after the alignment.
+
+    The errors are empty if fewer than three frames have a true pose.
+    """
     a, b = _associated_poses(estimate, truth)
     if len(a) < _MIN_ASSOCIATED:
         return PathErrors(np.zeros(0), np.zeros((0, 3)), np.zeros(0))
@@ -215,11 +219,11 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
 def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
     """Returns the consistency of the network: residuals of the links at the final poses of their keyframes.
 
-    A link is a loop if its nodes are more than two nodes apart. The residual of a link is log(M^-1 T), with M its
-    measured motion and T the motion between the final poses. `loop_translation_m` and `loop_rotation_deg` are medians
-    of the residuals of the loops. `loop_chi2` is the mean of r' C^-1 r / 6 over their residuals r, with C the
-    covariance of the measurement; it is below about 1 for consistent covariances. These numbers are not errors: an
-    error that all links have in common does not appear in them.
+    `links` is the number of links with matched points, `loops` the number of those whose nodes are more than two nodes
+    apart. The residual of a link is log(M^-1 T), with M its measured motion and T the motion between the final poses.
+    `loop_translation_m` and `loop_rotation_deg` are medians of the residuals of the loops. `loop_chi2` is the mean of
+    r' C^-1 r / 6 over their residuals r, with C the covariance of the measurement; it is below about 1 for consistent
+    covariances. These numbers are not errors: an error that all links have in common does not appear in them.
     """
     measured = result.links.select(result.links.n_points > 0)
     loops = measured.select(node_distance(measured, linked_nodes(result.links)) > ALONG_NODES)

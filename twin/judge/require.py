@@ -16,6 +16,8 @@ MORE_IS_BETTER = (
     "consistency.within_",
     "vision.points_",
     "vision.contrast_",
+    "orthomosaic.coverage_",
+    "orthomosaic.matched",
 )
 
 

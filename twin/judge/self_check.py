@@ -18,11 +18,11 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     standard deviation of this difference divided by the expected one, and of the largest autocorrelation of the left
     image away from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (a fraction of the focal length) are the
     estimated errors of the rectification, with the signs of `calibration_error.right_*`; row_pattern is the systematic
-    row difference that they do not explain, and disparity_offset the error of all disparities that the links imply
-    (fractions of the focal length). sigma_max_m is the largest 3-D
-    standard deviation (square root of the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D
-    standard deviation of the position of a frame relative to the last keyframe by frame-to-frame motion, just before
-    the next keyframe, 90th percentile over the keyframes [m].
+    row difference that they do not explain, and disparity_offset the common error of all disparities that the links
+    imply (both are fractions of the focal length). sigma_max_m is the largest 3-D standard deviation (square root of
+    the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
+    of a frame relative to the last keyframe by frame-to-frame motion, just before the next keyframe, 90th percentile
+    over the keyframes [m].
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]

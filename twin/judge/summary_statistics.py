@@ -15,19 +15,19 @@ def finite_float(value: Any) -> float | None:
 
 
 def rms(values: ArrayLike) -> float | None:
-    """Returns the root mean square of all values; None if there are none."""
+    """Returns the root mean square of all values; None if there are none or if it is not finite."""
     array = np.asarray(values, dtype=float)
     return finite_float(np.sqrt(np.mean(array**2))) if array.size else None
 
 
 def mean(values: ArrayLike) -> float | None:
-    """Returns the mean of all values; None if there are none."""
+    """Returns the mean of all values; None if there are none or if it is not finite."""
     array = np.asarray(values, dtype=float)
     return finite_float(array.mean()) if array.size else None
 
 
 def percentile(values: ArrayLike, percent: float) -> float | None:
-    """Returns the percentile (0 to 100) of all values with linear interpolation; None if there are none."""
+    """Returns a percentile (0 to 100) of all values, linearly interpolated; None without values or if not finite."""
     array = np.asarray(values, dtype=float)
     return finite_float(np.percentile(array, percent)) if array.size else None
 

@@ -17,8 +17,8 @@ TURNING_STEP = 1e-9
 def travel_direction(reference: Array) -> Array:
     """Returns horizontal unit vectors of travel (n, 2) along reference positions (n, 3).
 
-    While the reference position does not change, the direction is that of the previous step, or of the first step if
-    there is no previous one; [1, 0] if there is no step at all.
+    While the reference position does not change horizontally, the direction is that of the previous step, or of the
+    first step if there is no previous one; [1, 0] if there is no step at all.
     """
     n = len(reference)
     if n == 0:

@@ -36,7 +36,10 @@ def anchor(first_estimated: Array, first_true: Array) -> Array:
 
 
 def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
-    """Returns the errors at the frames of both trajectories, with the estimate anchored at the first true pose."""
+    """Returns the errors at the frames of both trajectories, with the estimate anchored at the first true pose.
+
+    If the trajectories differ in length, the frames at the end of the longer one are left out.
+    """
     n = min(len(estimate), len(truth))
     true = truth.world_from_camera[:n]
     if n == 0:

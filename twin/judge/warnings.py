@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-#: Mean NEES of positions outside which a survey is reported as inconsistent; the expectation is 3.
+#: Bounds of the mean NEES of the positions; outside them a survey is reported as inconsistent. The expectation is 3.
 NEES_BOUNDS = (2.0, 5.0)
-#: Sigma ratio (RMS of height error / sigma) outside which a map is reported as miscalibrated; the expectation is 1.
+#: Bounds of the sigma ratio (RMS of height error / sigma); outside them the sigmas of a map are reported as
+#: miscalibrated. The expectation is 1.
 SIGMA_RATIO_BOUNDS = (0.5, 2.0)
 #: Saturated fraction of the pixel values (median over the images) above which the images are reported as saturated.
 MOST_SATURATED = 0.01
@@ -42,4 +43,4 @@ def _saturation(fraction: float | None) -> str:
     if fraction is None or fraction <= MOST_SATURATED:
         return ""
     share, limit = 100 * fraction, 100 * MOST_SATURATED
-    return f"The images are saturated: {share:.3g} % of the values of the median image (more than {limit:g} %)."
+    return f"The images are saturated: the median share of saturated values is {share:.3g} % (more than {limit:g} %)."

@@ -1,1 +1,1 @@
-"""Plug-ins: controllers, estimators, terrains and readers of other packages that replace those of this package."""
+"""Plug-ins: controllers, estimators, terrains and readers that other packages provide."""

@@ -23,7 +23,7 @@ class PluginFailed(SurveyAborted):
 
 
 class GuardedPlugin:
-    """Plug-in whose calls and results are checked. It is created at the first call.
+    """Plug-in whose calls and results are checked. An object of its class is created at the first call.
 
     Args:
         key: key of the scenario that names the plug-in, for example "control.plugin".
@@ -55,7 +55,7 @@ class GuardedPlugin:
         return self._attempt(method, getattr(self._plugin, method), arguments)
 
     def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
-        """Returns a value that a method returned as an array of floats.
+        """Returns the result of a method, converted to an array of floats and checked.
 
         Args:
             method: name of the method, for the message.
@@ -77,7 +77,7 @@ class GuardedPlugin:
         return array
 
     def poses(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
-        """Returns a value that a method returned as rigid poses: `shape` is (4, 4) or (n, 4, 4).
+        """Returns the result of a method, checked to be rigid poses; `shape` is (4, 4) or (n, 4, 4).
 
         Raises:
             PluginFailed: the value is not valid for `numbers`, a rotation is not orthonormal with determinant 1, a
@@ -96,7 +96,7 @@ class GuardedPlugin:
         return array
 
     def covariance(self, method: str, value: Any) -> Array:
-        """Returns a value that a method returned as a covariance (6, 6).
+        """Returns the result of a method, checked to be a covariance (6, 6).
 
         Raises:
             PluginFailed: the value is not valid for `numbers`, or not symmetric and positive semidefinite.
@@ -108,7 +108,7 @@ class GuardedPlugin:
         return array
 
     def refuse(self, method: str, returned: str, expected: str) -> NoReturn:
-        """Raises PluginFailed; the message names the method, the returned value and the expected one."""
+        """Raises PluginFailed; the message describes the method, the value that it returned, and the expected one."""
         raise PluginFailed(f"{self.label}: {method} returned {returned} (expected: {expected})")
 
     def _attempt(self, what: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:

@@ -91,7 +91,7 @@ def described(error: BaseException) -> str:
 
 
 def _attribute(module: Any, dotted: str) -> Callable[..., Any]:
-    """Returns the class with a dotted name in a module. Raises AttributeError or TypeError if there is none."""
+    """Returns the class with a dotted name in a module. Raises AttributeError or TypeError if the module has none."""
     found = module
     for part in dotted.split("."):
         found = getattr(found, part)

@@ -42,8 +42,9 @@ class Controller(Protocol):
         """Returns the command until the next frame.
 
         Args:
-            estimate: online estimate of the pose and the velocity of the left camera. If no motion was measured at this
-                frame, position and velocity are those of the reference.
+            estimate: online estimate of the pose and the velocity of the left camera. If neither the images nor the DVL
+                measured a motion at this frame, position and velocity are those of the reference, except the height
+                and its rate if the pressure sensor has a reading.
             reference: planned position, velocity, yaw and acceleration of the left camera in the world, for this frame.
 
         Returns:

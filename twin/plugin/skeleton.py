@@ -67,7 +67,7 @@ def write(kind: Kind, folder: Path) -> list[Path]:
         folder: new or empty folder; its name becomes the name of the package and of the entry point.
 
     Raises:
-        TwinError: the name of the folder is no name of a package.
+        TwinError: the name of the folder gives no name of a package, or a package of this name is installed.
         OSError: a file cannot be written.
     """
     package = package_name(folder)

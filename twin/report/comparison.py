@@ -53,7 +53,7 @@ QUANTITIES = (
     ComparedQuantity("timing.frames", "frames", wording.plain, ""),
     ComparedQuantity("timing.keyframes", "keyframes", wording.plain, ""),
     ComparedQuantity("timing.wall_s", "computing time [s]", wording.plain),
-    ComparedQuantity("timing.peak_rss_mb", "peak memory [MB]", wording.plain),
+    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
 )
 
 
@@ -64,7 +64,7 @@ class Cell(NamedTuple):
         value: the value; None if the run has none.
         difference: value minus that of the first run; None for the first run and where a value is missing.
         text: the value as text.
-        change: the difference as text, for example "+1.2 mm (+10 %)"; "" if there is none.
+        change: the difference as text, for example "+1.2 mm (+10 %)"; "same" if it is 0; "" if it is None.
         level: "good" or "bad" if the value is better or worse than that of the first run; otherwise "".
     """
 
@@ -86,8 +86,8 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
     """Returns the runs in several folders.
 
     Raises:
-        TwinError: there are fewer than two or more than `MOST_RUNS` folders, one is given twice, is no run folder, or
-            has no metrics.json because its survey is unfinished.
+        TwinError: there are fewer than two or more than `MOST_RUNS` folders, or one of them is given twice, is not a
+            run folder, has a damaged file, or has no metrics.json because its survey is unfinished.
     """
     if not 2 <= len(folders) <= MOST_RUNS:
         raise TwinError("RUN", f"{len(folders)} runs", f"2 to {MOST_RUNS}")
@@ -101,7 +101,7 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def names_of(runs: Sequence[Run]) -> list[str]:
-    """Returns distinct names of runs: those of their folders, with parent folders where these are equal."""
+    """Returns distinct names of runs: those of their folders, all with as many parent folders as make them distinct."""
     paths = [run.folder.resolve() for run in runs]
     for n in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-n:]) for path in paths]
@@ -121,7 +121,10 @@ def table(runs: Sequence[Run]) -> list[Row]:
 
 
 def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Returns the keys of the scenario in which the runs differ, each with its value in every run as JSON."""
+    """Returns the keys of the scenario in which the runs differ, each with its value in every run as JSON (`_json`).
+
+    The value in a run whose scenario lacks the key is a dash.
+    """
     flat = [dict(_flattened(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
     texts = {key: [_json(one[key]) if key in one else wording.DASH for one in flat] for key in keys}
@@ -229,6 +232,6 @@ def _flattened(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any
 
 
 def _json(value: Any) -> str:
-    """Returns a value of a scenario as JSON, at most 80 characters."""
+    """Returns a value of a scenario as JSON, cut to 80 characters."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 80 else f"{text[:77]}..."

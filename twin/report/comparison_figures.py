@@ -16,7 +16,7 @@ from twin.report.figures import WIDTH_IN, log_scale, to_data_uri
 from twin.report.run_folder import Run
 from twin.report.style import COLOURS, FIGURE_STYLE
 
-#: Colours of the runs in their order (Okabe & Ito palette).
+#: Colours of the runs in their order (Okabe & Ito palette, with grey in place of yellow).
 _RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6d76", "#000000")
 #: Line styles of the runs: coinciding curves stay visible.
 _RUN_STYLES = ("-", "--", "-.", ":") * 2
@@ -69,7 +69,7 @@ def path_curves(runs: Sequence[Run], names: Sequence[str]) -> Figure | None:
     truth = next((run.trajectories["truth"] for run in runs if "truth" in run.trajectories), None)
     if truth is not None:
         x, y, _ = truth.positions.T
-        axes.plot(x, y, color=COLOURS["truth"], linewidth=5, alpha=0.25, label="true path of the first run")
+        axes.plot(x, y, color=COLOURS["truth"], linewidth=5, alpha=0.25, label="true path")
     for k, (run, name) in enumerate(zip(runs, names, strict=True)):
         if "final" in run.trajectories:
             x, y, _ = run.trajectories["final"].positions.T
@@ -80,7 +80,11 @@ def path_curves(runs: Sequence[Run], names: Sequence[str]) -> Figure | None:
 
 
 def height_error_curves(runs: Sequence[Run], names: Sequence[str]) -> Figure | None:
-    """Returns the cumulative distributions of the absolute height error of the map cells, with a line at 90 %."""
+    """Plots the cumulative distributions of the absolute height error of the map cells, with a line at 90 %.
+
+    Returns:
+        The figure; None if no run has height errors.
+    """
     figure = Figure(figsize=(WIDTH_IN, 3.4))
     axes = figure.add_subplot()
     for k, (run, name) in enumerate(zip(runs, names, strict=True)):

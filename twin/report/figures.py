@@ -118,18 +118,27 @@ def path_error_curves(run: Run) -> Figure | None:
 
 
 def log_scale(axes: Axes) -> None:
-    """Sets a logarithmic y axis that starts just below the 1st percentile of the positive values of all curves."""
-    sizes = np.concatenate([np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines])
+    """Sets a logarithmic y axis that starts just below the 1st percentile of the positive values of all curves.
+
+    Axes without a positive value stay linear.
+    """
+    sizes = np.concatenate([np.zeros(0), *(np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines)])
     sizes = sizes[sizes > 0]
     if len(sizes):
         log_axis(axes.yaxis, axes.set_yscale)
         axes.set_ylim(0.7 * float(np.percentile(sizes, 1)), None)
 
 
-def log_axis(axis: Any, set_scale: Callable[[str], None]) -> None:
-    """Makes an axis logarithmic, with labels at 1, 2 and 5."""
+def log_axis(axis: Any, set_scale: Callable[[str], None], steps: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Makes an axis logarithmic, with labels at the given multiples of the powers of 10.
+
+    Args:
+        axis: x or y axis.
+        set_scale: sets the scale of this axis by name, `Axes.set_xscale` or `Axes.set_yscale`.
+        steps: multiples, from 1 to less than 10.
+    """
     set_scale("log")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(LogLocator(subs=steps))
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda *_: "")
 
@@ -258,7 +267,7 @@ def error_histogram(run: Run) -> Figure | None:
 
 
 def network_plot(run: Run) -> Figure | None:
-    """Returns a plan view of the keyframe network: nodes and links."""
+    """Returns a plan view of the keyframe network with its nodes and links; None if the network has no nodes."""
     positions, edges = run.network
     if len(positions) == 0:
         return None
@@ -307,7 +316,7 @@ def subsampled(raster: Raster) -> np.ndarray:
 
 
 def _height_scale(heights: np.ndarray) -> tuple[float, float]:
-    """Returns the 0.5th and 99.5th percentile of the finite heights."""
+    """Returns the 0.5th and 99.5th percentile of the finite heights [m]; (0, 1) if there are none."""
     finite = heights[np.isfinite(heights)]
     low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
     return float(low), float(high)

@@ -15,9 +15,10 @@ from twin.core.growing_array import GrowingArray
 from twin.core.records import Array, Frame, Image, Readings
 
 Record = Literal["none", "keyframes", "all"]
-#: Columns of frames/frames.csv after index, time_s and stereo; an empty cell is a missing reading.
+#: Last columns of frames/frames.csv; an empty cell is a missing reading.
 READING_COLUMNS = ("pressure_z_m", "roll_rad", "pitch_rad", "yaw_rad", "forward_mps", "left_mps", "up_mps",
                    "usbl_x_m", "usbl_y_m", "usbl_z_m")  # fmt: skip
+#: Columns between index, time_s, stereo and the readings: `Frame.exposure`, empty if the cameras do not report it.
 EXPOSURE_COLUMNS = ("exposure_r", "exposure_g", "exposure_b")
 _MOST_WAITING = 8  # frames whose images wait to be written; a survey waits for the disk beyond this number
 #: PNG without loss in half the time of the default filters and strategy; the files are 6 % larger.
@@ -31,17 +32,17 @@ _PNG = [
 class FrameRecorder:
     """Writes frames to the folder `frames` of a run while it is flown. Use as a context manager.
 
-    `frames.csv` has index, time and sensor readings of every frame; `truth.npz` has the true poses and velocities in
-    double precision, which the text files of trajectories round. With "all", `left` and `right` have the images of the
-    frames as PNG files; the right camera takes images at planned keyframes only. With "keyframes", the images are
-    those that the estimators store in the folder `keyframes`.
+    `frames.csv` has index, time, exposure and sensor readings of every frame, and whether it has a stereo pair.
+    `truth.npz` has the true poses and velocities in double precision; the text files of trajectories are rounded. With
+    "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images at planned
+    keyframes only. With "keyframes", the images are those that the estimators store in the folder `keyframes`.
 
     Args:
         folder: run folder.
         record: which images are kept; with "none", nothing is written.
 
     Raises:
-        OSError: the folder cannot be written.
+        OSError: the folder cannot be written, or on exit one of the last images could not be written.
     """
 
     def __init__(self, folder: Path, record: Record):
@@ -62,13 +63,16 @@ class FrameRecorder:
     def __enter__(self) -> FrameRecorder:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Waits for the images, and writes truth.npz."""
         self._writer.shutdown()
         if self._lines is not None:
             self._lines.close()
             truth = {"world_from_camera": self._poses.array, "twist_body": self._twists.array}
             np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
+        if kind is None:
+            for written in self._waiting:
+                written.result()
 
     def add(self, frame: Frame, world_from_camera: Array, twist_body: Array) -> None:
         """Adds a frame.
@@ -102,7 +106,7 @@ class FrameRecorder:
 
 
 def _cells(readings: Readings) -> list[str]:
-    """Returns the readings as the texts of `READING_COLUMNS`."""
+    """Returns the readings as strings, one for each of `READING_COLUMNS`; empty for a missing reading."""
     groups = ((readings.pressure_z_m, 1), (readings.ahrs_rpy_rad, 3), (readings.dvl_mps, 3), (readings.usbl_m, 3))
     return [
         text

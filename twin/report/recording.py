@@ -58,7 +58,11 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
 
 
 def open_viewer(folder: Path) -> int:
-    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing."""
+    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing.
+
+    Raises:
+        TwinError: run.rrd is missing, and `folder` is not a run folder or one of its files is damaged.
+    """
     file = Path(folder) / "run.rrd"
     if not file.is_file():
         write_recording(Path(folder))

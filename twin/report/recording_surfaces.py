@@ -54,10 +54,10 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
-    """Returns whether two grids have the same north-west corner, and widths and heights that differ by less than a cell
-    plus a pixel.
+    """Returns whether two grids have the same north-west corner and nearly the same size.
 
-    A reduced orthomosaic (`run_folder.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
+    Their widths and heights may differ by less than a cell plus a pixel: a reduced orthomosaic
+    (`run_folder.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
     """
     corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
     size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m
@@ -109,16 +109,22 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
 
 
 def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
-    """Returns whether each of the points (n, 3) projects into the image of a camera, (n,) bool."""
+    """Returns whether each of the points (n, 3) projects into the image of a camera, (n,) bool.
+
+    The pixels are taken as square, and the principal point as the centre of the image.
+    """
     x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
     tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
     return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles whose last vertex is first observed by a given group, and their vertices.
+    """Returns the triangles that are complete with a given group, with their vertices.
+
+    A triangle is complete when the last of its three vertices is first observed.
 
     Args:
+        surface: the whole surface.
         group: (n,) group of each vertex, as `first_observed` returns it.
         number: number of the group.
     """

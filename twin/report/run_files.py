@@ -24,6 +24,7 @@ _INDEX = {
     "n_frames_per_keyframe": None,
     "timing_ms": {_ANY: [0.0]},
     "stereo_observations": [{name: _NAN for name in _OBSERVATION}],
+    "map_from_world": [[0.0]],
 }
 
 
@@ -51,6 +52,8 @@ def checked_index(index: Any) -> dict[str, Any]:
             raise ValueError(f"{key}: not allowed (allowed: integers from 0)")
     if len(index.get("frames", [])) != len(index.get("tracks", [])):
         raise ValueError("tracks: must have one number per frame")
+    if "map_from_world" in index and [len(row) for row in index["map_from_world"]] != [4] * 4:
+        raise ValueError("map_from_world: must have 4 rows of 4 numbers")
     return index
 
 

@@ -62,6 +62,7 @@ class Keyframes(NamedTuple):
         timing_ms: for some processing stages, the duration of each call in chronological order [ms].
         stereo_observations: (m, 3) frame number, number of matched points and contrast (NaN without images) of each
             stereo observation, including those that gave no keyframe.
+        map_from_world: (4, 4) pose of the world in the frame of the maps (`ElevationMap.map_from_world`).
     """
 
     frames: NDArray[np.int64]
@@ -69,6 +70,7 @@ class Keyframes(NamedTuple):
     n_frames_per_keyframe: int | None
     timing_ms: dict[str, Array]
     stereo_observations: Array
+    map_from_world: Array
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,8 @@ def _read_keyframes(file: Path) -> Keyframes:
         [observation[key] for key in _OBSERVATION_KEYS] for observation in index.get("stereo_observations", [])
     ]
     stereo_observations = np.array(observations, float).reshape(-1, 3)
-    return Keyframes(frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations)
+    map_from_world = np.array(index.get("map_from_world", np.eye(4)), float)
+    return Keyframes(frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations, map_from_world)
 
 
 def _read_json(file: Path, checked: Callable[[Any], dict[str, Any]]) -> dict[str, Any] | None:

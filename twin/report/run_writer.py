@@ -142,6 +142,9 @@ class RunFolder:
         Args:
             record: the results.
             guard: limits an interrupt to a single stage, and records why the survey ended early, if it did.
+
+        Raises:
+            OSError: metrics.json cannot be written.
         """
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
@@ -172,7 +175,11 @@ class RunFolder:
     def orthomosaic_file(
         self, grid: MapGrid, georeference: Georeference | None
     ) -> AbstractContextManager[OrthomosaicFile | None]:
-        """Returns mosaic.tif, opened to write the tiles of an orthomosaic; None if no maps are written."""
+        """Opens mosaic.tif to write the tiles of an orthomosaic.
+
+        Returns:
+            Context manager whose value is the open file, or None if no maps are written.
+        """
         from twin.exchange.geotiff import OrthomosaicFile
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
@@ -207,6 +214,8 @@ class RunFolder:
             "n_frames_per_keyframe": record.n_frames_per_keyframe,
             "timing_ms": {stage: record.stopwatch.durations_ms(stage) for stage in ("f2f", "stereo")},
         }
+        if record.elevation is not None:
+            index["map_from_world"] = record.elevation.map_from_world.tolist()
         (self.path / "keyframes").mkdir(exist_ok=True)
         self._write("keyframes/index.json", json.dumps(index))
 

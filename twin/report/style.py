@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-#: Colour of each plotted quantity, by key (Okabe & Ito palette, distinguishable with colour vision deficiency).
+#: Colour of each plotted quantity, by key. Those of the estimates are from the palette of Okabe & Ito, distinguishable
+#: with colour vision deficiency.
 COLOURS = {
     "truth": "#1b2a33",
     "reference": "#9aa8b0",

@@ -44,11 +44,11 @@ TERMS = {
     "cell is observed if both images of at least one keyframe show it.",
     "Asked area": "Area that the planned tracks are to cover. LE90 over this area counts a cell without a height as an "
     "infinite error, so it is infinite if more than 10 % of the area has no height.",
-    "Keyframe": "Frame with a stereo pair that is a node of the network and contributes to the map.",
+    "Keyframe": "Frame with a stereo pair whose pose the network estimates and that contributes to the map.",
     "Link": "Measured motion between two keyframes.",
     "F2F": "Frame-to-frame motion: camera motion between consecutive frames, from optical flow.",
     "F2M": "Registration of a keyframe with the mosaic of earlier keyframes.",
-    "GA": "Global alignment: least-squares adjustment of all keyframe poses to all links.",
+    "GA": "Global alignment: least-squares adjustment of the keyframe poses to the links and all other measurements.",
     "Eq. (2)": "Closed-form motion between two keyframes (Negahdaripour & Madjidi 2003), which treats depth as exact.",
 }
 
@@ -177,7 +177,7 @@ def replay_summary(metrics: Mapping[str, Any]) -> str:
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns the altitude and the water type of a survey, with its source, as text."""
+    """Returns as text the altitude of a survey and its water: Jerlov type with the source of its table, turbidity."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")

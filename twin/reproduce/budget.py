@@ -33,7 +33,7 @@ class Module(NamedTuple):
 
     Args:
         label: name of the module.
-        stage: key of its stage in the stopwatch; "" if it is part of the stage of the next module.
+        stage: key of its stage in the stopwatch; "" if it is part of the stage of another module.
         unit: name of the item that one call processes, as "frame" or "pair".
         paper: time of the module in the paper's words.
         budget_ms: time available for one frame or keyframe at the paper's 30 Hz; None if the module has no limit.
@@ -66,7 +66,14 @@ MODULES = (
 
 
 def run(folder: Path, quick: bool = False) -> Exhibit:
-    """Flies a part of the paper's mission and writes budget.json and budget.png to a folder, created if missing."""
+    """Flies a part of the paper's mission and returns the results.
+
+    Writes budget.json and budget.png to a folder, which is created if missing.
+
+    Args:
+        folder: folder to write.
+        quick: whether to fly one short track.
+    """
     flown = fly_aligned(load_scenario("paper", [*(QUICK if quick else FULL), *PAPER_SIZE]))
     folder.mkdir(parents=True, exist_ok=True)
     n_frames, n_keyframes = len(flown.result.online), len(flown.result.keyframe_rows)

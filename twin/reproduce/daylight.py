@@ -32,19 +32,19 @@ from twin.imaging.reference.pixel_light import (
     plane_light,
     refined,
 )
-from twin.imaging.sun_sky import WATER_INDEX, sky_radiance
+from twin.imaging.sun_sky import sky_radiance
 from twin.imaging.water import Medium, medium
 from twin.reproduce.light_cell import ALBEDO, GREEN, green_of, looking_down
-from twin.scenario.model import SunConfig, WaterConfig
+from twin.scenario.model import SEA_WATER_INDEX, SunConfig, WaterConfig
 
 Array = NDArray[np.float64]
 
 WATERS, DEPTHS_M, RANGES_M, ELEVATIONS_DEG = ("IB", "II", "III", "1C", "3C"), (2.0, 5.0, 15.0), (1.0, 3.0), (90.0, 45.0)
 LIFT_M = 1e-3  # height of the slopes above the floor
 SLOPE_DEG = 45.0  # angle of the slopes that face the sun and face away from it
-SUN_RADIUS_RAD = 0.0047 / WATER_INDEX  # angular radius of the sun's disc, under water
+SUN_RADIUS_RAD = 0.0047 / SEA_WATER_INDEX  # angular radius of the sun's disc, under water
 SKY_STEPS = 4000  # number of steps of the table of the sky's radiance
-ROUND, MOST_WALKS = 8_000, 400_000  # walks of a round, and the most of each value
+ROUND, MOST_WALKS = 8_000, 400_000  # walks (pairs of walks for a pixel) of a round, and the most of each value
 LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # relative standard errors at which upwelling light and illuminance are accurate
 RIG = StereoRig(64, 48, 100.0, 0.1)  # the pixel next to its principal point is compared
 

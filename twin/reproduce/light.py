@@ -37,7 +37,7 @@ from twin.scenario.model import Scenario
 Array = NDArray[np.float64]
 
 WATERS, HEIGHTS_M = ("IB", "II", "III", "1C", "3C"), (1.0, 2.0, 3.0)
-#: Pixels as fractions of image width and height: centre, right of it, lower right corner.
+#: Pixels as fractions of image width and height: centre, right of it, near the lower right corner.
 PIXELS = ((0.5, 0.5), (0.8, 0.5), (0.95, 0.95))
 #: Lamp arrangements: that of the scenario `reef`, and narrow beams far from the cameras, panned inwards.
 LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {

@@ -51,8 +51,9 @@ class LightCell(NamedTuple):
         lamps: name of the lamp arrangement.
         pixel: (column, row) [px].
         model: light by the model.
-        total, direct, veil, veil_once: light by the reference [cd/m2], see `PixelLight`.
+        total, direct: light by the reference [cd/m2], see `PixelLight`.
         sharp_share: share of the total that comes from the floor and was not scattered between floor and camera.
+        veil, veil_once: light by the reference [cd/m2], see `PixelLight`.
         blur_near, blur_far: shares of the blurred light whose point of the floor would, without scattering, be imaged
             within 2 px of the pixel and beyond 40 px.
     """

@@ -63,7 +63,9 @@ class Claim(NamedTuple):
 
 
 def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Exhibit:
-    """Flies the mission and writes paper.json and the figures to a folder, which is created if missing.
+    """Flies the mission and returns the results.
+
+    Writes paper.json and the figures to a folder, which is created if missing.
 
     Args:
         folder: folder to write.
@@ -93,8 +95,8 @@ def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
     paper_sheet.draw_maps(*flights, folder / "paper_maps.png")
     return (
         Figure("paper_paths.png", "Integrated frame-to-frame motion, and the path after alignment (Fig. 4)."),
-        Figure("paper_tracks.png", "Position error of the keyframes of a window, just before and after its global "
-               "alignment, for the tracks of Fig. 5."),
+        Figure("paper_tracks.png", "Position error of all keyframes so far, just before and after the global "
+               "alignment at the end of a track, for the tracks of Fig. 5."),
         Figure("paper_errors.png", "Errors of position, height and heading along the path after alignment; dashed: "
                "ends of tracks (Fig. 6)."),
         Figure("paper_maps.png", "True elevation, map after alignment, map flown without alignment, and histogram of "
@@ -161,7 +163,7 @@ def _better(value: float, limit: float) -> str:
 
 
 def tracks_table(flights: Flights) -> Table:
-    """Returns a table of the RMS position error of windows of tracks before and after their alignment (Fig. 5)."""
+    """Returns a table of the RMS position error of all keyframes so far, before and after alignments (Fig. 5)."""
     header = ("track", "paper", "coarse, before", "coarse, after", "full resolution, before", "after")
     rows: list[Row] = [header]
     found = [{row["track"]: row for row in track_metrics(f.result, f.truth)} for f in (flights.coarse, flights.fine)]
@@ -191,7 +193,10 @@ def path_table(flights: Flights) -> Table:
 
 
 def map_table(flights: Flights) -> Table:
-    """Returns a table of the share of the asked area without a height, with and without alignment (Fig. 7)."""
+    """Returns a table of the share of the asked area without a height, with and without alignment (Fig. 7).
+
+    For the flight without alignment, it also has an error of the map and the distance from the planned path.
+    """
     rows: list[Row] = [("", "paper", "coarse texture", "full resolution")]
     rows += [
         ("map after alignment: area without a height", "none seen in Fig. 7 (b)",

@@ -46,22 +46,22 @@ def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
 
 
 def draw_tracks(flights: Mapping[str, Flown], tracks: Sequence[int], file: Path) -> None:
-    """Draws the keyframe errors of the window of each track, before and after its alignment (Fig. 5)."""
+    """Draws the errors of all keyframes up to the end of each track, before and after its alignment (Fig. 5)."""
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(12.0, 8.0))
         panels = figure.subplots(3, -(-len(tracks) // 3), squeeze=False).ravel()
         for axes, track in zip(panels, tracks, strict=False):
             for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
-                _window_errors(axes, flown, track, name, colour)
+                _keyframe_errors(axes, flown, track, name, colour)
             axes.set(title=f"track {track}", yscale="log")
             axes.yaxis.set_major_formatter("{x:g}")
         panels[0].legend(fontsize=7)
-        figure.supxlabel("keyframe of the window")
+        figure.supxlabel("keyframe")
         figure.supylabel("position error [mm]")
         _save(figure, file)
 
 
-def _window_errors(axes: Axes, flown: Flown, track: int, name: str, colour: str) -> None:
+def _keyframe_errors(axes: Axes, flown: Flown, track: int, name: str, colour: str) -> None:
     result = flown.result
     numbers = [alignment.track for alignment in result.alignments[: len(result.before_ga)]]
     if track not in numbers:

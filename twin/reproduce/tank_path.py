@@ -1,4 +1,4 @@
-"""Paths of the stereo rig on the overhead track of the tank, which bends: planned positions and true poses."""
+"""Paths of the stereo rig on the overhead track of the tank, which is not straight: planned positions, true poses."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class TankObject(NamedTuple):
         return np.where((np.abs(u) < 1) & (np.abs(v) < 1), top / 2 * (1 + np.sqrt(np.maximum(1 - v**2, 0.0))), 0.0)
 
 
-#: Objects of the experiments: 1.4 to 6 inches, and a pipe of 2.4 inches, white and without texture, in the light.
+#: Objects of the experiments: 1.4 to 6 inches, and a pipe of 2.4 inches, white, with little texture, in the light.
 OBJECTS = (
     TankObject("brick", "box", (-0.1485, -0.2385), (0.150, 0.090, 0.060), 0.42),
     TankObject("crate", "box", (0.5115, -0.2985), (0.120, 0.120, 0.090), 0.35),

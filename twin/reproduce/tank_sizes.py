@@ -141,7 +141,8 @@ def _crossing(at: Array, above: Array) -> float:
 
     Args:
         at: (n,) places along the profile on one side of 0 [m].
-        above: (n,) height above the level at these places [m]."""
+        above: (n,) height above the level at these places [m].
+    """
     order = np.argsort(np.abs(at))
     at, above = at[order], above[order]
     below = np.flatnonzero(above <= 0)

@@ -32,11 +32,11 @@ _RENAMED_KEYS = {
     "imaging.calibration": "imaging.error_model",
     "imaging.forward_scatter": "imaging.scattering",
 }
-#: File of an item of `[[objects]]`.
+#: An item of `[[objects]]`, and its key `mesh_file`.
 _OBJECT = re.compile(r"objects\.\d+")
 _OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 _ABSENT = object()
-#: Largest number of errors of one file that are listed.
+#: Largest number of validation errors that are listed.
 _MAX_ERRORS = 20
 
 
@@ -48,7 +48,8 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
         overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is a string.
 
     Raises:
-        ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
+        ScenarioError: lists the errors, each as `FILE:LINE: key: problem (allowed: ...)`, or as `--set: ...` for an
+            override.
     """
     tree, source, errors = _read_with_base(find_scene(path), including_files=())
     source = source.model_copy(update={"overrides": tuple(overrides)})
@@ -74,7 +75,8 @@ def read_tree(path: str | Path) -> dict[str, Any]:
         path: path of a scenario file, or name of a scenario in scenes/.
 
     Raises:
-        ScenarioError: a file cannot be read or contains the old name of a renamed key.
+        ScenarioError: there is no such scenario, or a file cannot be read, is not TOML, extends itself or contains the
+            old name of a renamed key.
     """
     tree, _, errors = _read_with_base(find_scene(path), including_files=())
     if errors:
@@ -92,7 +94,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
         source: file that the new values come from, for error messages.
 
     Raises:
-        ScenarioError: lists every error.
+        ScenarioError: lists the errors.
     """
     changed = copy.deepcopy(dict(tree))
     for key, value in values.items():
@@ -112,7 +114,11 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 
 
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
-    """Validates a tree of keys and values and returns the model. Raises ScenarioError, which lists every error."""
+    """Validates a tree of keys and values and returns the model.
+
+    Raises:
+        ScenarioError: lists up to `_MAX_ERRORS` errors and the number of the others.
+    """
     try:
         return model.model_validate(tree)
     except ValidationError as error:
@@ -126,22 +132,27 @@ def find_scene(path: str | Path) -> Path:
     """Returns the path of a scenario file.
 
     Args:
-        path: path of an existing file, or name of a scenario in scenes/, with or without ".toml".
+        path: path of an existing file, or name of a scenario in scenes/, with or without "scenes/" and ".toml".
 
     Raises:
         ScenarioError: there is neither a file nor a scenario of this name.
     """
-    import scenes
-
     candidate = Path(path)
     if is_file(candidate):
         return candidate
-    folder = Path(scenes.__file__).parent
-    names = sorted(p.stem for p in folder.glob("*.toml"))
-    if str(path).removesuffix(".toml").removeprefix("scenes/") in names:
-        return folder / (str(path).removesuffix(".toml").removeprefix("scenes/") + ".toml")
-    hint, allowed = _hint(str(path), names), f"a file, or one of {', '.join(names)}"
+    files = _built_in_scenes()
+    name = str(path).removesuffix(".toml").removeprefix("scenes/")
+    if name in files:
+        return files[name]
+    hint, allowed = _hint(str(path), list(files)), f"a file, or one of {', '.join(files)}"
     raise ScenarioError([f"{shown(str(path))}: no such scenario{hint} (allowed: {allowed})"])
+
+
+def _built_in_scenes() -> dict[str, Path]:
+    """Returns the scenario files in scenes/ by name, in alphabetical order."""
+    import scenes
+
+    return {file.stem: file for file in sorted(Path(scenes.__file__).parent.glob("*.toml"))}
 
 
 def dump_toml(scenario: Scenario) -> str:
@@ -159,7 +170,7 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         Keys and values, and the line number of each dotted key.
 
     Raises:
-        ScenarioError: the file cannot be read, or is not TOML.
+        ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
         with file.open(encoding="utf-8") as stream:
@@ -190,7 +201,7 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
         numbers that they come from; and one error for each old name.
 
     Raises:
-        ScenarioError: the file extends itself, or a file cannot be read.
+        ScenarioError: the file extends itself, its base file does not exist, or a file cannot be read or is not TOML.
     """
     if resolved(file) in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
@@ -202,12 +213,19 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
     base = tree.pop("extends", None)
     if base is None:
         return tree, Source(path=file, lines=lines), errors
-    base_file = resolved(file.parent / str(base))
-    if not is_file(base_file):
-        line, name = lines.get("extends", 1), shown(repr(str(base)))
-        raise ScenarioError([*errors, f"{file}:{line}: extends: no such file {name}"])
+    base_file = _base_file(str(base), file.parent)
+    if base_file is None:
+        line, name, allowed = lines.get("extends", 1), shown(repr(str(base))), ", ".join(_built_in_scenes())
+        message = f"no such file {name} (allowed: a path relative to this file, or one of {allowed})"
+        raise ScenarioError([*errors, f"{file}:{line}: extends: {message}"])
     base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, resolved(file)))
     return _merge(base_tree, tree), Source(path=file, lines=lines, base=base_source), errors + base_errors
+
+
+def _base_file(base: str, folder: Path) -> Path | None:
+    """Returns the file that `extends` names: a path relative to `folder`, or a name in scenes/; None if neither."""
+    file = resolved(folder / base)
+    return file if is_file(file) else _built_in_scenes().get(base)
 
 
 def _remove(tree: dict[str, Any], key: str) -> bool:
@@ -276,7 +294,7 @@ def _override_value(key: str, text: str) -> Any:
     """Returns the TOML value in the text of an override; the text itself if it is not TOML.
 
     Raises:
-        ScenarioError: the value exceeds the limits of `toml_text`.
+        ScenarioError: the text or the value exceeds the limits of `toml_text`.
     """
     try:
         given = parse_toml(f"v = {text}")

@@ -6,8 +6,7 @@ from twin.scenario.model import CalibrationErrorConfig, Scenario
 
 
 def idealisations(scenario: Scenario) -> list[str]:
-    """Returns a sentence for each idealised part of a scenario: cameras, water, light, vehicle,
-    restored colours, images."""
+    """Returns a sentence for each idealised part: cameras, water, light, vehicle, restored colours, images."""
     subjects = {
         "The cameras are ideal": _cameras(scenario),
         "The water is ideal": _water(scenario),
@@ -61,7 +60,7 @@ def _vehicle(scenario: Scenario) -> list[str]:
 
 
 def _restoration(scenario: Scenario) -> list[str]:
-    """Returns the errors that the restoration of real images has and that of this scenario has not.
+    """Returns the names of the errors that the restoration of real images has and that of this scenario does not have.
 
     Simulated images are restored with the true values of water, lamps, vignetting and exposure.
     """

@@ -19,6 +19,7 @@ from twin.errors import TwinError
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 
 FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of texels of the default size [m]
+SEA_WATER_INDEX = 1.339  #: refractive index of sea water in visible light
 PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
@@ -328,7 +329,7 @@ class PortConfig(Section):
     glass_index: float = Field(
         default=1.49, ge=1, le=3, description="refractive index of the window of the port: acrylic 1.49, glass 1.52"
     )
-    water_index: float = Field(default=1.339, ge=1, le=2, description="refractive index of sea water")
+    water_index: float = Field(default=SEA_WATER_INDEX, ge=1, le=2, description="refractive index of sea water")
     calibrated_at_m: float = Field(
         default=0.0, ge=0, le=100,
         description="depth along the optical axis for which images are rectified exactly, as after a calibration in "
@@ -524,7 +525,7 @@ class CurrentConfig(Section):
 
 
 class NavigationConfig(Section):
-    """Navigation sensors: all are simulated, but the estimators receive only the readings of those in `aiding`."""
+    """Navigation sensors and their noise; the estimators receive the readings of the sensors in `aiding` only."""
 
     aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty: vision only")
     pressure_sigma_m: float = Field(
@@ -867,7 +868,11 @@ class Scenario(Section):
 
     @property
     def texel_m(self) -> float:
-        """Returns the size of a texture pixel [m]: as given, or that of an image pixel on the floor, within limits."""
+        """Returns the size of a texture pixel [m]: as given, or by default `COARSEST_TEXEL_M` for a photo.
+
+        The default for a generated texture is the size of an image pixel on the reference plane, limited to the range
+        from `FINEST_TEXEL_M` to `COARSEST_TEXEL_M`.
+        """
         if self.terrain.texture_px_m is not None:
             return self.terrain.texture_px_m
         if self.terrain.texture_file is not None:

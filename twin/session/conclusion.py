@@ -115,13 +115,16 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
 
 def plugin_notes(scenario: Scenario) -> list[str]:
     """Returns one sentence on each plug-in of the survey."""
-    notes = {
-        scenario.terrain.plugin: "The heights of the floor are those of the plug-in {}.",
-        scenario.control.plugin: "The vehicle was steered by the plug-in {}.",
-        scenario.estimate.plugin: "The trajectories are those of the plug-in {}: its online poses (shown as F2F and as "
-        "online) and the poses that it returned at the end (final). There are no links and no alignments.",
-    }
-    return [note.format(name) for name, note in notes.items() if name is not None]
+    notes = (
+        (scenario.terrain.plugin, "The heights of the floor are those of the plug-in {}."),
+        (scenario.control.plugin, "The vehicle was steered by the plug-in {}."),
+        (
+            scenario.estimate.plugin,
+            "The trajectories are those of the plug-in {}: its online poses (shown as F2F and as online) and the poses "
+            "that it returned at the end (final). There are no links and no alignments.",
+        ),
+    )
+    return [note.format(name) for name, note in notes if name is not None]
 
 
 def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:

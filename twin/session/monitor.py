@@ -1,4 +1,4 @@
-"""Monitoring of a running survey: progress, log, live view, and abort if vision or position is lost."""
+"""Monitoring of a running survey: progress, log, live view, and abort if vision is lost or the position uncertain."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ class SurveyProgress(NamedTuple):
     """Progress of a survey.
 
     Args:
-        simulated_s, wall_s: simulated and wall time [s].
+        simulated_s, wall_s: simulated time (0 after the flight) and wall time [s].
         share: completed fraction of `stage`, 0 to 1.
-        sigma_m: standard deviation of the online position, root of the sum of the three variances [m].
-        stage: current stage, "survey", "map" or "report".
+        sigma_m: standard deviation of the online position, root of the sum of the three variances [m]; 0 after the
+            flight.
+        stage: current stage, "survey", "map", "orthomosaic" or "report".
     """
 
     simulated_s: float
@@ -39,7 +40,9 @@ class SurveyProgress(NamedTuple):
 
 
 class SurveyMonitor:
-    """Reports the progress of a survey at every frame; aborts it if vision is lost or the position too uncertain.
+    """Reports the progress of a survey at every frame; aborts a survey that cannot continue.
+
+    It cannot continue if vision is lost, the vehicle has been stopped for too long, or the position is too uncertain.
 
     Args:
         mission: the survey as planned.
@@ -95,7 +98,7 @@ class SurveyMonitor:
         self.folder.log("action", time_s=estimate.time_s, action=action, status=estimate.status)
 
     def report_stage(self, stage: str, share: float) -> None:
-        """Reports the completed fraction of a stage that follows the flight, "map" or "report"."""
+        """Reports the completed fraction of a stage that follows the flight: "map", "orthomosaic" or "report"."""
         self.progress(SurveyProgress(0.0, self.wall_s, share, 0.0, stage))
 
     @property

@@ -33,7 +33,8 @@ class Orthomosaic(NamedTuple):
 def is_wanted(mission: Mission, folder: RunFolder) -> bool:
     """Returns whether to make the orthomosaic of a survey.
 
-    It is made if the scenario enables it, and maps are written or a requirement limits one of its metrics."""
+    It is made if the scenario enables it, and maps are written or a requirement limits one of its metrics.
+    """
     scenario = mission.scenario
     return scenario.map.orthomosaic and (
         folder.writes_maps or any(name.startswith("orthomosaic.") for name in scenario.require)
@@ -49,14 +50,24 @@ def make_orthomosaic(
     folder: RunFolder,
     tools: tuple[StageTimer, Callable[[float], None]],
 ) -> Orthomosaic | None:
-    """Makes the orthomosaic of a survey, writes it and compares it with the truth; None without images or mapped cells.
+    """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
 
-    The estimators get the images, the estimated poses and map, and the believed lamps and water. The true albedo is
-    used for the comparison only.
+    The orthomosaic is made from the images, the estimated poses and map, and, for the restoration of colours, from the
+    lamps and the water of the scenario. The true albedo is used for the comparison only.
 
     Args:
+        mission: the survey as planned.
+        navigator: the estimators, with the images of the keyframes.
+        result: output of the estimators.
+        elevation: elevation map.
+        truth: source of the true albedo and of the asked area.
+        folder: run folder.
         tools: timer of the stage "orthomosaic", which excludes the comparison; function called with the completed
             fraction.
+
+    Returns:
+        The elevation map with the orthomosaic averaged to its cells, and the errors of the orthomosaic; None without
+        images or mapped cells.
 
     Raises:
         OSError: the file could not be written, or an image could not be read.

@@ -56,7 +56,7 @@ class PluginNavigator(Navigator):
             OSError: images could not be written.
         """
         interval_s = self._interval_s(frame.time_s)
-        keyframe = self._stereo_keyframe(frame, track)  # before the plug-in, which could change the images
+        keyframe = self._stereo_keyframe(frame, track)
         with self.stopwatch("f2f"):
             found = self._plugin.call("update", frame)
             cov = self._plugin.call("covariance")

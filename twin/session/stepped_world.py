@@ -37,7 +37,8 @@ class SteppedWorld:
 
     `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
     the next frame of the plan. A frame holds images and sensor readings, no truth. The same seed and the same commands
-    give the same frames, bit for bit. One object holds one OpenGL context; use it in one thread.
+    give the same frames, bit for bit. One object holds one OpenGL context; use it in one thread. Before `reset`, all
+    methods and properties that need a flight raise RuntimeError.
 
     Args:
         scenario: the survey, from `twin.load_scenario`.
@@ -97,7 +98,7 @@ class SteppedWorld:
 
         Raises:
             ValueError: the command has another shape.
-            RuntimeError: `reset` was not called, or not after an earlier call returned None.
+            RuntimeError: `reset` was not called, or was not called again after `step` returned None.
             SurveyAborted: the physics diverged, for example because a command is not finite.
         """
         values, n = np.array(command, dtype=np.float64), 8 if self.mission.scenario.vehicle.dynamics == "rigid" else 3

@@ -65,8 +65,13 @@ def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> l
 
 
 def _area(mission: Mission, elevation: ElevationMap | None) -> list[Finding]:
-    """Returns a finding if the map covers too small a fraction of the asked area."""
+    """Returns a finding if the map covers too small a fraction of the asked area.
+
+    An area that is smaller than a cell may contain no cell centre; it is not checked.
+    """
     asked = mission.plan.inside_area(*np.meshgrid(*mission.grid.centres()))
+    if not asked.any():
+        return []
     mapped = 0.0 if elevation is None else float(np.isfinite(elevation.height_m[asked]).mean())
     if mapped >= MIN_AREA_MAPPED:
         return []

@@ -102,8 +102,9 @@ def free_joint_acceleration(
     linear and w the angular velocity in body axes.
 
     Args:
+        hull, world_from_body: as defined in `acceleration`.
         velocity: (6,) velocity in these coordinates [m/s, rad/s].
-        hull, world_from_body, current_mps, wrench: as defined in `acceleration`.
+        current_mps, wrench: as defined in `acceleration`.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
     body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)

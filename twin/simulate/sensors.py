@@ -26,7 +26,7 @@ class NavigationSensors:
     Args:
         settings: the sensors used for aiding, and the interval of acoustic fixes.
         noise: standard deviations from the data sheets, and the surveyed positions of the beacons.
-        rig: nominal calibration of the stereo rig.
+        rig: believed calibration of the stereo rig.
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
         project: projects points (n, 3) in left camera axes to pixels (n, 2) with the true calibration; None: the
             projection of `rig`.
@@ -231,7 +231,7 @@ def detect_beacons(
     noise: SensorNoise,
     rng: np.random.Generator,
 ) -> tuple[BeaconDetection, ...]:
-    """Simulates the detection of beacons in the left image; beacons occluded by the floor are not detected.
+    """Simulates the detection of beacons in the left image, except those outside the image or occluded by the floor.
 
     Noise is sampled for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
 
@@ -251,7 +251,14 @@ def detect_beacons(
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
-    """Returns whether a point, given by its pixel (2,) and its depth, is inside the image and not behind the floor."""
+    """Returns whether a point is inside the image and not hidden by the floor.
+
+    Args:
+        pixel: (2,) column and row of the point [px].
+        distance_m: depth of the point along the optical axis [m]; it may exceed that of the floor by the height of a
+            beacon.
+        depth_m: (H, W) depth of the floor along the optical axis [m].
+    """
     rows, columns = depth_m.shape
     if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # also true for NaN
         return False

@@ -18,6 +18,7 @@ from twin.study.agreement import Agreement, MetricAgreement
 from twin.study.analysis import StudyAnalysis
 from twin.study.figures import make_panels
 from twin.study.statistics import Array
+from twin.study.study_file import n_planned_surveys
 
 HEADER = ("metric", "pairs", "rendered", "surrogate", "surrogate / rendered", "KS p", "verdict")
 LIMITS = (
@@ -42,7 +43,7 @@ def verdict_line(result: Agreement) -> str:
 
 
 def figure(analysis: StudyAnalysis) -> Figure:
-    """Returns the figure: values of every metric in the surrogate survey against those in the rendered survey."""
+    """Returns the figure: one plot per compared metric, with the surrogate values against the rendered ones."""
     with matplotlib.rc_context(FIGURE_STYLE):
         drawing, panels = make_panels(len(analysis.study.compare), columns=3)
         for metric, axes in zip(analysis.study.compare, panels, strict=True):
@@ -73,7 +74,7 @@ def _markdown(analysis: StudyAnalysis, result: Agreement) -> str:
     study = analysis.study
     lines = [
         "# Agreement of surrogate with rendered surveys", "",
-        f"`twin study {study.name}` flies {study.sampling.samples or ''} pairs of surveys, each rendered and with the "
+        f"`twin study {study.name}` flies {n_planned_surveys(study) // 2} pairs of surveys, each rendered and with the "
         "surrogate, and writes this page and its figure to the results folder; `make agreement` copies them here. "
         f"Requirements of a survey: {_requirements(study.limits)}.", "",
         verdict_line(result), "", *_markdown_table(result), "", LIMITS, "",
@@ -130,7 +131,7 @@ def _draw_pairs(axes: Axes, metric: str, rendered: Array, surrogate: Array) -> N
     x, y = (np.minimum(values, edge) for values in (rendered, surrogate))
     axes.plot(x, y, "o", markersize=3.5, color=COLOURS["online"], alpha=0.7)
     if logarithmic:
-        log_axis(axes.xaxis, axes.set_xscale)
+        log_axis(axes.xaxis, axes.set_xscale, (1.0,) if high > 30 * low else (1.0, 3.0))
         log_axis(axes.yaxis, axes.set_yscale)
     axes.set(xlim=(start, edge), ylim=(start, edge), xlabel="rendered", ylabel="surrogate")
     axes.set_title(textwrap.fill(wording.metric_name(metric), 30), fontsize=8)

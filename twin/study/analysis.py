@@ -26,8 +26,8 @@ _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, e
 class MetricSummary(NamedTuple):
     """Distribution of a metric over the surveys: median, 95th or 5th percentile, and required limit.
 
-    `surveys` is the number of surveys; `bound` is the 95th percentile, or the 5th percentile if larger values of the
-    metric are better; `limit` is None if the metric has no requirement.
+    `surveys` is the number of surveys with a value; `bound` is the 95th percentile, or the 5th percentile if larger
+    values of the metric are better; `limit` is None if the metric has no requirement.
     """
 
     name: str
@@ -38,7 +38,10 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN for strings), explained fraction of rank variance."""
+    """Dependence of a metric on a key: rank correlation (NaN unless the key is a number), explained rank variance.
+
+    `explained` is the fraction of the variance of the metric's ranks; see `statistics.explained_variance`.
+    """
 
     key: str
     metric: str
@@ -79,8 +82,8 @@ class RefusedSample(NamedTuple):
 class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
-    Refused and failed surveys have no result and are excluded from every statistic. Surveys of the same scenario with
-    the same seed are identical and count once.
+    Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Surveys
+    of the same scenario with the same seed are identical and count once.
 
     Args:
         rows: results table.
@@ -124,15 +127,15 @@ class StudyAnalysis:
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is required or has a value in any survey (surrogate surveys have no contrast)."""
+        """Returns whether the table has the metric, required or with a value (surrogate surveys have no contrast)."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
     def included(self, metric: str) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
 
-        These are the complete surveys with a value of the metric. The statistics of image quality metrics ("vision.")
-        also include degraded and aborted surveys.
+        These are the complete surveys with a finite value of the metric. The statistics of image quality metrics
+        ("vision.") also include degraded and aborted surveys.
         """
         flown = self.evaluated if metric.startswith("vision.") else self.complete
         return flown & np.isfinite(self.numbers(metric))
@@ -168,7 +171,10 @@ class StudyAnalysis:
 
     @property
     def requirement_missed(self) -> bool:
-        """Returns whether the pass probability over all samples is below the required value, or is not known."""
+        """Returns whether the pass probability over all samples is below the required value, or is not known.
+
+        False if no pass probability is required.
+        """
         required = self.required_probability
         return required is not None and not self.pass_probability.value >= required
 
@@ -235,17 +241,18 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean of a metric over the surveys of each sample; NaN if any of them was not completed."""
+        """Returns the mean of a metric over the surveys of each sample; NaN unless all are complete with a value."""
         values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
 
     @cached_property
     def answers(self) -> dict[str, list[Answer]]:
-        """Returns, for each varied key, whether the pass probability reaches the required value; it may be undecided.
+        """Returns, for each varied key, the verdicts on whether the pass probability reaches the required value.
 
-        A key with a distribution has one answer per range, a key with listed values one per value; the other keys vary
-        as the study specifies. Empty without a required pass probability, or if no survey was evaluated.
+        A key with a distribution has one answer per range, a key with listed values one per value, or per range if it
+        has more than 12 different numbers. The other keys vary as the study specifies. Empty without a required pass
+        probability, or if no survey was evaluated.
         """
         if self.required_probability is None or not self.evaluated.any():
             return {}
@@ -276,7 +283,7 @@ class StudyAnalysis:
 
     @cached_property
     def refusal_reasons(self) -> list[FailureReason]:
-        """Returns the reasons why surveys were refused, the most frequent first.
+        """Returns the reasons why surveys were refused, at most 12, the most frequent first.
 
         Reasons that differ only in numbers count as one, with the text of the first.
         """
@@ -298,7 +305,7 @@ class StudyAnalysis:
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:
-        """Returns the most frequent reasons why surveys did not pass, in descending order, with numbers masked."""
+        """Returns the reasons why surveys did not pass, with numbers masked: at most 12, the most frequent first."""
         counts: dict[tuple[str, str], int] = {}
         for k in np.flatnonzero(~self.passed & ~self.refused & ~self.duplicate):
             reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))

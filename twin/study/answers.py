@@ -1,4 +1,4 @@
-"""Verdicts on ranges of a key: the pass probability reaches the required value, is below it, or is undecided."""
+"""Verdicts on ranges of a key: whether the pass probability reaches the required value, or this is undecided."""
 
 from __future__ import annotations
 

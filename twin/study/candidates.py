@@ -1,7 +1,7 @@
 """Candidate plans of a search: their surveys, objectives, pass probability, and the Pareto front.
 
 All candidates are flown with the same samples and seeds. Finalists, the plans to be confirmed, are flown again
-with new samples and seeds, and then as rendered surveys with samples and seeds of their own.
+with new samples and seeds. The plans to be verified are then flown as rendered surveys, with further samples and seeds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.study.analysis import count_similar
 from twin.study.correction import NO_CORRECTION, PlanCorrection
-from twin.study.design import Sample, samples, seeds_of_sample
+from twin.study.design import Sample, axis_names, samples, seeds_of_sample
 from twin.study.flight import Row, has_passed, refused_row
 from twin.study.statistics import Interval, wilson_interval
 from twin.study.study_file import Study, TuningConfig
@@ -28,8 +28,8 @@ from twin.study.surveys import Survey, merge_errors, refusals, scenario_of_sampl
 
 _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
 _CONFIRM_SEEDS = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
-_RENDER_SEEDS = 2_000_000  # added to it for the rendered surveys of finalists
-_PENALTY = 1e9  # objective of a candidate without any complete survey; Optuna does not accept infinity
+_RENDER_SEEDS = 2_000_000  # added to it for the rendered surveys
+_PENALTY = 1e9  # objective of a candidate without a finite median; Optuna does not accept infinity
 
 
 class SurveyScore(NamedTuple):
@@ -50,7 +50,7 @@ class Candidate(NamedTuple):
     """An evaluated plan: trial number, value of each searched key, objectives, pass probability and its shortfall.
 
     `completeness` lists (name, median) of each completeness metric that is reported in addition to the objectives; the
-    median is NaN without a completed survey.
+    median is NaN if no completed survey has a value.
     """
 
     number: int
@@ -62,7 +62,7 @@ class Candidate(NamedTuple):
 
     @property
     def has_metrics(self) -> bool:
-        """Returns whether every objective has a value, which requires at least one completed survey."""
+        """Returns whether every objective has a finite value; all but "risk" require a completed survey."""
         return max(abs(value) for value in self.objectives) < _PENALTY
 
 
@@ -78,7 +78,7 @@ def tuning_config(study: Study) -> TuningConfig:
 
 
 def required_probability(study: Study) -> float:
-    """Returns the pass probability that a plan must reach."""
+    """Returns the pass probability that a plan must reach: that of the study, or else 0.5."""
     return _DEFAULT_PROBABILITY if study.probability is None else study.probability
 
 
@@ -93,6 +93,9 @@ class CandidateSurveys:
         config: section [tune] of the study.
         folder: results folder; the run folders are created in its subfolder `runs`.
         rows: rows of the surveys flown so far.
+
+    Raises:
+        ScenarioError: no sample is valid.
     """
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, rows: Iterable[Row]):
@@ -108,21 +111,25 @@ class CandidateSurveys:
             self.add(row)
 
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new samples.
+        """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new seeds.
+
+        Sampled keys have new samples.
 
         Args:
             rows: rows of the surveys flown so far.
         """
         sampling = self.study.sampling
-        count = "seeds" if sampling.samples is None else "samples"
+        is_sampled = sampling.method != "grid" and len(axis_names(self.study)) > 0
+        count = "samples" if is_sampled else "seeds"
         update = {"seed": sampling.seed + _CONFIRM_SEEDS, count: (getattr(sampling, count) or 1) * self.config.confirm}
         study = self.study.model_copy(update={"sampling": sampling.model_copy(update=update)})
         return CandidateSurveys(study, self.config, self.folder, rows)
 
     def rendered(self, rows: Iterable[Row]) -> CandidateSurveys:
-        """Returns the rendered surveys that verify a plan: `tune.verify` samples, each with a new seed of its own.
+        """Returns the rendered surveys that verify a plan: `tune.verify` new design points, each with its own seed.
 
-        A study that varies only grids has `tune.verify` seeds for each cell of the grids instead.
+        Each design point is combined with every cell of the grids. A study without sampled keys has `tune.verify` seeds
+        for each cell instead.
 
         Args:
             rows: rows of the surveys flown so far.
@@ -142,7 +149,7 @@ class CandidateSurveys:
 
     @property
     def uses_surrogate(self) -> bool:
-        """Returns whether the surveys are flown by the surrogate."""
+        """Returns whether the surveys are flown by the surrogate, judged by the first sample."""
         return scenario_of_sample(self.study, self.base, self.conditions[0]).imaging.fidelity == "surrogate"
 
     def add(self, row: Row) -> None:
@@ -154,7 +161,7 @@ class CandidateSurveys:
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
-        """Returns whether the survey has a result; one with a different scenario hash belongs to another scenario."""
+        """Returns whether the survey has a result with its scenario hash; a result with another hash does not count."""
         score = self._scores.get(survey.key)
         return score is not None and score.status != "failed" and score.scenario_hash == survey.scenario_hash
 
@@ -280,7 +287,7 @@ def check_bounds(study: Study, config: TuningConfig) -> None:
     """Validates the scenario at both bounds, or at all listed values, of each searched key.
 
     Raises:
-        ScenarioError: lists all errors, each key once.
+        ScenarioError: lists the errors, each key once.
     """
     base, errors = read_tree(study.scenario_file), []
     condition = next(samples(study))

@@ -11,7 +11,7 @@ from twin.study.distribution import Distribution
 
 _WIDTH = 0.15  # standard deviation of the kernel, as a fraction of the searched range
 _PRIOR_WEIGHT = math.exp(-2.0)  # weight of "no correction": that of a plan at a distance of two widths
-_LARGEST = 100.0  # largest ratio that is used
+_LARGEST = 100.0  # largest ratio that is used; the smallest is its inverse
 _MISSING = 10.0  # ratio of an error metric without a rendered value, e.g. because the rendered surveys were aborted
 
 

@@ -12,7 +12,7 @@ Result = TypeVar("Result")
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task: its `result`, or None with the reason of its `failure`; and the number of attempts."""
+    """Outcome of one task: its `result` (None if it failed), the reason of its failure, and the number of attempts."""
 
     task: Task
     result: Result | None

@@ -15,17 +15,17 @@ from twin.study.design import Sample
 from twin.study.surveys import Survey
 
 Row = dict[str, Any]
-#: Files of a run folder that are kept, for each value of the study's `keep`.
+#: Files of a run folder that are kept, by the value of the study's `keep`; "all" keeps every file, "none" no file.
 KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
 #: Argument `outputs` of `survey.run` for each value of the study's `keep`: files that would be deleted are not written.
 OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
 
 
 def fly(survey: Survey) -> Row:
-    """Flies a survey, writes its run folder, and returns its row of results.
+    """Flies a survey, writes the files of its run folder that are kept, and returns its row of results.
 
-    A survey that ends with a TwinError or OSError gives a row with status "refused" or "failed". The survey writes to a
-    hidden folder that is renamed at the end, so a folder with the final name is complete.
+    A ScenarioError gives a row with status "refused", any other TwinError or an OSError one with "failed". The survey
+    writes to a hidden folder that is renamed at the end, so a folder with the final name is complete.
     """
     import cv2
 
@@ -69,13 +69,13 @@ def _status(metrics: Mapping[str, Any]) -> str:
 
 
 def row_of(survey: Survey, status: str, reason: str) -> Row:
-    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason and varied keys.
+    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason and values of varied keys.
 
     Args:
         survey: the survey.
         status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
             "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
-            computer failed. A refused or failed survey has no result.
+            computer failed.
         reason: why the status is not "complete"; else "".
     """
     identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}

@@ -32,11 +32,23 @@ class RenderedCheck(NamedTuple):
         rendered: (n,) whether each rendered survey was completed and met every requirement.
         surrogate: (n,) whether each of the surrogate surveys was completed and met every requirement.
         rows: result of each rendered survey.
+        interrupted: whether Ctrl-C ended the check, so that some of the rendered surveys are missing.
+        has_limits: whether the study has a limit, so that there are verdicts to check.
     """
 
     rendered: NDArray[np.bool_]
     surrogate: NDArray[np.bool_]
     rows: list[Row]
+    interrupted: bool = False
+    has_limits: bool = True
+
+    @property
+    def exit_status(self) -> int:
+        """Returns 130 if the check was interrupted; 0 if surrogate and rendered surveys agree or there are no limits.
+
+        Otherwise 1.
+        """
+        return 130 if self.interrupted else int(self.has_limits and not self.agrees)
 
     @property
     def pass_probability(self) -> Interval:
@@ -45,13 +57,25 @@ class RenderedCheck(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Returns whether the fraction of the surrogate surveys that passed lies in `pass_probability`."""
+        """Returns whether the fraction of the surrogate surveys that passed lies in the interval of `pass_probability`.
+
+        False without a rendered survey.
+        """
         interval = self.pass_probability
         return len(self.rendered) > 0 and interval.low <= float(self.surrogate.mean()) <= interval.high
 
     def sentence(self) -> str:
-        """Returns the result in one sentence."""
+        """Returns the result in one sentence, and another one if the check is incomplete."""
+        partial = " The check was interrupted and is incomplete; --resume continues it." if self.interrupted else ""
+        return self._result() + partial
+
+    def _result(self) -> str:
+        """Returns the result of the rendered surveys that were flown in one sentence."""
         n = len(self.rendered)
+        if not self.has_limits:
+            return "No survey was flown rendered: the study has no limit in [require], so there is no verdict to check."
+        if n == 0 and self.interrupted:
+            return "No survey was flown rendered."
         if n == 0:
             return "No survey was flown rendered: none of the surrogate surveys has a value of every required metric."
         same = int((self.rendered == self.surrogate).sum())
@@ -67,6 +91,8 @@ def check(
 ) -> RenderedCheck:
     """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
+    Ctrl-C ends the check early; the comparison then has the rendered surveys flown until then.
+
     Args:
         study: the study.
         analysis: results of the study.
@@ -74,6 +100,10 @@ def check(
         folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
         engine: runs the surveys in parallel.
         progress: display of the progress.
+
+    Raises:
+        TwinError: the subfolder cannot be written, or contains the results of another study.
+        OSError: the results cannot be written.
     """
     nearest = nearest_surveys(analysis, n)
     keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
@@ -81,12 +111,13 @@ def check(
     log = open_folder(folder / FOLDER, True, ((key, survey.scenario_hash) for key, survey in chosen.items()))
     done = log.done()
     progress.begin(progress.done + len(set(keys) - done))
-    fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+    completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
     log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
     found = [rows[keys[k]] for k in flown]
-    return RenderedCheck(np.array([has_passed(row) for row in found], bool), analysis.passed[nearest[flown]], found)
+    passed = np.array([has_passed(row) for row in found], bool)
+    return RenderedCheck(passed, analysis.passed[nearest[flown]], found, not completed, bool(analysis.limits))
 
 
 def summary(checked: RenderedCheck) -> dict[str, Any]:
@@ -97,14 +128,15 @@ def summary(checked: RenderedCheck) -> dict[str, Any]:
         "surrogate_passed": int(checked.surrogate.sum()),
         "same_verdict": int((checked.rendered == checked.surrogate).sum()),
         "agrees": checked.agrees,
+        "interrupted": checked.interrupted,
     }
 
 
 def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     """Returns the row numbers of the n surrogate surveys whose metrics are closest to the limits, the closest first.
 
-    The distance of a metric from its limit is the fraction of the surveys whose value lies between the two, so that
-    metrics of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
+    The distance of a metric from its limit is the number of surveys whose value lies between the two, so that metrics
+    of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
     or else closest to it. Surveys without a finite value of every required metric are left out.
 
     Args:
@@ -123,14 +155,17 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
 
 
 def _excess(values: Array, limit: float) -> Array:
-    """Returns, for each of the values (n,), how many others lie between it and a limit; negative below the limit."""
+    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit.
+
+    Of the values equal to it, half are counted.
+    """
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
     return rank - np.searchsorted(ascending, limit, "right")
 
 
 def _rendered(survey: Survey, folder: Path) -> Survey:
-    """Returns the rendered survey with the scenario and seed of a surrogate survey, and its run folder in `folder`."""
+    """Returns the rendered survey with the scenario and seed of a surrogate survey, and a run folder in `folder`."""
     imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
     scenario = survey.scenario.model_copy(update={"imaging": imaging})
     run_folder = folder / "runs" / survey.folder.name

@@ -105,14 +105,18 @@ def _line_end(file: IO[bytes], end: int) -> bytes:
 
 
 def write_parquet(rows: pa.Table, file: Path) -> None:
-    """Writes the table atomically."""
+    """Writes a table to a Parquet file atomically.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     part = file.with_name(f".{file.name}.part")
     pq.write_table(rows, part)
     part.replace(file)
 
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names ordered by section: identity in a fixed order, varied keys, metrics and timing by alphabet."""
+    """Returns the names by section: identity in a fixed order; varied keys, metrics and timing each by alphabet."""
     identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 

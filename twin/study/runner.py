@@ -58,7 +58,8 @@ def run_study(
 ) -> StudyResult:
     """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
-    Ctrl-C ends the study early; the results obtained until then are written.
+    A study that compares rendered and surrogate surveys also gets agreement.md and its figure. Ctrl-C ends the study
+    early; the results obtained until then are written.
 
     Args:
         study: the study.
@@ -69,7 +70,8 @@ def run_study(
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study.
+        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study;
+            or the engine lost its connection.
         ScenarioError: no sample has a valid scenario; nothing was flown.
     """
     refused = refusals(study)
@@ -123,6 +125,8 @@ def refusal_notice(refused: dict[int, str]) -> str:
         refused: reason of each refused sample, by sample number.
     """
     number, reason = min(refused.items())
+    if len(refused) == 1:
+        return f"1 sample cannot be flown and is left out: sample {number}: {reason}"
     return f"{len(refused)} samples cannot be flown and are left out, e.g. sample {number}: {reason}"
 
 

@@ -20,7 +20,7 @@ from twin.study.distribution import Distribution
 from twin.study.study_file import Study, TuningConfig
 
 NAME = "twin"  #: name of the Optuna study in the journal
-ROUND_NUMBERS = 1_000_000  #: difference between the first candidate numbers of successive rounds
+ROUND_NUMBERS = 1_000_000  #: offset between the candidate numbers of successive rounds
 _EARLIER = "earlier_round"  # marks the trials that were added from earlier rounds
 
 
@@ -65,7 +65,7 @@ class Search:
         self.optuna_study.set_user_attr("identity", identity)
 
     def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
-        """Adds the candidates of earlier rounds; the sampler proposes the first batch of this round from their results.
+        """Adds the candidates of earlier rounds, whose results the sampler uses from the first batch of this round.
 
         Does nothing once this round has candidates of its own. After an interruption, adds the ones still missing.
 

@@ -231,9 +231,10 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
 
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
-    """Returns the group index (n,) of each number: one group per distinct value if there are few, else 2 to 10 bins.
+    """Returns the group index (n,) of each of n numbers.
 
-    All bins have about the same number of elements.
+    If there are at most 12 distinct values, and fewer than n, each distinct value is a group. Otherwise, the numbers
+    are divided into 2 to 10 bins of about equal count; equal numbers may be in different bins.
 
     Args:
         x: (n,) numbers.

@@ -87,7 +87,12 @@ class TuningConfig(Section):
         description="rendered surveys of a plan, all of which must pass before it is recommended, if the search uses "
         "the surrogate; 0: the recommended plan is not verified",
     )
-    plans: int = Field(default=3, ge=1, le=100, description="largest number of plans with rendered surveys in a round")
+    plans: int = Field(
+        default=3,
+        ge=1,
+        le=100,
+        description="largest number of plans verified in a round, and of cheaper plans at the end",
+    )
     rounds: int = Field(
         default=2,
         ge=0,
@@ -111,7 +116,8 @@ class Study(Section):
     question: str = Field(default="", max_length=200, description="question to answer; a heading of the report")
     seek: str | None = Field(
         default=None,
-        description="a varied numeric key: estimate the value at which the pass probability equals require.probability",
+        description="a varied numeric key: report first at which of its values the pass probability reaches "
+        "require.probability",
     )
     keep: KeepLevel = Field(default="metrics", description="files to keep of each run")
     timeout_s: float = Field(
@@ -159,7 +165,11 @@ class Study(Section):
 
     @property
     def scenario_file(self) -> Path:
-        """Returns the path of the scenario file whose keys the study varies."""
+        """Returns the path of the scenario file whose keys the study varies.
+
+        Raises:
+            ScenarioError: there is no such file.
+        """
         relative = self.source.path.parent / self.scenario
         return find_scene(relative if is_file(relative) else self.scenario)
 
@@ -219,7 +229,7 @@ def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _errors(study: Study) -> Iterable[TwinError]:
-    """Yields the errors that involve several fields, which pydantic's validation of each field does not find."""
+    """Yields the errors that pydantic's validation of single fields does not find."""
     yield from _key_errors(study)
     yield from _table_errors(study)
     yield from _sampling_errors(study)
@@ -291,7 +301,7 @@ def n_planned_surveys(study: Study) -> int:
     cells = math.prod(len(d.values) for d in study.vary.values() if is_grid or not d.is_sampled)
     tables = math.prod(len(table.rows) for table in study.together) if is_grid else 1
     n_axes = sum(d.is_sampled for d in study.vary.values()) + len(study.together)
-    points = (sampling.samples or 1) * (n_axes + 2 if sampling.method == "saltelli" else 1)
+    points = (sampling.samples or 1) * (n_axes + 2 if sampling.method == "saltelli" and n_axes else 1)
     return (1 if is_grid else points) * cells * tables * sampling.seeds
 
 

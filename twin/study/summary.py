@@ -51,7 +51,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
 
 
 def _agreement(analysis: StudyAnalysis) -> dict[str, Any] | None:
-    """Returns the agreement of surrogate with rendered surveys as JSON values; None if the study compares none."""
+    """Returns the agreement of surrogate with rendered surveys as JSON values; None without it."""
     result = agreement(analysis)
     if result is None:
         return None

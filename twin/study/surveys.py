@@ -65,6 +65,7 @@ def surveys(study: Study, folder: Path, without: Container[int] = ()) -> Iterato
     """Yields every survey of the study, sample by sample.
 
     Args:
+        study: the study.
         folder: results folder of the study; the run folders are created in its subfolder `runs`.
         without: numbers of the samples to leave out.
 
@@ -95,7 +96,7 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
     Args:
         study: the study.
         base: contents of the study's scenario file.
-        sample: the sample, whose values replace those of `base`.
+        sample: the sample, whose values replace those of `base` and of the section [set] of the study.
 
     Raises:
         ScenarioError: lists every error of the scenario, each with a line of the study file.
@@ -129,7 +130,7 @@ def refusals(study: Study) -> dict[int, str]:
 def merge_errors(errors: Iterable[str]) -> list[str]:
     """Returns the first error of each line and key of the study file, with the number of further errors of that key.
 
-    The list is limited to 20 keys; its last line states how many were left out.
+    The list is limited to 20 keys; if there are more, its last line states how many were left out.
     """
     by_key: dict[str, list[str]] = {}
     for error in errors:

@@ -40,10 +40,10 @@ class TuningResult(NamedTuple):
         verifications: plans that were verified by rendered surveys, in the order of flight.
         recommended: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest
             plan confirmed with new samples and seeds; None if there is none or the search was interrupted.
-        scenario: scenario of the recommended plan.
+        scenario: scenario of the recommended plan; None if there is none.
         interrupted: whether Ctrl-C ended the search.
         needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
-        warnings: for each warning, the number of the finalists' surveys that have it.
+        warnings: for each warning, the number of the finalists' surveys with new seeds that have it.
         refused: for each reason, the number of plans whose surveys were all refused in the search.
     """
 
@@ -120,8 +120,9 @@ def tune(
 
     Raises:
         TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, cannot be written,
-            or belongs to another search.
+            or belongs to another search; or the engine lost its connection.
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
+        OSError: the results cannot be written.
     """
     config = tuning_config(study)
     check_bounds(study, config)
@@ -138,7 +139,7 @@ def tune(
 
 
 class Tuning:
-    """State of a search: evaluated plans, finalists (plans evaluated again with new seeds), and verifications."""
+    """Search for a plan, with the evaluated plans, finalists (evaluated again with new seeds), and verifications."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
         self.study, self.config, self.folder, self.flights = study, config, folder, flights
@@ -152,7 +153,7 @@ class Tuning:
         self.confirmed: Candidate | None = None
 
     def run(self) -> None:
-        """Runs the rounds of the search until a plan can be recommended, or the rounds are used up.
+        """Runs the rounds of the search until a plan can be recommended, none is confirmed, or the rounds are used up.
 
         Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
         After a plan has passed, cheaper plans that the surrogate rejects are verified until one does not pass.
@@ -239,14 +240,16 @@ class Tuning:
     def _next_cheaper(self) -> Candidate | None:
         """Returns the next plan to verify that is cheaper than the recommended one.
 
-        The candidates are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those
+        The costs of all plans, including the recommended one, are those of the search with the same correction. The
+        candidates are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those
         that are not verified, the one with the smallest shortfall of the pass probability is returned; of several with
         the same shortfall, the most expensive one. None if no plan is recommended, or if all candidates are verified.
         """
         if self.recommended is None:
             return None
         sign, cost = objective_signs(self.config), cost_index(self.config)
-        most = self.recommended.objectives[cost] * sign[cost]
+        recommended = self._evaluate(self.trials, self.recommended.number, self.recommended.values)
+        most = recommended.objectives[cost] * sign[cost]
         cheaper = [c for c in self._candidates() if c.objectives[cost] * sign[cost] < most]
         front = [one for one in non_dominated(cheaper, self.config) if one.number not in self.verifications]
         return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)

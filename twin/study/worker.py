@@ -95,7 +95,7 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), and the last line of its output before a blank one."""
+        """Returns how the process ended (signal or exit status), and the last output line before a blank one."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -104,7 +104,11 @@ class Worker:
 
 
 class WorkerPool:
-    """Thread-safe pool of worker processes, one per concurrent task; idle workers are reused."""
+    """Thread-safe pool of worker processes, one per concurrent task; idle workers are reused.
+
+    Args:
+        cores: CPU cores, one for each worker to pin; further workers are not pinned.
+    """
 
     def __init__(self, cores: Sequence[int | None] = ()) -> None:
         self._free_cores = list(cores)

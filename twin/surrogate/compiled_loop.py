@@ -22,9 +22,10 @@ def compiled_loop(
 ) -> FastForward:
     """Returns a function that runs the compiled closed loop from a given frame to the next keyframe.
 
-    It performs the same operations with the same random numbers as the loop in `survey.fly`, so the results are equal.
-    It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no frames. If the
-    physics diverges, it keeps the frames up to the one at which this was detected, and raises SurveyAborted.
+    The function performs the same operations with the same random numbers as the loop in `survey.fly`, so the results
+    are equal. It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no
+    frames. If the physics diverges, it keeps the frames up to the one at which this was detected, and raises
+    SurveyAborted.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz

@@ -11,7 +11,7 @@ from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
 
 Range = tuple[float, float]
-_OVERLAP_PAIRS = 40  # number of pairs of images whose overlap is computed along and across the legs
+_OVERLAP_PAIRS = 40  # largest number of pairs of images whose overlap is computed, along and across the legs each
 
 
 class Quantity(NamedTuple):
@@ -31,8 +31,8 @@ class Quantity(NamedTuple):
     limits: Literal["both", "lower", "upper"] = "both"
 
 
-#: Quantities whose fitted range may restrict the use of an error model, by name. A name in the table [fitted_range] of
-#: the file must be one of these, and `survey_conditions` must return it.
+#: Quantities whose fitted range may restrict the use of an error model, by name. The table [fitted_range] of the file
+#: may have these names only; `survey_conditions` returns their values in a survey.
 QUANTITIES = {
     "bound_px": Quantity("matching precision at medium depth (Cramér-Rao bound)", " px", 1.5, "upper"),
     "unevenness_px": Quantity(
@@ -46,6 +46,8 @@ QUANTITIES = {
 
 def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str, Range]:
     """Returns the smallest and the largest value of each quantity in a survey, by name.
+
+    An overlap is left out if no pair of planned images has one.
 
     Args:
         mission: the survey.

@@ -51,8 +51,8 @@ class DepthLaw(NamedTuple):
     """Standard deviation of a pixel's depth from the Kalman depth filter.
 
     One keyframe gives a depth from stereo, with the standard deviation of `sigma_px`. Each further one adds a depth
-    from stereo and one from the motion between the keyframes. The shorter their distance B, the less depth from motion
-    adds. With n keyframes, the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
+    from stereo and one from the motion between the keyframes. The shorter the distance B between consecutive keyframes,
+    the less each adds. With n keyframes, the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
     g = gain B^2 / (B^2 + half_step^2).
 
     Args:
@@ -62,7 +62,7 @@ class DepthLaw(NamedTuple):
             is the fraction of the reflected light that comes from the lamps.
         common: fraction of the variance that all keyframes share.
         gain: information that each further keyframe adds, relative to the first one, if keyframes are far apart.
-        half_step: distance between keyframes at which it adds half of that [stereo baselines].
+        half_step: distance between consecutive keyframes at which each adds half of `gain` [stereo baselines].
     """
 
     floor_px: float
@@ -122,7 +122,7 @@ class BinningFactors(NamedTuple):
     by_4: float
 
     def __call__(self, binning: int) -> float:
-        """Returns the factor or value for a binning; 1 without binning."""
+        """Returns the factor or value for a binning of 2 or 4; 1 without binning."""
         return {1: 1.0, 2: self.by_2, 4: self.by_4}[binning]
 
 
@@ -158,9 +158,10 @@ class ErrorModel(NamedTuple):
     the reported one.
 
     Args:
-        bound_range_px: smallest and largest Cramér-Rao bound of the surveys to which the model was fitted.
-        point_fraction: number of matched stereo points of a keyframe, as a fraction of the number that the scenario
-            asks for (`estimate.points`).
+        bound_range_px: smallest and largest Cramér-Rao bound of the surveys to which the model was fitted; the bound of
+            a survey is the median over its keyframes.
+        point_fraction: number of matched stereo points of a keyframe, as a fraction of the number of points that the
+            estimators try to match (`vision.corner_count`).
         match_sigma_px: reported standard deviation of a patch's position in one image of a level floor.
         stereo_relief_gain: increase of this standard deviation over relief: it becomes
             sqrt(match_sigma_px^2 + (stereo_relief_gain * p)^2), where p is the RMS parallax of the relief within a
@@ -206,9 +207,11 @@ class ErrorModel(NamedTuple):
         depth_error: true standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
         depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
         depth_cell_scatter: standard deviation, over the cells of a map with equal conditions, of the logarithm of the
-            standard deviation of depth. The true and the reported one vary by the same factor, because the depth filter
-            measures how well each pixel is matched. The errors of a map are therefore a scale mixture: normal with the
-            standard deviation of their cell, but with heavy tails over the whole map.
+            reported standard deviation of depth: the depth filter measures how well each pixel is matched. The errors
+            of a map are therefore a scale mixture: normal with the standard deviation of their cell, but with heavy
+            tails over the whole map.
+        error_scatter_share: the same standard deviation for the true standard deviation of depth, which varies with the
+            reported one, divided by that for the reported one.
         depth_binned_error: factor on the true standard deviation of depth [px of the binned images] due to binning.
         depth_binned_sigma: factor on the reported standard deviation of depth [px of the binned images] due to binning.
         depth_binned_scatter: value of `depth_cell_scatter` for binned images; it hardly depends on the bound.
@@ -220,15 +223,15 @@ class ErrorModel(NamedTuple):
         map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
             Kalman depth filter provides a depth.
         border_holes: fraction of the cells without a depth near the borders of the images.
-        relief_error_gain: true standard deviation of the height error due to the roughness of a cell, per roughness,
-            for roughness of about `relief_error_limit_px / relief_error_gain`; see `map_model.roughness_error_px`. The
-            roughness is the RMS deviation of the floor from a plane within the window of dense matching. The error is
-            common to all views of the cell.
+        relief_error_gain: gain g of the true standard deviation of the height error due to the roughness r of a cell,
+            a q^2 / sqrt(1 + q^4) with q = g r / a and the limit a, `relief_error_limit_px`. The roughness is the RMS
+            deviation of the floor from a plane within the window of dense matching. The error is common to all views of
+            the cell.
         relief_error_limit_px: limit of this standard deviation for large roughness [px of disparity].
-        edge_error_gain: true standard deviation of the height error at edges, where the matching window shows two
-            surfaces, per unresolved roughness r^3 / (r^2 + `map_model.EDGE_PX`^2) for the roughness r. The errors are
-            gross errors of a quarter of the cells (`map_model.gross_noise`).
-        edge_sigma_gain: reported standard deviation of the height due to roughness, per unresolved roughness.
+        edge_error_gain: true standard deviation of the height error near walls, where the matching window shows two
+            surfaces, per `map_model.edge_roughness`. The errors are heavy-tailed (`map_model.heavy_tailed`).
+        edge_sigma_gain: reported standard deviation of the height near walls, per `map_model.edge_roughness`, in
+            addition to the terms that the map computes from the heights around a cell.
         edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
 
@@ -254,6 +257,7 @@ class ErrorModel(NamedTuple):
     depth_error: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 4.0, 1.5)
     depth_sigma: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 3.0, 1.0)
     depth_cell_scatter: ScatterLaw = ScatterLaw(0.0, 1.0)
+    error_scatter_share: float = 1.0
     depth_binned_error: BinningFactors = BinningFactors(1.0, 1.0)
     depth_binned_sigma: BinningFactors = BinningFactors(1.0, 1.0)
     depth_binned_scatter: BinningFactors = BinningFactors(0.0, 0.0)

@@ -66,7 +66,8 @@ class FittedErrorModel:
         misfit: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted
             parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
         fitted_range: smallest and largest value of each quantity in these surveys, by name (names of
-            `coverage.QUANTITIES`), without the Cramér-Rao bound, whose range is `ErrorModel.bound_range_px`.
+            `coverage.QUANTITIES`). The largest Cramér-Rao bound is infinite if surveys with larger bounds were lost;
+            without an entry, the range of the bound is `ErrorModel.bound_range_px`.
     """
 
     model: ErrorModel
@@ -108,7 +109,11 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
 
 
 def save(fitted: FittedErrorModel, path: Path) -> None:
-    """Writes an error model to a file that `load` reads."""
+    """Writes an error model to a file that `load` reads.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     lines = [
         "# Error model of the surrogate, fitted to rendered surveys by `twin fit-surrogate`; see error_model.py.",
         f"n_surveys = {fitted.n_surveys}",

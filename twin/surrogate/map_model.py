@@ -1,15 +1,15 @@
-"""Model of the elevation map: samples the grid cells that a keyframe sees and the heights that it contributes.
+"""Model of the elevation map: the grid cells that a keyframe sees, and samples of the heights that it contributes.
 
 The heights stand for those from the Kalman depth filter, with one sample per grid cell for all pixels that show the
 cell. Their errors are correlated over the matching window, as those of dense matching are. A cell is visible if its
 centre projects into both images and no relief hides it from either camera (ray casting). Where the floor is not a plane
-within the matching window, e.g. at the edge of a wall, heights have an additional error that grows with the RMS
-deviation from the plane (the roughness of the cell), and cells without a height are more frequent.
+within the matching window, heights have an additional error that grows with the RMS deviation from the plane (the
+roughness of the cell), and cells without a height are more frequent. Near walls this error is larger and heavy-tailed,
+because the window shows two surfaces.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +29,14 @@ from twin.world.coverage import DEPTH_TOLERANCE
 
 Map = NDArray[np.float32]
 WINDOW_PX = 11  #: side of the window of dense matching, over which the roughness of a cell is computed
-#: Roughness [px of disparity] of which half is unresolved: dense matching resolves smaller deviations from the plane of
-#: the window, while at larger ones the window shows two surfaces.
-EDGE_PX = 0.5
-_GROSS_SIGMAS = 1.15  # a normal variable exceeds this many standard deviations with a probability of a quarter
+#: Side of the square over which errors are correlated, in matching windows: dense matching is regularised, and the
+#: depth filter passes depths on from keyframe to keyframe.
+_CORRELATED_WINDOWS = 1.5
+WALL_SLOPE = 1.0  #: rise over run of the least steep wall
 #: Law of a depth that more keyframes do not improve.
 ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 _NO_CELLS = np.zeros((0, 0), np.float32)
-_HIDING_SLOPE = 1.0  # rise over run: a floor below this line from a cell cannot hide it from a camera that looks down
+_HIDING_SLOPE = 1.0  # rise over run: floor below a line of this slope cannot hide the cell where the line starts
 
 
 class CellErrors(NamedTuple):
@@ -46,16 +46,16 @@ class CellErrors(NamedTuple):
         lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
         relief_noise: (rows, cols) standard normal samples of the error due to relief within the matching window, shared
             by all views of a cell; see `window_noise`.
-        edge_noise: (rows, cols) samples of the error at edges, of zero mean and unit variance, shared by all views of a
-            cell; see `gross_noise`.
+        edge_noise: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of
+            a cell; see `heavy_tailed`.
         cell_noise: (rows, cols) standard normal samples of the precision of depth, shared by all views of a cell and
             correlated over a window; see `cell_scatter`.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next four fields are tabulated [m].
+        depths_m: (m,) ascending depths at which the next four fields and `border_width_px` are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
-        cell_scatter: (m,) standard deviation over cells of the logarithm of both standard deviations.
+        cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
         completeness: (m,) fraction of the level cells in view for which the filter provides a depth.
         error_law: decrease of the true variance with the number of keyframes.
         sigma_law: decrease of the reported variance with the number of keyframes.
@@ -65,7 +65,8 @@ class CellErrors(NamedTuple):
         edge_sigma_gain: `ErrorModel.edge_sigma_gain`.
         edge_half_px: `ErrorModel.edge_half_px`.
         border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
-        border_width_px: (m,) distance from the border over which this fraction decreases to 1 / e [px].
+        border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
+        error_scatter_share: `ErrorModel.error_scatter_share`.
     """
 
     lateral_noise: Map
@@ -88,6 +89,7 @@ class CellErrors(NamedTuple):
     edge_half_px: float = np.inf
     border_share: float = 0.0
     border_width_px: Array = np.ones(2)
+    error_scatter_share: float = 1.0
 
 
 class ObservedCells(NamedTuple):
@@ -122,12 +124,14 @@ class MapModel:
     Attributes:
         seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
         roughness_m: (rows, cols) RMS deviation of the floor from its best-fit plane within the matching window [m].
+        edge_m: (rows, cols) roughness that causes errors near walls [m]; see `edge_roughness`.
         window_cells: side of the matching window [cells].
+        correlated_cells: side of the square over which errors are correlated [cells].
         views: (rows, cols) number of consecutive keyframes whose depths were fused in the latest height of the cell;
             updated by `sample_patch`.
         step_baselines: (rows, cols) RMS distance between these keyframes, in stereo baselines; 0 for one keyframe.
         border_px: (rows, cols) largest distance of the cell from the image border over consecutive keyframes, times the
-            square root of their number [px].
+            square root of their number; the maximum over all series of keyframes [px].
     """
 
     def __init__(
@@ -145,8 +149,11 @@ class MapModel:
         self._lowest_m = float(np.nanmin(height_m))
         self.depth_m = depth_m
         self._floor, self._may_be_hidden = floor, _may_be_hidden(height_m, grid.cell_m)
-        self.window_cells = max(round(WINDOW_PX * depth_m / rig.focal_px / grid.cell_m), 1)
-        self.roughness_m = roughness(height_m, WINDOW_PX * depth_m / rig.focal_px / grid.cell_m)
+        window_cells = WINDOW_PX * depth_m / rig.focal_px / grid.cell_m
+        self.window_cells = max(round(window_cells), 1)
+        self.correlated_cells = max(round(_CORRELATED_WINDOWS * window_cells), 1)
+        self.roughness_m = roughness(height_m, window_cells)
+        self.edge_m = edge_roughness(self.roughness_m, self.steepness, window_cells)
         self.views, run = (np.zeros(height_m.shape, np.int16) for _ in range(2))
         self.step_baselines, self.border_px, *rest = (np.zeros(height_m.shape, np.float32) for _ in range(4))
         self._runs = _Runs(run, *rest)
@@ -219,11 +226,12 @@ class MapModel:
         rotation = geometry.adjoint(geometry.pose(estimated[:3, :3], np.zeros(3)))
         next_cells = (0, 0, _NO_CELLS) if following is None else following[:3]
         depth_m = _sample_patch(
-            height, variance, systematic, (self.height_m, self._slope, self.roughness_m, self._geotransform),
+            height, variance, systematic,
+            (self.height_m, self._slope, self.roughness_m, self.edge_m, self._geotransform),
             self._runs, (self.views, self.step_baselines, self.border_px), observed[:4], next_cells,
             step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
             estimated @ geometry.inverse(true), estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
-            window_noise(shape, self.window_cells, rng), errors,
+            window_noise(shape, self.correlated_cells, rng), errors,
         )  # fmt: skip
         lateral = surface.LATERAL_SIGMA_PX * depth_m / self._rig.focal_px
         return HeightPatch(
@@ -271,7 +279,7 @@ def _window(pose, camera, geotransform, lowest, size):
 
 
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
-    """Returns standard normal numbers (rows, cols) that are correlated over a matching window, as matching errors are.
+    """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are.
 
     Args:
         shape: number of rows and columns.
@@ -282,20 +290,12 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 
 
-def gross_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
-    """Returns numbers (rows, cols) of zero mean and unit variance, most of which are 0, for gross errors at edges.
+def heavy_tailed(noise: Map) -> Map:
+    """Returns n^3 / sqrt(15) for standard normal numbers n (rows, cols): zero mean, unit variance and heavy tails.
 
-    They are the numbers of `window_noise` beyond `_GROSS_SIGMAS` in magnitude, divided by the square root of their mean
-    square over all cells. Dense matching resolves most cells at an edge and assigns others, in patches, to the wrong
-    surface.
-
-    Args:
-        shape, window_cells, rng: see `window_noise`.
+    Dense matching resolves most cells near a wall, and assigns others, in patches, to the wrong surface.
     """
-    noise = window_noise(shape, window_cells, rng)
-    density = math.exp(-(_GROSS_SIGMAS**2) / 2) / math.sqrt(2 * math.pi)
-    beyond = 2 * _GROSS_SIGMAS * density + math.erfc(_GROSS_SIGMAS / math.sqrt(2))
-    return np.where(np.abs(noise) > _GROSS_SIGMAS, noise / np.float32(math.sqrt(beyond)), np.float32(0))
+    return np.asarray(noise**3 / np.float32(np.sqrt(15)), np.float32)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -367,7 +367,7 @@ def roughness(height_m: Map, window_cells: float) -> Map:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
         window_cells: side of the window in cells; rounded to an odd number, at least 3.
     """
-    side = 2 * max(round((window_cells - 1) / 2), 1) + 1
+    side = _odd(window_cells)
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
     height -= height.mean()
     row, col = np.indices(height.shape, dtype=np.float64)
@@ -381,6 +381,28 @@ def roughness(height_m: Map, window_cells: float) -> Map:
         covariance = mean(height * coordinate) - level * mean(coordinate)
         variance -= covariance**2 / ((side**2 - 1) / 12)
     return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
+
+
+def edge_roughness(roughness_m: Map, steepness: Map, window_cells: float) -> Map:
+    """Returns the roughness (rows, cols) that causes errors near walls [m]; 0 where no matching window shows a wall.
+
+    It is the geometric mean of the roughness of the cell and of the largest roughness of the windows that contain the
+    cell: the error of a cell is large if its own window shows two surfaces, or if it is matched as its neighbours are.
+
+    Args:
+        roughness_m: (rows, cols) roughness [m]; see `roughness`.
+        steepness: (rows, cols) magnitude of the slope of the floor [m/m]. A cell steeper than `WALL_SLOPE` is a wall.
+        window_cells: side of the matching window in cells; rounded to an odd number, at least 3.
+    """
+    side = _odd(window_cells)
+    near_wall = maximum_filter(np.nan_to_num(steepness), side) > WALL_SLOPE
+    largest_m = np.asarray(maximum_filter(roughness_m, side), np.float32)
+    return np.where(near_wall, np.sqrt(roughness_m * largest_m), np.float32(0))
+
+
+def _odd(window_cells: float) -> int:
+    """Returns the side of a window of cells, rounded to an odd number of cells, at least 3."""
+    return 2 * max(round((window_cells - 1) / 2), 1) + 1
 
 
 @njit(cache=True, nogil=True)
@@ -465,7 +487,7 @@ def _sample_patch(
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
     the lateral error and the roughness to `systematic`.
     """
-    (height, slope, roughness, (west, north, cell)), (row, col, depth_m, border_px) = floor, observed
+    (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px) = floor, observed
     (next_row, next_col, next_depth_m), (views, step_baselines, best_border_px) = following, fused
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
@@ -504,43 +526,40 @@ def _sample_patch(
                 px, py, pz = _transformed(estimated_from_true, x, y, z)
             value = pz - sx * (px - x) - sy * (py - y)
             steep = np.sqrt(sx * sx + sy * sy)
-            scale = np.exp(_interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j])
-            error_px = scale * np.sqrt(error_share) * _interpolate(errors.depth_error_px, k, fraction)
+            log_scale = _interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j]
+            error_px = np.exp(errors.error_scatter_share * log_scale) * np.sqrt(error_share)
+            error_px *= _interpolate(errors.depth_error_px, k, fraction)
             value += per_px * error_px * depth_noise[i - row, j - col]
-            relief_px = roughness_error_px(rough_px, errors.relief_error_gain, errors.relief_error_limit_px, 0.0)
-            edge_px = roughness_error_px(rough_px, 0.0, 1.0, errors.edge_error_gain)
-            value += per_px * (relief_px * errors.relief_noise[i, j] + edge_px * errors.edge_noise[i, j])
+            relief_px = relief_error_px(rough_px, errors.relief_error_gain, errors.relief_error_limit_px)
+            value += per_px * relief_px * errors.relief_noise[i, j]
+            value += errors.edge_error_gain * edge[i, j] * errors.edge_noise[i, j]
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
-            sigma_px = scale * _interpolate(errors.depth_sigma_px, k, fraction)
+            sigma_px = np.exp(log_scale) * _interpolate(errors.depth_sigma_px, k, fraction)
             variance[i - row, j - col] = sigma_share * (per_px * sigma_px) ** 2
             systematic[i - row, j - col] = surface.pose_variance(
                 x - position[0], y - position[1], z - position[2], sx, sy, cov
             )
             systematic[i - row, j - col] += (surface.LATERAL_SIGMA_PX * depth / camera[0] * steep) ** 2
-            rough_sigma_px = roughness_error_px(rough_px, 0.0, 1.0, errors.edge_sigma_gain)
-            systematic[i - row, j - col] += (per_px * rough_sigma_px) ** 2
+            systematic[i - row, j - col] += (errors.edge_sigma_gain * edge[i, j]) ** 2
             total += depth
             count += 1
     return total / max(count, 1)
 
 
 @njit(cache=True, nogil=True)
-def roughness_error_px(rough_px, relief_gain, relief_limit_px, edge_gain):
-    """Returns the standard deviation of a height error due to roughness [px of disparity].
+def relief_error_px(rough_px, gain, limit_px):
+    """Returns the standard deviation of a height error due to relief within the matching window [px of disparity].
 
-    The part due to relief is a q^2 / sqrt(1 + q^4), with q = relief_gain r / a, for the roughness r and the limit a: it
-    is proportional to r^2 for small roughness, which dense matching resolves. The part due to edges is that of
-    `ErrorModel.edge_error_gain`. Both are added as variances.
+    It is a q^2 / sqrt(1 + q^4), with q = gain r / a, for the roughness r and the limit a: it is proportional to r^2 for
+    small roughness, which dense matching resolves.
 
     Args:
         rough_px: roughness of the cell [px of disparity].
-        relief_gain, relief_limit_px, edge_gain: see `ErrorModel`.
+        gain, limit_px: `ErrorModel.relief_error_gain` and `ErrorModel.relief_error_limit_px`.
     """
-    share = (relief_gain * rough_px / max(relief_limit_px, 1e-9)) ** 2
-    relief = relief_limit_px * share / np.sqrt(1 + share**2)
-    edge = edge_gain * rough_px**3 / (rough_px**2 + EDGE_PX**2)
-    return np.sqrt(relief**2 + edge**2)
+    share = (gain * rough_px / max(limit_px, 1e-9)) ** 2
+    return limit_px * share / np.sqrt(1 + share**2)
 
 
 @njit(cache=True, nogil=True)

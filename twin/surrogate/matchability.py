@@ -42,7 +42,7 @@ from twin.surrogate.snow_noise import snow_effect, snow_poses
 #: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.
 _CORNERS_BOUND_PX = 0.11
 _DEPTHS = 6  # number of tabulated depths
-_LARGEST_UNEVENNESS = 2.0  # largest unevenness of a patch in the mean, relative to the median over the patches
+_LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, relative to the median of the patches
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
 _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
 
@@ -59,7 +59,8 @@ class Matchability:
     Attributes:
         depths_m: (m,) ascending depths of the floor along the optical axis [m].
         binning: number of pixels that the estimators average along each side of the images.
-        bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images].
+        bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images]; infinite where marine snow
+            prevents all matches.
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
             baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
@@ -84,11 +85,14 @@ class Matchability:
 
     @property
     def medium_bound_px(self) -> float:
-        """Returns the Cramér-Rao bound of a patch's position at the geometric mean of the depths [px]."""
-        return self.bound_at(self._medium_depth_m)
+        """Returns the Cramér-Rao bound of a patch's position at a medium depth [px of the binned images].
+
+        The medium depth is the geometric mean of the smallest and the largest depth.
+        """
+        return self.bound_at(self.medium_depth_m)
 
     @property
-    def _medium_depth_m(self) -> float:
+    def medium_depth_m(self) -> float:
         """Returns the geometric mean of the smallest and the largest depth [m]."""
         return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
 
@@ -96,22 +100,22 @@ class Matchability:
         """Sets `binning`, `bounds_px` and `clear_share`.
 
         As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, or else
-        the best one. Which corners are matched depends on the bound.
+        the best one; 1 if all bounds are infinite. Which corners are matched depends on the bound.
         """
         rig, best_px = scenario.believed_rig(), np.inf
         for binning in BINNINGS:
             if rig.width_px % binning or rig.height_px % binning:
                 break
             bounds_px, clear_share = precision(scenario, illumination, terrain, self.depths_m, binning)
-            medium_px = float(np.interp(self._medium_depth_m, self.depths_m, bounds_px))
-            if medium_px < best_px:
+            medium_px = float(np.interp(self.medium_depth_m, self.depths_m, bounds_px))
+            if binning == BINNINGS[0] or medium_px < best_px:
                 best_px = medium_px
                 self.binning, self.bounds_px, self.clear_share = binning, bounds_px, clear_share
             if medium_px < _CORNERS_BOUND_PX:
                 break
 
     def bound_at(self, depth_m: float) -> float:
-        """Returns the Cramér-Rao bound of a patch's position [px] at a depth [m]."""
+        """Returns the Cramér-Rao bound of a patch's position [px of the binned images] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.bounds_px))
 
     def clear_share_at(self, depth_m: float) -> float:
@@ -119,12 +123,12 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.clear_share))
 
     def unevenness_at(self, depth_m: float) -> float:
-        """Returns the unevenness at a depth [px per unit of baseline / depth]."""
+        """Returns the unevenness at a depth [m] [px of the binned images per unit of baseline / depth]."""
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
 def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array) -> Array:
-    """Returns the Cramér-Rao bound (n,) [px] at depths (n,) [m]."""
+    """Returns the Cramér-Rao bound (n,) [px] at depths (n,) [m], without binning; see `precision`."""
     return precision(scenario, illumination, terrain, depths_m)[0]
 
 
@@ -137,7 +141,7 @@ def precision(
         scenario: description of the survey.
         illumination: optical properties of the water, and daylight in the water.
         terrain: true floor.
-        depths_m: depths of the floor along the optical axis.
+        depths_m: (n,) depths of the floor along the optical axis [m].
         binning: number of pixels that are averaged along each side of the images; the bound is in binned pixels.
     """
     scenario = _with_linear_images(scenario)
@@ -204,7 +208,7 @@ def lamp_share(scenario: Scenario, illumination: Illumination) -> float:
 
 
 def _reflected_radiance(scenario: Scenario, illumination: Illumination) -> float:
-    """Returns the image signal due to light reflected by a white floor at the planned altitude [cd/m2].
+    """Returns the radiance due to light reflected by a white floor at the planned altitude [cd/m2].
 
     It is the difference between the images of a white and a black floor, which removes the veil, averaged over pixels
     and colour channels.
@@ -228,7 +232,10 @@ def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose
 
 
 def _with_linear_images(scenario: Scenario) -> Scenario:
-    """Returns the scenario without tone curve and white balance, which scale texture and noise of a pixel alike."""
+    """Returns the scenario with a linear tone curve and the white balance of white light.
+
+    Tone curve and white balance scale texture and noise of a pixel alike.
+    """
     if scenario.sensor is None:
         return scenario
     linear = {"tone_curve": "linear", "white_balance": "white_light"}
@@ -259,7 +266,7 @@ def unevenness_px(
     Args:
         scenario: description of the survey.
         terrain: true floor.
-        depths_m: depths of the floor along the optical axis.
+        depths_m: (n,) depths of the floor along the optical axis [m].
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
         binning: see `precision`.

@@ -46,14 +46,14 @@ class MeasuredRows:
     def observe(
         self, observation: StereoObservation, points: Array, sigma_px: float
     ) -> tuple[StereoObservation, float]:
-        """Adds the row differences of a stereo pair; returns the observation with them and the noise ratio.
+        """Adds the row differences of a stereo pair; returns the observation with their statistics and the noise ratio.
 
-        The noise ratio is the one of `stereo.row_noise_ratio`.
+        The noise ratio is that of `stereo.row_noise_ratio`.
 
         Args:
             observation: stereo observation of the pair, without row differences.
             points: (n, 3) true points that are matched; they represent `observation.n_points` points.
-            sigma_px: standard deviation of a match in one image.
+            sigma_px: standard deviation of a match in one image [px].
         """
         rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
         of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
@@ -71,7 +71,13 @@ class MeasuredRows:
         return self._calibration.report()
 
     def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:
-        """Adds row differences (n,) of true points (n, 3) to the estimated errors of the rectification."""
+        """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3).
+
+        Args:
+            points: (n, 3) true points in the axes of the left camera [m].
+            rows_px: (n,) row of the right image minus row of the left image [px].
+            sigma_px: standard deviation of the row differences [px].
+        """
         n, (left, _) = len(points), self._positions_px(points)
         cov = np.tile(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 1, 1))
         measured, zeros = self._view.measure(points), np.zeros((n, 2))

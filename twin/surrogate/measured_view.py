@@ -72,7 +72,10 @@ class MeasuredView(NamedTuple):
         return measure_all(self.table, points)
 
     def row_difference(self, points: Array) -> Array:
-        """Returns the remaining row differences (n,), right minus left (normalised), of true points (n, 3)."""
+        """Returns the remaining row differences (n,), right minus left (normalised), of true points (n, 3).
+
+        The view must not be ideal.
+        """
         rows = ViewTable(np.repeat(self.row_table[..., None], 3, axis=-1), self.table.first, self.table.step)
         return measure_all(rows, points)[:, 0]
 

@@ -17,7 +17,7 @@ _MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are
 
 @njit(cache=True, nogil=True)
 def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
-    """Samples the frame-to-frame motion (4, 4) between two true poses (4, 4).
+    """Samples the frame-to-frame motion previous_from_current (4, 4) between two true poses (4, 4).
 
     Args:
         errors: distribution of the errors, a `vision.FrameErrors`.

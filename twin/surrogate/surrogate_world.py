@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -45,7 +46,8 @@ class SurrogateWorld(World):
         vision: source of the sampled visual measurements.
 
     Raises:
-        ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set.
+        ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
+            snow prevents all matches.
     """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, fitted: FittedErrorModel):
@@ -113,6 +115,19 @@ def _refusal(quantity: QuantityOutsideFit) -> TwinError:
     )
 
 
+def _check_matches(mission: Mission, matchability: Matchability) -> None:
+    """Raises ScenarioError if marine snow prevents all matches at a medium depth, so that they have no error."""
+    if math.isfinite(matchability.medium_bound_px):
+        return
+    error = TwinError(
+        "imaging.fidelity",
+        f"the surrogate cannot simulate this survey: marine snow prevents all matches of the floor at a depth of "
+        f"{matchability.medium_depth_m:.3g} m",
+        'less [snow], or imaging.fidelity = "rendered"',
+    )
+    raise ScenarioError([mission.scenario.source.describe(error)])
+
+
 def surrogate_vision(
     mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer
 ) -> SurrogateVision:
@@ -123,9 +138,13 @@ def surrogate_vision(
         model: error model of the measurements.
         true_pose: function that returns the current true world_from_camera (4, 4) of the left camera.
         stopwatch: timer of the stages.
+
+    Raises:
+        ScenarioError: marine snow prevents all matches at a medium depth.
     """
     scenario, terrain = mission.scenario, mission.terrain
     matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)
+    _check_matches(mission, matchability)
     view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
     floor, heights = FloorRayCaster(terrain), true_heights(mission.grid, terrain.height_at)
     depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))

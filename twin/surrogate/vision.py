@@ -35,7 +35,7 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import CellErrors, MapModel, gross_noise, window_noise
+from twin.surrogate.map_model import CellErrors, MapModel, heavy_tailed, window_noise
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
@@ -43,7 +43,7 @@ from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
-_CORNER_AREA_PX2 = 75.0  # area of an image per corner that is detected at most, in rendered surveys
+_CORNER_AREA_PX2 = 75.0  # smallest image area per detected corner, in rendered surveys
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe or a link
 _BLOCK = 4096  # random numbers generated at a time
 #: Largest relative increase of a link's squared median residual due to relief: matches shifted more are outliers.
@@ -190,7 +190,7 @@ class SurrogateVision:
 
     @property
     def binning(self) -> int:
-        """Returns the number of pixels that are averaged along each side of the images."""
+        """Returns the binning factor: the side [px] of the squares of pixels that are averaged into one pixel."""
         return self.scene.matchability.binning
 
     @property
@@ -414,7 +414,7 @@ class SurrogateVision:
     def _sample_link(
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes; None if too few points would be matched.
+        """Samples the motion between two keyframes; None if too few points, or too small a fraction, would be matched.
 
         The motion is estimated from noisy points by least squares, starting at the true motion: in one iteration, or in
         several if `TrueScene.view` is not ideal. The random numbers that belong to the link alone depend only on the
@@ -503,9 +503,9 @@ class SurrogateVision:
         `CellErrors` holds their random numbers and standard deviations.
         """
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
-        window_cells = self.scene.map_model.window_cells
-        relief_noise, cell_noise = (window_noise(shape, window_cells, self._rng) for _ in range(2))
-        edge_noise = gross_noise(shape, window_cells, self._rng)
+        cells = self.scene.map_model.correlated_cells
+        relief_noise, cell_noise, wall_noise = (window_noise(shape, cells, self._rng) for _ in range(3))
+        edge_noise = heavy_tailed(wall_noise)
         level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
         error_factor = float(np.exp(level + ratio)) * model.depth_binned_error(self.binning)
         sigma_factor = float(np.exp(level)) * model.depth_binned_sigma(self.binning)
@@ -520,7 +520,7 @@ class SurrogateVision:
             np.array([model.map_completeness(b) for b in bounds_px]),
             model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
             model.edge_error_gain, model.edge_sigma_gain, model.edge_half_px, model.border_holes.share,
-            model.border_holes.width_px(bounds_px, self.lamp_share),
+            model.border_holes.width_px(bounds_px, self.lamp_share), model.error_scatter_share,
         )  # fmt: skip
 
     def draw_normals(self, n: int) -> Array:

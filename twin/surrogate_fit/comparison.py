@@ -25,16 +25,17 @@ from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate.error_model import BinningFactors, DepthLaw, ErrorModel, ScatterLaw
-from twin.surrogate.map_model import EDGE_PX
+from twin.surrogate.map_model import WALL_SLOPE
 from twin.surrogate.vision import SurrogateVision
 
-_MIN_CELLS = 200  # a map statistic needs at least this many cells
+_MIN_CELLS = 200  # a statistic of height errors needs at least this many cells, a fraction of holes a tenth
 _STEEP_SLOPE = 0.6  # rise over run that level cells do not reach
-_VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells
+_VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells, and the end
 _ROUGH_PX = 0.25  # roughness that level cells do not reach
-#: Classes of level cells by name, with the first and the last roughness.
+#: Classes of level cells by name, with their lowest and highest roughness.
 _RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.08, _ROUGH_PX)}
-_WALL_SLOPE = 1.0  # rise over run: cells near steeper ones belong to no class but edges
+_EDGE = "edge"  # first part of the names of the classes of cells near walls
+_EDGE_BINS_PX = (0.05, 0.1, 0.2, 0.4, 0.8, np.inf)  # `MapModel.edge_m` of these classes
 _ROUGHNESS_BINS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
 _BORDER_BINS_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 20.0)  # see `MapModel.border_px`
 _GROSS = 5.0  # error / sigma beyond which an error counts as a gross error
@@ -43,7 +44,7 @@ _NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
 UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
 #: Quantities of a class of map cells, in the order of the statistic `map_<error or sigma>_<class>`: variances of the
 #: maps from images and sampled maps [m^2], and conditions of the class.
-MAP_STATISTICS = ("images", "pose", "depth", "lateral", "edge", "views", "step_baselines", "roughness_px")
+MAP_STATISTICS = ("images", "pose", "depth", "lateral", "edge", "all", "views", "step_baselines", "roughness_px")
 #: Parameter values of the models of `single_error_models`, in which one error source acts alone.
 BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
 
@@ -195,8 +196,9 @@ class ComparisonVision:
     ) -> ElevationMap:
         """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
-        There are four sampled maps: one with pose errors alone, and three with pose errors and one other kind of error
-        with a unit standard deviation: depth errors, lateral errors, or errors at edges of the relief.
+        There are five sampled maps: one with pose errors alone, three with pose errors and one other kind of error with
+        a unit standard deviation (depth errors, lateral errors, or errors near walls), and one with all errors, of
+        the standard deviations in the error model, without their scatter between surveys.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         none = model._replace(
@@ -211,6 +213,7 @@ class ComparisonVision:
             "depth": none._replace(depth_error=unit, depth_sigma=unit),
             "lateral": none._replace(lateral_sigma_px=1.0),
             "edge": none._replace(edge_error_gain=1.0, edge_sigma_gain=1.0),
+            "all": model._replace(depth_survey_scatter=0.0, depth_ratio_scatter=0.0),
         }
         maps = {"images": elevation}
         for name, self.surrogate.model in models.items():
@@ -224,13 +227,18 @@ class ComparisonVision:
         return elevation
 
     def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
-        """Adds three statistics of a class of cells: errors and reported variances (`MAP_STATISTICS`), and a scatter.
+        """Adds four statistics of a class of cells: errors and reported variances (`MAP_STATISTICS`), and a scatter.
+
+        Adds none if the class has too few cells with a height in all maps.
 
         The reported standard deviation varies from cell to cell, and the errors of a cell are normal with a standard
         deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
         variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The variance of
-        errors is that of a cell with the median sigma.
-        The third statistic is the scatter of ln(sigma) in the class, relative to a sampled map in which depth has the
+        errors is that of a cell with the median sigma. Near walls, where gross errors are the subject, it is the
+        mean squared error.
+        The third statistic is the ratio of the 90th percentile of absolute errors to the median, in the map from images
+        and in the map sampled with all errors; its logarithm exceeds that of normal errors if errors vary over cells.
+        The fourth one is the scatter of ln(sigma) in the class, relative to a sampled map in which depth has the
         same precision in all cells. The upper half of its distribution determines the largest errors, so it is taken
         from the median and the 90th percentile.
 
@@ -249,40 +257,48 @@ class ComparisonVision:
         typical = np.median(sigmas, axis=1)
         normalised = np.abs(errors - np.median(errors, axis=1, keepdims=True)) / np.maximum(sigmas, 1e-12)
         variances = np.mean(np.square(np.minimum(normalised, _GROSS)), axis=1) * typical**2
+        if name.startswith(_EDGE):
+            variances = np.mean(np.square(errors - np.median(errors, axis=1, keepdims=True)), axis=1)
         reported = np.square(typical)
         names = list(maps)
         log_ratio = np.log(sigmas[names.index("images")] / sigmas[names.index("depth")])
         scatter = np.diff(np.percentile(log_ratio, (50, 90))) / _NORMAL_P90
         conditions = [
             float(np.mean(map_model.views[known])), float(np.median(map_model.step_baselines[known])),
-            float(np.sqrt(np.mean(self._roughness_px()[known] ** 2))),
+            float(np.sqrt(np.mean(self._in_px(map_model.roughness_m)[known] ** 2))),
         ]  # fmt: skip
         self.statistics[f"map_error_{name}"] = [*variances.tolist(), *conditions]
         self.statistics[f"map_sigma_{name}"] = [*reported.tolist(), *conditions]
         self.statistics[f"map_scatter_{name}"] = scatter.tolist()
+        centred = np.abs(errors - np.median(errors, axis=1, keepdims=True))[[names.index("images"), names.index("all")]]
+        median, p90 = np.maximum(np.percentile(centred, (50, 90), axis=1), 1e-12)
+        self.statistics[f"map_tail_{name}"] = (p90 / median).tolist()
 
     def _cell_classes(self) -> dict[str, np.ndarray]:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
 
-        Level cells are divided by roughness and by the number of consecutive keyframes that observed them. Cells within
-        a matching window of an edge, and cells near the image border, belong to the class "edge" or to none.
+        Level cells are divided by roughness and by the number of consecutive keyframes that observed them, cells near
+        walls by `MapModel.edge_m`. Other cells within a matching window of a wall or of rough cells, and cells near the
+        image border, belong to no class.
         """
-        map_model, rough = self.surrogate.scene.map_model, self._roughness_px()
-        edge, steepness, views = rough > EDGE_PX, map_model.steepness, map_model.views
-        wall = (rough > _ROUGH_PX) | (steepness > _WALL_SLOPE)
-        near_edge = np.asarray(maximum_filter(wall, 2 * map_model.window_cells + 1), np.bool_)
-        plain = ~near_edge & (map_model.border_px > _BORDER_BINS_PX[-1])
-        classes = {"edge": edge, "steep": plain & (steepness > _STEEP_SLOPE) & (rough < _RELIEF_BINS_PX["smooth"][1])}
+        map_model = self.surrogate.scene.map_model
+        rough = self._in_px(map_model.roughness_m)
+        steepness, views, inner = map_model.steepness, map_model.views, map_model.border_px > _BORDER_BINS_PX[-1]
+        wall, edge = (rough > _ROUGH_PX) | (steepness > WALL_SLOPE), self._in_px(map_model.edge_m)
+        plain = inner & ~np.asarray(maximum_filter(wall, 2 * map_model.window_cells + 1), np.bool_)
+        classes = {"steep": plain & (steepness > _STEEP_SLOPE) & (rough < _RELIEF_BINS_PX["smooth"][1])}
+        for low, high in pairwise(_EDGE_BINS_PX):
+            classes[f"{_EDGE}{low:g}"] = inner & (edge >= low) & (edge < high)
         for name, (smoothest, roughest) in _RELIEF_BINS_PX.items():
             level = plain & (steepness < _STEEP_SLOPE) & (rough >= smoothest) & (rough < roughest)
             for low, high in pairwise(_VIEW_BINS):
                 classes[f"{name}{low}"] = level & (views >= low) & (views < high)
         return classes
 
-    def _roughness_px(self) -> np.ndarray:
-        """Returns the roughness of the map cells (rows, cols) at the typical depth of the floor [px of disparity]."""
+    def _in_px(self, height_m: np.ndarray) -> np.ndarray:
+        """Returns heights [m] as differences of disparity at the typical depth of the floor [px]."""
         rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
-        return map_model.roughness_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
+        return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
         """Adds the number of observed cells and the fraction with a height, by roughness and by distance from borders.
@@ -290,7 +306,8 @@ class ComparisonVision:
         The numbers by distance from the border of the images count smooth cells only; those by roughness count cells
         far from the border only.
         """
-        map_model, roughness = self.surrogate.scene.map_model, self._roughness_px()
+        map_model = self.surrogate.scene.map_model
+        roughness = self._in_px(map_model.roughness_m)
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)
         inner, smooth = seen & (border > _BORDER_BINS_PX[-1]), seen & (roughness < _ROUGH_PX)
         for name, values, cells, bins in (

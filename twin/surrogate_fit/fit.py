@@ -3,7 +3,7 @@
 The functions that model reported standard deviations (`SigmaLaw`) are fitted to the ratios of the standard deviations
 reported for image measurements to those reported by the surrogate. The error ratios are fitted to squared errors
 normalised by the reported covariance. Medians and trimmed means make the fit robust against a few failed measurements.
-Every survey has the same weight.
+Every survey has the same weight, except in the fit of `match_bias_fraction`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,17 @@ from twin.surrogate.error_model import (
     ScatterLaw,
     SigmaLaw,
 )
-from twin.surrogate.map_model import roughness_error_px
+from twin.surrogate.map_model import relief_error_px
 from twin.surrogate.vision import match_sigma_px
 from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, UNIT_PX
 
 _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute value
 _PRIOR = 0.01  # weight of the departure of a parameter from the compared model's, relative to it or to a typical value
 _HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a bin of cells has less weight
-_OUTLIER = 0.3  # residual of a log variance beyond which a class of cells has less weight
+_OUTLIER = 0.3  # residual of the logarithm of a standard deviation beyond which it has less weight
 _LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # statistics of cells without edges
+_LEVEL_TAILS = ("map_tail_smooth", "map_tail_rough")
+_NORMAL_TAIL = 2.4387  # 90th percentile of the absolute value of a normal variable, divided by the median
 _SOURCES = ("images", "patches", "relief")
 
 #: Samples of each statistic of one survey, by name; see `ComparisonVision.statistics`.
@@ -42,7 +44,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     """Returns the error model that reproduces the statistics of rendered surveys.
 
     Args:
-        surveys: statistics of each survey.
+        surveys: statistics of each survey; all of them complete (`rendered_surveys.fit_to_surveys`).
         compared: error model of the surrogate with which the surveys were compared.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
@@ -90,6 +92,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         depth_error=errors.depth,
         depth_sigma=reported.depth,
         depth_cell_scatter=cell_scatter,
+        error_scatter_share=_fit_error_scatter(surveys, compared.error_scatter_share),
         depth_binned_scatter=binned_scatter,
         depth_binned_error=errors.binned,
         depth_binned_sigma=reported.binned,
@@ -366,11 +369,11 @@ class _MapErrors(NamedTuple):
         lateral_sigma_px: standard deviation of the lateral shift [px].
         relief_gain: standard deviation per roughness of a cell.
         relief_limit_px: limit of this standard deviation for large roughness [px].
-        edge_gain: standard deviation per unresolved roughness.
+        edge_gain: standard deviation per `map_model.edge_roughness`.
         departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
             classes of cells, because a class may consist of a few cells at one spot of the floor.
         binned: factors due to binning, the medians of measured / modelled values over the surveys with binned images;
-            the laws are fitted to the other surveys.
+            the laws are fitted to the other surveys, and `departures` are computed with these factors.
     """
 
     depth: DepthLaw
@@ -386,11 +389,15 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
 
     The model variance of a class is that of the map with pose errors alone, plus a term each for depth (`DepthLaw`),
-    lateral shift, relief within the matching window, and edges. A term is the variance that a unit error adds to a
+    lateral shift, relief within the matching window, and walls. A term is the variance that a unit error adds to a
     sampled map, times a fitted factor. The relief error is common to all views of a cell, so the fusion of several
-    tracks does not reduce it, and its variance follows from the height per pixel of disparity. Residuals are
-    differences of logarithms; every survey has the same weight. The reported variances of the map with pose errors
-    alone already contain the effects of a lateral shift and of relief.
+    tracks does not reduce it, and its variance follows from the height per pixel of disparity. The reported variances
+    of the map with pose errors alone already contain the effects of a lateral shift and of relief.
+
+    Variances do not simply add up: the map computes part of its variance from the heights around a cell, whose errors
+    count as relief. The model variance is therefore multiplied by the ratio of the variance in the map sampled from
+    the compared model to the model variance with the compared parameters. Repeated fits converge, each with the
+    result of the former as compared model. Residuals are differences of logarithms; every survey has the same weight.
 
     Args:
         surveys: statistics of n surveys.
@@ -406,7 +413,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
         conditions += [condition] * len(classes)
         weights += [float(binning[number] == 1) / np.sqrt(max(len(classes), 1))] * len(classes)
         numbers += [number] * len(classes)
-    images, pose, depth, lateral, edge, views, step, rough = np.array(rows).T
+    images, pose, depth, lateral, edge, sampled, views, step, rough = np.array(rows).T
     (bounds, lamps, metres_per_px), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
     of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
     per_px2 = of_depth / UNIT_PX**2
@@ -414,7 +421,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     def variance(x: np.ndarray) -> np.ndarray:
         law = DepthLaw(*x[:6])
         depth_px2 = law.sigma_px(bounds, lamps) ** 2 * law.relative_variance(views, step)
-        relief_px2 = roughness_error_px(rough, x[7], x[8], 0.0) ** 2
+        relief_px2 = relief_error_px(rough, x[7], x[8]) ** 2
         common = metres_per_px**2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
         return pose + per_px2 * depth_px2 + common + x[9] ** 2 * of_edge
 
@@ -426,14 +433,18 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 0.2, 0.5, 0.05, 1.0])
     start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + 1e-3, highest - 1e-3)
 
+    binned = compared.depth_binned_error if is_error else compared.depth_binned_sigma
+    by_image = binning[numbers]
+    combined = sampled / variance(np.array([*law, compared.lateral_sigma_px, *gains]))
+    combined /= np.select([by_image == 2, by_image == 4], np.square(binned), 1.0)
+
     def residuals(x: np.ndarray) -> np.ndarray:
-        return np.concatenate(
-            [weight * np.log(variance(x) / images) / 2, _PRIOR * (x - start) / np.maximum(start, typical)]
-        )
+        logs = np.log(variance(x) * combined / images) / 2
+        return np.concatenate([weight * logs, _PRIOR * (x - start) / np.maximum(start, typical)])
 
     limits = lowest, highest
     found = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER)
-    ratios = np.log(images / variance(found.x)) / 2
+    ratios = np.log(images / (variance(found.x) * combined)) / 2
     flown = sorted(set(numbers))
     departures, by = np.array([np.median(ratios[np.array(numbers) == number]) for number in flown]), binning[flown]
     factors = [float(np.median(departures[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
@@ -470,3 +481,23 @@ def _fit_cell_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw)
         law = ScatterLaw(*x.tolist())
     binned = (float(np.median(scatters[binning == k])) if (binning == k).any() else 0.0 for k in (2, 4))
     return law, BinningFactors(*binned)
+
+
+def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> float:
+    """Fits `error_scatter_share` to the tails of the height errors of cells without edges.
+
+    If the logarithm of the standard deviation of normal errors varies with the standard deviation s, the logarithm of
+    the ratio of their 90th percentile to their median grows in proportion to s^2. The tail of a survey is the median
+    over its classes. The result is the compared value if no sampled map has tails.
+
+    Args:
+        surveys: statistics of n surveys.
+        compared: value of the compared model.
+    """
+    tails = [
+        np.median([np.log(np.divide(s[name], _NORMAL_TAIL)) for name in s if name.startswith(_LEVEL_TAILS)], axis=0)
+        for s in surveys
+        if any(name.startswith(_LEVEL_TAILS) for name in s)
+    ]
+    images, sampled = np.maximum(np.array(tails).reshape(-1, 2), 0.0).sum(axis=0)
+    return float(compared * np.sqrt(images / sampled)) if sampled > 0 else compared

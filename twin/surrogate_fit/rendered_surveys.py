@@ -56,7 +56,10 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
 
 def comparison_model(model: ErrorModel) -> ErrorModel:
-    """Returns an error model in which all points are matched, so that every image measurement has a sampled one."""
+    """Returns an error model whose fractions of matched points do not decrease with the Cramér-Rao bound.
+
+    Every measurement in images then has a sampled one.
+    """
     points, matches = (law._replace(half_px=_NEVER_PX) for law in (model.point_fraction, model.match_fraction))
     return model._replace(point_fraction=points, match_fraction=matches)
 

@@ -78,7 +78,7 @@ def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedO
 
     Args:
         mission: the survey.
-        most_pairs: largest number of pairs along and across the swaths that are evaluated, chosen at equal intervals.
+        most_pairs: largest number of pairs that are evaluated along, and across, the swaths, chosen at equal intervals.
     """
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
     pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(mission.terrain)

@@ -154,6 +154,7 @@ class Mission:
 
     @property
     def _n_holding(self) -> int:
+        """Returns the number of frames of half the station keeping after a track."""
         return max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))
 
     @property
@@ -445,7 +446,10 @@ def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
 
 
 def _widest(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
-    """Returns an upper bound of the size of the footprints, as a multiple of the footprint at `plan.altitude_m`."""
+    """Returns an upper bound of the size of the footprints, as a multiple of the footprint at `plan.altitude_m`.
+
+    For a path at constant height, the floor is taken to lie at or above the reference plane.
+    """
     if plan.surface is None:
         return 1.0
     highest_m = max(

@@ -48,15 +48,15 @@ def _entry(
     number: int, config: ObjectConfig, models: dict[str, tuple[ObjectModel, ...]], found: list[PlacedObject],
     world: tuple[terrains.Terrain, int],
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns the objects of one entry of `[[objects]]` and adds the shapes of the entry to `models`.
+    """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet.
 
     Raises TwinError if the entry is invalid.
 
     Args:
         number: number of the entry, from 0.
         config: the entry.
-        models: models that have been built, by shape.
-        found: objects of the entries before, which scattered objects do not overlap.
+        models: models built so far, by shape, mesh file, colour and variant.
+        found: objects placed so far, which scattered objects do not overlap.
         world: terrain, and seed of the scenario.
     """
     _check_keys(number, config)

@@ -90,8 +90,8 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
     """Reads a polygon from a GeoJSON file; returns its corners (n, 2) in the scene [m].
 
     The coordinates are in the CRS that the member "crs" names. In a file without this member they are longitude and
-    latitude (RFC 7946) if all of them lie within +-180 and +-90 degrees and, read in the CRS of the DEM, no corner lies
-    on the DEM; otherwise they are in the CRS of the DEM.
+    latitude (RFC 7946) if the DEM names its CRS, all of them lie within +-180 and +-90 degrees and, read in the CRS of
+    the DEM, no corner lies on the DEM; otherwise they are in the CRS of the DEM.
 
     Raises:
         TwinError: the file cannot be read or does not contain exactly one polygon without holes, its coordinates cannot
@@ -144,7 +144,7 @@ def _named_crs(tree: Any) -> str | None:
 
 
 def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeference) -> bool:
-    """Returns whether corners (n, 2) must be longitude and latitude: within their range, and off the DEM in its CRS."""
+    """Returns whether corners (n, 2) are taken as longitude and latitude, see `read_geojson`."""
     within = (np.abs(corners) <= [180.0, 90.0]).all()
     x, y = origin.to_scene(*corners.T)
     return bool(within and origin.crs_wkt is not None and np.isnan(terrain.height_at(x, y)).all())

@@ -1,9 +1,9 @@
 """Supernodal Cholesky factorisation of a sparse symmetric matrix of 6 x 6 blocks, and blocks of its inverse.
 
 The columns are grouped into panels (see `elimination`). Factorisation is right-looking (Davis 2006, chapter 4): the
-outer product of a finished panel is subtracted from later panels, so no memory is needed in addition to the panels. A
-finished panel stores L1^-1 above L2, where L1 is the lower triangular block in the panel's own rows, and L2 holds the
-nonzero rows below them.
+outer product of a finished panel is subtracted from later panels at once, so no update matrices are stored. A finished
+panel stores L1^-1 above L2, where L1 is the lower triangular block in the panel's own rows, and L2 holds the nonzero
+rows below them.
 
 Blocks of the inverse are computed from the last panel to the first (Takahashi et al. 1973). Let cov be the inverse,
 "own" the rows of the panel, "below" the rows of L2, and W = L2 L1^-1. Then cov(below, own) = -cov(below) W and
@@ -238,7 +238,7 @@ def _next_ancestor(s, positions, start):
 
 @njit(cache=True, nogil=True)
 def _subtract(product, at, panel):
-    """Subtracts the lower triangle of `product` from a panel.
+    """Subtracts the lower block triangle of `product` from a panel.
 
     Args:
         product: (6 m, 6 w), m x w blocks.

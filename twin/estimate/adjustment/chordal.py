@@ -48,6 +48,10 @@ def solve_pose_graph(
         start: initial pose (4, 4) of every node, by node number; None: chordal initialisation, with the pose of the
             first node equal to the identity.
         huber: residual [standard deviations] above which the cost of a link grows linearly; None: least squares.
+
+    Raises:
+        RuntimeError: the links do not connect all nodes, and `start` is None.
+        LinAlgError: the links do not connect all nodes of `start`.
     """
     start = chordal_start(links) if start is None else start
     numbers = sorted(start)
@@ -64,6 +68,9 @@ def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
 
     The pose of the node with the lowest number is the identity. The weight of a link is the inverse of its mean
     rotation variance when solving for the rotations, and of its mean translation variance for the positions.
+
+    Raises:
+        RuntimeError: the links do not connect all nodes.
     """
     columns = Links.from_sequence(links)
     numbers = np.unique(np.concatenate([columns.i, columns.j])).tolist()

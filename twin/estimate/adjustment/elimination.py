@@ -1,7 +1,8 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
-The elimination order is SuperLU's multiple minimum degree order of A' + A. Consecutive nodes whose columns have nearly
-the same sparsity pattern below the diagonal form a supernode, whose columns are stored as one dense matrix, a panel.
+The elimination order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree
+whose columns have nearly the same sparsity pattern below the diagonal form a supernode; they are renumbered to be
+consecutive, and their columns are stored as one dense matrix, a panel.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ class SymbolicFactor(NamedTuple):
 
     Args:
         permutation: (n,) position of each node.
-        panel_start: (s + 1,) panel p holds the positions panel_start[p] to panel_start[p + 1] - 1.
-        row_start, rows: the positions below panel p are rows[row_start[p] : row_start[p + 1]], ascending.
-        offset: (s + 1,) start of each panel in one long array; a panel is a row-major matrix whose rows are the panel's
-            own positions and those below it, and whose columns are its own positions.
+        panel_start: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1.
+        row_start, rows: (s + 1,), (r,) the positions below panel p are rows[row_start[p] : row_start[p + 1]],
+            ascending.
+        offset: (s + 1,) start of each panel in one long array, and the length of this array; a panel is a row-major
+            matrix whose block rows are the panel's own positions and those below it, and whose block columns are its
+            own positions.
         panel_of: (n,) panel of each position.
         off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
         transposed: (m,) true where block (i, j) has to be transposed because node i is eliminated before node j.
@@ -62,6 +65,7 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
     """Returns the symbolic factor of a matrix of n x n blocks.
 
     Args:
+        n: number of nodes, the block rows of the matrix.
         i, j: (m,) nodes of the off-diagonal blocks (i, j); a pair may occur more than once.
     """
     permutation = _minimum_degree(n, i, j)
@@ -100,6 +104,7 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
     """Returns the nodes of each supernode and the nodes below it.
 
     Args:
+        n: number of nodes.
         early, late: (m,) nodes of each off-diagonal block, numbered in elimination order, early < late.
     """
     order = np.argsort(early, kind="stable")

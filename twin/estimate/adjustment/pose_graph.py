@@ -5,7 +5,7 @@ the norm of a factor's residual, whitened by its covariance. The residual of a m
 log(Z_ij^-1 X_i^-1 X_j). rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt
 damping after a step that increased the cost. The increment d of a pose is a motion in the camera's own axes, X exp(d).
 
-One scalar parameter may be shared by all binary factors (the scale error of the DVL); F then includes its zero-mean
+One scalar parameter may be shared by binary factors (the scale error of the DVL); F then includes its zero-mean
 Gaussian prior. The parameter adds one row and one column, the border, to the normal equations of the poses. The
 bordered system is solved by the Schur complement of the block of the poses.
 """
@@ -59,7 +59,7 @@ class BinaryFactors(NamedTuple):
         residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
         jacobians: function of i_from_j, the shared parameter and the residuals that returns the Jacobians (m, d, 6)
             with respect to the increment of pose j, and (m, d) with respect to the shared parameter, or None if the
-            factors do not depend on it.
+            factors do not depend on it. It is called for a part of the factors at a time.
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
 
@@ -72,7 +72,7 @@ class BinaryFactors(NamedTuple):
 
 
 class FactorGraph(NamedTuple):
-    """Factor graph of poses and, optionally, one parameter shared by all binary factors.
+    """Factor graph of poses and, optionally, one parameter shared by binary factors.
 
     Args:
         n_poses: number of poses.
@@ -131,7 +131,7 @@ class _NormalEquations(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Minimum of the cost of a factor graph; if not converged, the last state of the iteration.
+    """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration.
 
     Args:
         state: poses and shared parameter at the minimum.
@@ -175,7 +175,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     Args:
         graph: factors of the graph.
         start: initial values of the unknowns.
-        max_iterations: largest number of linear solves, at least one.
+        max_iterations: largest number of steps, accepted or rejected; at least one.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -244,7 +244,7 @@ def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damp
 
 
 def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
-    """Returns cost, residuals and robust weights of a factor graph at a state."""
+    """Returns cost, residuals, robust weights and squared norms of a factor graph at a state."""
     cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
     unary, binary, chi2 = [], [], []
     for factors in graph.unary:

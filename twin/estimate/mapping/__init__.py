@@ -1,1 +1,1 @@
-"""The Kalman depth filter and the elevation map."""
+"""Kalman depth filter, elevation map and orthomosaic."""

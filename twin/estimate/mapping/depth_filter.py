@@ -94,7 +94,7 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
         new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
-        rig: calibration.
+        rig: calibration of the images, with square pixels.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     args = (camera, rig.focal_px * rig.baseline_m, JUMP_PX)
@@ -130,7 +130,7 @@ def motion_depth(
         current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
-        rig: calibration.
+        rig: calibration of the images, with square pixels.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
@@ -201,10 +201,10 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Returns depth and variance at pixel (x, y); NaN if its four neighbours are unknown or not on one surface.
+    """Returns depth and variance at pixel (x, y); NaN if one of its four neighbours is unknown or on another surface.
 
-    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly, as for fully
-    correlated errors, because the matching windows of neighbouring pixels overlap.
+    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly. It does not
+    decrease as for independent errors, because the matching windows of neighbouring pixels overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -226,7 +226,8 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
 
-    The gradient of inverse depth is set to zero across a depth discontinuity.
+    The gradient of inverse depth is set to zero across a depth discontinuity, beside an unknown pixel and at the image
+    border.
     """
     height, width = depth.shape
     z = depth[v, u]
@@ -294,7 +295,8 @@ def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_bas
     """Returns the variance (H, W) of disparity from motion due to the error of the relative pose: J cov J' [px^2].
 
     A pose error displaces the image point; the component of this displacement along the epipolar line has the same
-    effect as an error of depth.
+    effect as an error of depth. NaN where a change of depth does not displace the image point: at the epipole, and
+    everywhere without translation.
     """
     height, width = disparity.shape
     focal, cx, cy = camera
@@ -313,6 +315,9 @@ def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_bas
             ey = (translation[1] * w - translation[2] * y) / (w * w) * focal * z / focal_baseline
             # flow due to a displacement of the point in the new camera, projected on the epipolar line
             length = ex * ex + ey * ey
+            if length == 0:
+                result[v, u] = np.nan
+                continue
             gx, gy = ex / length * focal / w, ey / length * focal / w
             gz = -(gx * x + gy * y) / w
             nx = gx * rotation[0, 0] + gy * rotation[1, 0] + gz * rotation[2, 0]

@@ -65,7 +65,7 @@ class ElevationMapper:
 
         Args:
             patch: heights of a keyframe.
-            successor: heights of the next keyframe; None for the last one.
+            successor: heights of the next keyframe; None for the last one, or if the next one is outside the grid.
             inherited: (H, W) bool, pixels of the next keyframe whose depth contains information from this keyframe
                 (`depth_filter.PropagatedDepth`).
         """
@@ -126,7 +126,10 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest second difference of height across each cell (rows, cols), over four directions [m]."""
+    """Returns the largest absolute second difference of height across each cell (rows, cols), over four directions [m].
+
+    It is 0 for the cells at the edge of the grid, and in directions in which a height is unknown.
+    """
     step = np.zeros_like(height)
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
     for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):

@@ -7,7 +7,8 @@ c of the floor at the normalised image coordinates (u, v) is modelled as
     y_kc = a_c + g_k + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2,
 
 with a_c the colour of the patch, g_k the logarithm of the exposure, and b the illumination pattern of the lamps, which
-is the same in all images. The sum of squared residuals is minimised with a weak prior g_k = 0.
+is the same in all images. The sum of squared residuals is minimised with weak priors g_k = 0 and b = 0, for each colour
+band separately.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from twin.core.records import Array, ElevationMap, Exposure, Image, StereoRig
 
 #: Weight of the prior of an exposure or a coefficient of the pattern, relative to the colour of a patch in one image.
 _PRIOR = 1e-3
-_PATCH_PX = 16  # side of the squares over which the colours of an image are averaged
+_PATCH_PX = 16  # spacing of the patches; the standard deviation of the Gaussian average of their colours is a quarter
+_BATCH = 2**14  # number of patches that `cv2.remap` reads at a time; it refuses arrays of more than 32766 rows
 _MIN_LEVEL = 4.0  # darkest mean colour that is used [grey levels]
 
 
@@ -56,7 +58,8 @@ def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
 def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Array:
     """Returns points (n, 3) of the map [m], the centres of the patches.
 
-    They are on a square grid with a spacing of `_PATCH_PX` pixels of an image at the depth `depth_m`.
+    They are mapped cells on a square grid with a spacing of about `_PATCH_PX` pixels of an image at the depth
+    `depth_m`.
     """
     step = max(1, round(_PATCH_PX * depth_m / rig.focal_px / elevation.grid.cell_m))
     x, y = elevation.grid.centres()
@@ -68,22 +71,32 @@ def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Arr
 def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points: Array) -> PatchColours:
     """Returns the mean colours in an image of the patches around points (n, 3) [m] of the map.
 
-    Patches that are not completely in the image, or are too dark, are left out.
+    The mean is weighted by a Gaussian. Patches that are not completely in the image, or are too dark, are left out.
+
+    Args:
+        image: (H, W, 3) image.
+        world_from_camera: (4, 4) pose of the camera in the axes of the map.
+        rig: calibration of the image.
+        points: (n, 3) centres of the patches (`patch_points`).
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)
     last = np.array([rig.width_px - 1, rig.height_px - 1]) - _PATCH_PX / 2
     patch = np.flatnonzero(((pixel >= _PATCH_PX / 2) & (pixel <= last)).all(axis=1))
     blurred = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _PATCH_PX / 4)
     at = pixel[patch].astype(np.float32)
-    colour = np.zeros((0, 3))
-    if len(patch):
-        colour = cv2.remap(blurred, at[:, :1], at[:, 1:], cv2.INTER_LINEAR).reshape(-1, 3).astype(np.float64)
+    colour = np.zeros((len(patch), 3))
+    for first in range(0, len(patch), _BATCH):
+        part = at[first : first + _BATCH]
+        colour[first : first + _BATCH] = cv2.remap(blurred, part[:, :1], part[:, 1:], cv2.INTER_LINEAR).reshape(-1, 3)
     bright = colour.min(axis=1, initial=np.inf) > _MIN_LEVEL
     return PatchColours(patch[bright], np.log(colour[bright]), rig.normalised(at[bright]))
 
 
 def estimated_factors(colours: Iterable[PatchColours]) -> Array:
-    """Returns the factors (n, 3) by which to multiply n images, from the colours of the same patches in all of them."""
+    """Returns the factors (n, 3) by which to multiply n images, from the colours of the patches that they share.
+
+    They are 1 if no image shows a patch.
+    """
     views = list(colours)
     image = np.repeat(np.arange(len(views)), [len(view.patch) for view in views])
     if not len(image):

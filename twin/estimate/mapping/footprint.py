@@ -7,7 +7,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig, SurveyResult
 
-_MOST_CELLS = 4e7  # cells of a larger map are enlarged, to bound its memory
+_MOST_CELLS = 4e7  # the cells of a map with more cells are enlarged, to limit its memory
 _CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that several disparities support each height
 
 
@@ -16,7 +16,8 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = 
 
     Args:
         result: result of a survey with at least one keyframe.
-        cell_m: side of a cell [m]; by default the size of three pixels at the median depth of all keyframes.
+        cell_m: side of a cell [m]; by default the size of three pixels at the median depth of all keyframes. It is
+            enlarged if the grid would have more than 4e7 cells.
     """
     depth_m = result.keyframe_depth_m
     cell = cell_m or _CELL_PX * float(np.median(depth_m)) / rig.focal_px

@@ -96,7 +96,7 @@ def build_map(
     Args:
         keyframes: stereo pairs along the path, read one at a time.
         path: poses of the keyframes and their covariances.
-        rig: calibration.
+        rig: calibration of the images, with square pixels.
         grid: grid of the map.
         progress: called with the number of keyframes processed so far.
         max_disparity_px: largest disparity searched; if None, it is adapted to the disparities of the previous pair.
@@ -161,6 +161,9 @@ class MeanIllumination:
     """Illumination pattern, estimated as the mean of all images added so far.
 
     The lamps are fixed to the camera, so their pattern remains in the mean, and the texture of the floor averages out.
+
+    Args:
+        rig: calibration, for the size of the images.
     """
 
     def __init__(self, rig: StereoRig) -> None:
@@ -175,6 +178,9 @@ class MeanIllumination:
         self._count += 1
 
     def gain(self) -> Map:
-        """Returns the factor (H, W, 3) by which to multiply an image to make its illumination uniform."""
+        """Returns the factor (H, W, 3) by which to multiply an image to make its illumination uniform.
+
+        At least one image must have been added.
+        """
         mean = self._sum / self._count + 1
         return np.asarray(cv2.resize(mean.mean(axis=(0, 1)) / mean, self._size), np.float32)

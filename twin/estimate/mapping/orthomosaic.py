@@ -1,8 +1,9 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
 It is made in tiles of at most `TILE_PX` x `TILE_PX` pixels, one after the other; an image is read once for each tile
-that it touches. Memory is that of one tile and of two images, whatever the size of the survey; the layers of a tile
-(`orthophoto.OrthoLayers`) take 24 bytes per pixel, 101 MB for a whole tile.
+that it touches, and once more if its exposure has to be estimated. Memory is that of one tile and of two images,
+whatever the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`) take 24 bytes per pixel,
+114 MB for a whole tile.
 """
 
 from __future__ import annotations
@@ -45,7 +46,10 @@ class Views(NamedTuple):
 
 
 class Restore(Protocol):
-    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white."""
+    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white.
+
+    Its arguments are the image (H, W, 3) uint8, its exposure, and the pose (4, 4) of the camera in the axes of the map.
+    """
 
     def __call__(self, image: Image, exposure: Exposure | None, world_from_camera: Array, /) -> Map: ...
 
@@ -89,7 +93,10 @@ def orthomosaic(
 
 
 def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:
-    """Returns the grid of an orthomosaic, whose pixels have the median ground sample distance of its images."""
+    """Returns the grid of an orthomosaic, whose pixels divide the cells of the map.
+
+    They are not larger than the ground sample distance of the images at the median of their depths.
+    """
     return finer_grid(elevation.grid, float(np.median(views.depth_m)) / rig.focal_px)
 
 

@@ -5,10 +5,11 @@ bicubically. Where several images show a pixel, their colours are averaged with 
 
     w = r exp(-K tan^2(n)),
 
-n the angle of the view from the vertical (zero at nadir) and r a ramp from 0 to 1 at the border of the image. K is so
-large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are blended.
-Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is smaller by a factor, so
-that it is used only where no other image shows the floor. A view of a pixel is discarded where nearer floor hides it.
+n the angle of the view from the vertical (zero at nadir) and r a ramp from 0.001 at the border of the image to 1. K is
+so large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are
+blended. Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is smaller by a
+factor, so that it is used only where no other image shows the floor, or only far from nadir. A view of a pixel is
+discarded where nearer floor hides it.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from twin.core.records import Array, MapGrid, StereoRig
 
 Map = NDArray[np.float32]
 
-#: K of the weight. Between two cameras 0.15 heights apart, the seam (10 % to 90 % of the weight) is 0.03 heights wide:
-#: 8 pixels of an image with a focal length of 277 px.
+#: K of the weight. Between two cameras 0.15 heights apart, the seam (10 % to 90 % of the weight) is 0.06 heights wide:
+#: 17 pixels of an image with a focal length of 277 px.
 SHARPNESS = 240.0
-_SATURATED = 60.0  # added to -log w where a pixel of the image is saturated; as an angle from nadir: 27 deg
-#: A view whose weight is less than exp(-this) of the best one so far is not added.
+_SATURATED = 60.0  # added to -log w where a pixel of the image is saturated; -log w of a view 27 deg from nadir
+#: A view for which exp(-K tan^2(n)) is less than exp(-this) times the best weight so far is not added.
 _NEGLIGIBLE = 7.0
 _RAMP_PX, _LEAST_RAMP = 12.0, 1e-3  # width of the ramp at the border of the image, and its value at the border
 #: A pixel is hidden if floor that projects to the same pixel of the image is nearer by more than this fraction.

@@ -59,7 +59,7 @@ def rasterise(
         depth_map: depth in the left camera.
         world_from_camera: (4, 4) pose of the left camera.
         pose_cov: (6, 6) covariance of the pose [rotation, translation], in the camera (rad, m).
-        rig: calibration.
+        rig: calibration of the image, with square pixels.
         grid: grid of the map.
 
     Returns:

@@ -1,1 +1,1 @@
-"""Online pose filter, and models of the navigation sensors that aid the filter and the global alignment."""
+"""Dead reckoning, the online pose filter, and factors of the navigation sensors for the global alignment."""

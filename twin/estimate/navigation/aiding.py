@@ -101,7 +101,10 @@ def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFac
 
 
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the beacons seen in the left image; their residuals are reprojection errors [px]."""
+    """Returns the factors of the beacons seen in the left image.
+
+    The residuals are the predicted minus the detected positions [px].
+    """
     sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
     beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
     pixels = np.array([sighting.pixel for _, sighting in sightings]).reshape(-1, 2)

@@ -69,10 +69,10 @@ def dead_reckon(
 
     Args:
         last: `DeadReckoningState` of the previous frame.
-        aiding: `FrameAiding`.
+        aiding: error models of the sensors, and the state of the DVL integration, which is modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m, rpy_rad, velocity_mps: height (pressure), roll, pitch and yaw (3,) (AHRS) and velocity (3,) (DVL) of
-            this frame; NaN where there is no reading.
+        height_m, rpy_rad, velocity_mps: height (pressure), roll, pitch and yaw (3,) (AHRS) and velocity (3,) in body
+            axes (DVL) of this frame [m], [rad], [m/s]; NaN where there is no reading.
 
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.

@@ -19,7 +19,7 @@ class DvlModel(NamedTuple):
 
     Args:
         body_from_camera: (4, 4) pose of the left camera in the body.
-        step_s: time between readings [s].
+        step_s: time since the previous frame [s].
         white_m2: variance of each component of a frame's displacement due to white noise [m^2].
         scale_variance: variance of the scale error (a relative error of the velocity).
     """
@@ -35,11 +35,12 @@ class DvlState(NamedTuple):
 
     Args:
         velocity: (3,) last reading, in body axes [m/s]; NaN if the last frame had none.
-        node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance [rad^2].
+        node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance in the body axes
+            at the node [rad^2].
         displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
             white noise [m^2].
         path_m: (1,) path length since the node [m].
-        complete: (1,) true unless a reading has been missing since the node.
+        complete: (1,) true unless a reading, that at the node included, has been missing.
     """
 
     velocity: Array
@@ -55,8 +56,8 @@ class DvlIntegrator:
     """Integrates DVL velocities, rotated into the body axes at the last node, by the trapezoidal rule.
 
     Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
-    correlated. Treating the displacements as independent, each with the variance (sigma dt)^2, gives the correct
-    variance of their sum; sigma is the standard deviation of a reading, dt the interval between frames.
+    correlated. The sum of n displacements has the variance (n - 1/2) (sigma dt)^2 in each component, with sigma the
+    standard deviation of a reading and dt the interval between frames; (sigma dt)^2 per displacement is used.
 
     Args:
         rig: believed calibration, for the pose of the camera in the body.
@@ -91,7 +92,7 @@ class DvlIntegrator:
             number: number of the current node.
 
         Returns:
-            The displacement, or None if a reading was missing.
+            The displacement, or None if a reading was missing since the last node.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]

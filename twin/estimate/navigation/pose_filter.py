@@ -14,13 +14,13 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings, SensorNoise, StereoRig
 
-_GATE = 30.0  # largest chi2 (6 degrees of freedom) of a correction; above it, the correction is rejected
+_GATE = 30.0  # largest chi2 (6 degrees of freedom) of a pose in `correct_pose`; above it, the pose is rejected
 
 
 class PoseFilter:
     """Extended Kalman filter of one pose.
 
-    Errors are motions [rotation, translation] (rad, m) in camera axes: true pose = pose @ exp(error).
+    Errors are motions [rotation, translation] (rad, m) in camera axes: pose = true pose @ exp(error).
 
     Args:
         world_from_camera: (4, 4) initial pose, known with a standard deviation of 1e-4 rad and 1e-4 m.
@@ -29,7 +29,7 @@ class PoseFilter:
 
     Attributes:
         world_from_camera: (4, 4) estimated pose.
-        cov: (6, 6) covariance of its error.
+        cov: (6, 6) covariance of the error of this pose.
         pressure_ahrs: error model of the pressure sensor and the AHRS.
     """
 
@@ -102,7 +102,7 @@ class PressureAhrsModel(NamedTuple):
     Args:
         camera_from_body: (4, 4) pose of the body in the camera.
         pressure_m2: variance of the height measured by the pressure sensor [m^2].
-        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw measured by the AHRS.
+        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad].
     """
 
     camera_from_body: Array
@@ -120,7 +120,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
         height_m, rpy_rad: readings of the height, and of roll, pitch and yaw (3,); NaN where there is no reading.
 
     Returns:
-        Pose and covariance after the update.
+        Pose (4, 4) and covariance (6, 6) after the update.
     """
     pose = world_from_camera
     if not np.isnan(height_m):
@@ -149,6 +149,9 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
     The limits apply to the generalised eigenvalues of `cov` with respect to `reference`.
+
+    Raises:
+        LinAlgError: the reference covariance is not positive definite.
     """
     root = np.linalg.cholesky(reference)
     inverse_root = np.linalg.inv(root)
@@ -170,7 +173,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
     Args:
         world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
         residual, jacobian, cov: (k,), (k, 6), (k, k) residual of the observation, Jacobian of the predicted
-            observation, and covariance of the observation; k <= 3.
+            observation, and covariance of the observation.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -236,7 +239,15 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
 
 
 def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
-    """Returns the rotation world_from_camera (3, 3) of an AHRS reading and its covariance (3, 3) in camera axes."""
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading, and its covariance (3, 3) in camera axes.
+
+    The errors of roll, pitch and yaw are treated as rotations about the x, y and z axes of the body.
+
+    Args:
+        rpy_rad: (3,) roll, pitch and yaw of the body.
+        camera_from_body: (4, 4) pose of the body in the camera.
+        noise: believed noise of the navigation sensors.
+    """
     return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 
 

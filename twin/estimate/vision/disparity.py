@@ -17,7 +17,7 @@ Map = NDArray[np.float32]
 #: Block size of semi-global matching [px]. In turbid water, a block of 5 px matches more pixels than one of 3 px; the
 #: refinement restores the sharpness of edges.
 BLOCK_PX = 5
-#: Connected regions with fewer pixels than this are removed as mismatches.
+#: Connected regions of at most this many pixels are removed as mismatches.
 SPECKLE_PX = 60
 #: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
 #: because illumination and backscatter vary slowly over the image. In a small window (25 px), the local mean near an
@@ -66,7 +66,7 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
 
     Args:
         left, right: (H, W) uint8 rectified grey images.
-        max_disparity_px: largest disparity searched.
+        max_disparity_px: number of whole-pixel disparities searched, from 0 on; rounded up to a multiple of 16.
     """
     coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
@@ -105,7 +105,7 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
     Args:
         left, right: (H, W) uint8 rectified images with normalised contrast.
-        max_disparity_px: largest disparity searched.
+        max_disparity_px: number of whole-pixel disparities searched, from 0 on; rounded up to a multiple of 16.
     """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(

@@ -144,7 +144,9 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of a disparity from the measurement alone.
+    """Returns the standard deviation (H, W) of a disparity from the measurement alone, sigma / gain.
+
+    Where there is little texture, it is too large, because `sigma` includes the error due to the prior.
 
     Args:
         sigma, gain: `Refinement.sigma_px`, which includes the prior, and `Refinement.gain`.

@@ -56,7 +56,14 @@ class RegionMeans(NamedTuple):
     jacobian: Array
 
     def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
-        """Returns the sums with n more row differences `rows` (n,), which lie in the regions `region` (n,)."""
+        """Returns the sums with n more row differences.
+
+        Args:
+            region: (n,) numbers of the regions in which they lie.
+            weight: (n,) weights.
+            rows: (n,) normalised row differences.
+            jacobian: (n, 4) their derivatives (`row_jacobian`).
+        """
         terms = np.column_stack([weight, weight * rows, weight[:, None] * jacobian])
         sums = np.zeros((len(self.weight), terms.shape[1]))
         np.add.at(sums, region, terms)
@@ -171,7 +178,8 @@ class EpipolarCalibration:
 def row_jacobian(x: Array, y: Array) -> Array:
     """Returns the derivatives (n, 4) of the normalised rows of the right image at normalised (x, y).
 
-    They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset."""
+    They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset.
+    """
     return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
 
 

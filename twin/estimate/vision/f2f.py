@@ -66,17 +66,19 @@ class _Located(NamedTuple):
 class FrameToFrame:
     """Frame-to-frame motion by tracking the points of the last keyframe.
 
-    Every frame is matched with the last keyframe, and structure is estimated together with motion
-    (`two_view_motion.pair_motion`); the motion between two frames follows from their poses relative to the keyframe.
-    The alternative is to match each frame with the previous one and to take depth as exact, as in eq. (2) of
-    Negahdaripour & Madjidi (2003). There, matching errors accumulate over the 15 frames between two keyframes: the bias
-    of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and 4 mrad over coarse texture, where depth is
-    noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation is 0.6 mrad (this method: 0.35).
+    Every frame is matched with a reference image: the last keyframe, or a later frame once too few of the points are
+    tracked. Structure is estimated together with motion (`two_view_motion.pair_motion`); the motion between two frames
+    follows from their poses relative to the reference. The alternative is to match each frame with the previous one and
+    to take depth as exact, as in eq. (2) of Negahdaripour & Madjidi (2003). There, matching errors accumulate over the
+    15 frames between two keyframes: the bias of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and
+    4 mrad over coarse texture, where depth is noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation
+    is 0.6 mrad (this method: 0.35).
 
     A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
     acceleration of a vehicle is limited, whereas the error of a pose from few and noisy pixels is not. A step fails if
-    too few points are tracked, if too few of them are inliers, or if the measured pose contradicts the prediction. The
-    predicted motion is then returned, with a large covariance and the reason for the failure.
+    too few points are tracked, if too few of them are inliers, if their residuals are too large, or if the measured
+    pose contradicts the prediction. The predicted motion is then returned, with a large covariance and the reason for
+    the failure.
 
     Args:
         rig: calibration at the scale of the images.
@@ -97,7 +99,12 @@ class FrameToFrame:
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Makes a new keyframe the reference, with the strongest of its points; `points` are sorted by strength."""
+        """Makes a new keyframe the reference, with the strongest of its points.
+
+        Args:
+            image: (height, width) normalised left image of the keyframe.
+            points: its matched points, strongest first.
+        """
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
         self._reference_cov = np.zeros((6, 6))

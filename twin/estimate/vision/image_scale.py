@@ -18,10 +18,12 @@ _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning at which enough corners are matched, otherwise the one at which most are matched.
+    """Returns the smallest binning at which enough corners are matched, or else that with the largest fraction matched.
+
+    Only binnings that divide the width and the height of the images are tried.
 
     Args:
-        left, right: (height, width, 3) images of the first keyframe.
+        left, right: (height, width, 3) images of the first stereo pair.
         rig: calibration at full image size.
         settings: settings of the estimators.
 

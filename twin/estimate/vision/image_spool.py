@@ -63,21 +63,38 @@ class ImageSpool:
             writing.result()
 
     def close(self) -> None:
-        """Waits until all pairs are written, and ends the thread that writes them."""
+        """Waits until all pairs are written, and ends the thread that writes them.
+
+        An error in writing the last pair is not raised.
+        """
         self._writer.shutdown()
 
     def pair(self, row: int) -> tuple[Image, Image]:
-        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`."""
+        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`.
+
+        Raises:
+            OSError: the images could not be read, or the last pair could not be written.
+        """
         self.flush()
         return self._read(row, "left"), self._read(row, "right")
 
     def left(self, row: int) -> Image:
-        """Returns the left image (height, width, 3) of the keyframe at frame index `row`."""
+        """Returns the left image (height, width, 3) of the keyframe at frame index `row`.
+
+        Raises:
+            OSError: the image could not be read, or the last pair could not be written.
+        """
         self.flush()
         return self._read(row, "left")
 
     def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
-        """Returns the binned grey levels of the left and the right image of a keyframe (`matching.gray`)."""
+        """Returns the binned grey levels of the left and the right image of the keyframe at frame index `row`.
+
+        They are rounded to half precision.
+
+        Raises:
+            OSError: images that are not in the cache could not be read, or the last pair could not be written.
+        """
         with self._lock:
             if row not in self._gray:
                 left, right = self.pair(row)
@@ -87,9 +104,12 @@ class ImageSpool:
         return left.astype(np.float32), right.astype(np.float32)
 
     def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
-        """Adds the grey levels of a pair to the cache; removes the least recently used pairs beyond `_CACHE_BYTES`."""
+        """Adds the grey levels of a pair to the cache; removes the least recently used ones beyond `_CACHE_BYTES`.
+
+        The pair itself always remains in the cache.
+        """
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
-        while len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
+        while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
 
     def _write(self, row: int, left: Image, right: Image) -> None:

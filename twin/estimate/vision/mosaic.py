@@ -50,7 +50,7 @@ class Registration(NamedTuple):
 
 
 class Mosaic:
-    """Raster of brightness, elevation and keyframe number, in tiles on disk, so memory does not grow with the area.
+    """Raster of brightness, elevation and keyframe number, in tiles (`TiledRaster`), so that memory is limited.
 
     Args:
         cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
@@ -76,6 +76,9 @@ class Mosaic:
             depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.
             rig: calibration at the scale of the image.
+
+        Raises:
+            OSError: a tile could not be read or written.
         """
         known = depth_m[np.isfinite(depth_m)]
         if known.size == 0:
@@ -108,8 +111,11 @@ class Mosaic:
             rig: calibration at the scale of the image.
 
         Returns:
-            The pose correction with its covariance, or None if too few cells are textured, or too few of these have
-            small residuals.
+            The pose correction with its covariance, or None if too few cells are textured, or too few of these are
+            visible in the frame with a known depth and a small residual.
+
+        Raises:
+            OSError: a tile could not be read or written.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], half_window_m)
         if cells is None:

@@ -21,7 +21,7 @@ class MotionFilter:
     pose; where it does not (few pixels, noise), the pose follows from the velocity over many frames, and a measurement
     that contradicts the prediction is rejected. The model is that of constant velocity (Bar-Shalom, Li & Kirubarajan
     2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose are motions
-    [rotation, translation] (rad, m) in the axes of the camera: true pose = pose @ exp(error).
+    [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
 
     Attributes:
         pose: (4, 4) pose of the last frame in the reference camera.

@@ -20,6 +20,8 @@ _MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 class PairMeasurements(NamedTuple):
     """Measurements of the same n points in two stereo pairs, a (earlier) and b (later).
 
+    In frame-to-frame motion (`f2f`), a is the current image, without measured disparity, and b its reference.
+
     Args:
         a: (n, 3) normalised (x, y, disparity) in pair a.
         b: (n, 3) normalised (x, y, disparity) in pair b.

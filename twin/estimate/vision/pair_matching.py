@@ -57,6 +57,9 @@ class PairMatcher:
         Returns:
             For each of the other nodes, the points measured in its stereo pair (a) and in that of `node` (b); None for
             every node if `node` has no points.
+
+        Raises:
+            OSError: images could not be read or written.
         """
         points = node.points
         if points is None:

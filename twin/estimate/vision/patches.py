@@ -54,7 +54,7 @@ class PatchTemplates(NamedTuple):
         half: half side of a patch, (side - 1) / 2 [px].
         offset: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
         energy: (n,) sum of squared deviations from the patch's mean; 0 if the patch cannot be matched, because it is
-            too uniform or extends beyond the image.
+            too uniform, or not inside the image with a margin of one pixel.
         gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
         nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
             of both with respect to column and row.
@@ -123,7 +123,7 @@ def spline_coefficients(images: Sequence[Image]) -> list[Spline]:
 def match_templates(
     templates: Sequence[PatchTemplates], target: Sequence[Spline], guess: NDArray[np.floating], warp: Array
 ) -> PatchMatches:
-    """Matches patches of one image in another, from the coarsest level of both pyramids down to the full image.
+    """Matches patches of one image in another, from the coarsest common level of the pyramids down to the full image.
 
     Args:
         templates: patches per pyramid level (`extract_templates`).
@@ -227,7 +227,7 @@ def _prepare(source, u0, v0, half, rows):
     orthonormal, and rows 6 and 7, the gradient in column and row, orthogonal to them.
 
     Returns:
-        The sum of squared deviations from the mean of the patch.
+        The sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
     """
     side = 2 * half + 1
     mean = 0.0
@@ -312,7 +312,8 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
     """Matches patches at one pyramid level.
 
     Returns:
-        Positions (n, 2), correlations (n,) (-1 where matching failed) and covariances (n, 2, 2).
+        Positions (n, 2), correlations (n,) and covariances (n, 2, 2). Where matching failed, they are the guess, -1 and
+        zero.
     """
     n = (2 * half + 1) ** 2
     height, width = spline.shape

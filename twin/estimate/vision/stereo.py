@@ -31,7 +31,7 @@ class StereoPoints(NamedTuple):
         xyz: (n, 3) positions in the left camera [m].
         row_difference_px: (n,) row in the right image minus row in the left image [px].
         noise_ratio: ratio of the measured to the expected standard deviation of the row differences
-            (`row_noise_ratio`); the standard deviations in `cov` include this factor.
+            (`row_noise_ratio`); the matching noise in `cov` includes this factor.
     """
 
     pixels: NDArray[np.float32]
@@ -62,7 +62,7 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
     Args:
         left, right: (n, 2) positions [px].
         cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
-        rig: calibration.
+        rig: calibration, with square pixels.
 
     Returns:
         (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
@@ -86,7 +86,7 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
     Args:
         left, right: (n, 2) shifts of the positions [px].
         fused_cov: (n, 3, 3) covariance returned by `fuse`.
-        rig: calibration.
+        rig: calibration, with square pixels.
     """
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
@@ -162,7 +162,7 @@ def match_stereo_points(
     Args:
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
-        rig: calibration.
+        rig: calibration at the scale of the images, with square pixels.
         count: maximum number of corners.
         patch_px: side of the matched patches (odd).
     """

@@ -111,7 +111,7 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
         iterations: number of Gauss-Newton iterations.
 
     Returns:
-        The motion, or None if there are too few inliers or a point is behind the later camera.
+        The motion, or None if there are too few points or inliers, or a point is behind the later camera.
     """
     if len(points) < _MIN_POINTS:
         return None
@@ -144,7 +144,7 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
         guess: (4, 4) initial pose of b in a.
 
     Returns:
-        (4, 4) pose of b in a, or None if there are too few inliers or a point is behind camera a.
+        (4, 4) pose of b in a, or None if there are too few points or inliers, or a point is behind camera a.
     """
     points = np.column_stack([b[:, :2], np.ones(len(b))]) * baseline_m / b[:, 2:]
     motion = frame_motion(points, a[:, :2], geometry.inverse(guess))
@@ -178,7 +178,7 @@ def pair_motion(
 
     Returns:
         The motion, with its residual relative to the expected standard deviation (1 = as expected), or None if there
-        are too few inliers.
+        are too few points or inliers.
     """
     if len(measured.a) < _MIN_POINTS:
         return None
@@ -230,7 +230,7 @@ def _with_locking(
 ) -> LinearisedObservations:
     """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`."""
     moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
-    derivative = locking.a - moved  # of the residual with respect to the amplitude
+    derivative = locking.a - moved  # of the predicted measurements with respect to the amplitude
     residual = observations.residual - derivative * amplitude_px
     chi2 = np.einsum("ni,nij,nj->n", residual, observations.information, residual)
     return observations._replace(
@@ -298,7 +298,7 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
     coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
     determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
-    counts as 50 points.
+    counts as 50 points. The prior information is added to M and S.
 
     Args:
         normals: normal equations at the last iteration.

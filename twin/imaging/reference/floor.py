@@ -7,7 +7,7 @@ from numba import njit
 
 from twin.core.floor_rays import cast_ray
 
-LIFT_M = 1e-6  # height by which a path vertex on the floor is raised above the floor
+LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor, along the normal
 TOLERANCE_M = 1e-4  # an intersection with the floor this close to the end of a ray does not block the ray
 
 
@@ -58,14 +58,14 @@ def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _gap(field, x, y, z):
-    """Returns the height of a point above the floor [m]; inf where there is no floor."""
+    """Returns the height of a point above the floor [m]; inf where the floor has no height."""
     height, _, _ = _height_and_slopes(field, x, y)
     return z - height if not np.isnan(height) else np.inf
 
 
 @njit(cache=True, nogil=True)
 def _height_and_slopes(field, x, y):
-    """Returns the height of the floor and its slopes towards east and north; NaN, 0, 0 where there is no floor."""
+    """Returns the height of the floor [m] and its slopes towards east and north; NaN, 0, 0 outside the grid."""
     rows, cols = field.height_m.shape
     u, v = (x - field.west_m) / field.spacing_m, (y - field.south_m) / field.spacing_m
     if not (0 <= u <= cols - 1 and 0 <= v <= rows - 1):
@@ -90,7 +90,7 @@ def floor_normal(is_plane, field, x, y):
 
 @njit(cache=True, nogil=True)
 def sees(is_plane, field, ax, ay, az, bx, by, bz):
-    """Returns whether the floor does not block the straight line between two points above it."""
+    """Returns whether the straight line between two points above the floor is not blocked by the floor."""
     if is_plane:
         return az > 0 and bz > 0
     dx, dy, dz = bx - ax, by - ay, bz - az

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 BEAM_STEPS = 3600  # steps of 0.025 deg
 BIN_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0, 80.0, 160.0)
-NO_FLOOR = height_field(np.zeros((2, 2)), 1.0, 0.0, 0.0)
+NO_FLOOR = height_field(np.zeros((2, 2)), 1.0, 0.0, 0.0)  # not used by the kernels: the floor is a plane
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ class ReferenceScene:
     Args:
         water: optical properties of the water.
         lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity on the axis [cd].
-        beams: for each lamp, (m, 2) angle from the axis [deg] and intensity relative to that on the axis.
+        beams: for each lamp, (m, 2) angle from the axis [deg] and relative intensity.
         albedo: albedo of the Lambertian floor.
         relief: the floor; None = the plane z = 0.
         sun: sunlight and light of the sky; by default none, and no surface.
-        lamp_radius_m: distance from a lamp within which there is no water.
+        lamp_radius_m: vertices that are not farther from a lamp than this get no light from it.
     """
 
     water: BandWater
@@ -106,7 +106,7 @@ class Effort:
 
     Args:
         walks: number of pairs of random walks, rounded down to a multiple of `batches`; one walk of each pair starts on
-            the floor, the other in the water.
+            the floor, the other in the water. In `plane_light`, it is the number of single walks.
         batches: number of batches; the standard errors are computed from the scatter of their means.
         seed: seed of the random numbers, one number or several; equal seeds give equal results.
         plain: use the textbook estimator, which connects every vertex directly to the lamps and samples directions
@@ -147,7 +147,7 @@ class PixelLight:
 
     @property
     def direct(self) -> BatchMean:
-        """Light of the floor that was scattered neither between lamp and floor nor between floor and camera."""
+        """Light that was reflected by the floor once and not scattered."""
         return _estimate(self.sums[:, DIRECT])
 
     @property
@@ -167,7 +167,7 @@ class PixelLight:
 
     @property
     def blurred_straight_lamp(self) -> BatchMean:
-        """Light of the floor that was scattered between floor and camera, but not between lamp and floor."""
+        """Light of the floor that was scattered between floor and camera, but not scattered or reflected before."""
         return _estimate(self.blurred_by_bin[:, 0].sum(1))
 
     @property
@@ -187,7 +187,7 @@ class PixelLight:
 
     @property
     def blurred_by_bin(self) -> Array:
-        """Blurred light (batches, 2, n) [cd/m2]: index 0 = direct illumination of the floor, 1 = all other; n bins."""
+        """Blurred light (batches, 2, n) [cd/m2] in n bins; index 0: direct illumination of the floor, 1: all other."""
         return self.sums[:, FIRST_BIN:].reshape(len(self.sums), 2, -1)
 
     def blurred_share(self, from_px: float, to_px: float = np.inf) -> BatchMean:
@@ -209,34 +209,34 @@ class PixelLight:
 
 @dataclass(frozen=True)
 class PlaneLight:
-    """Illuminance of a plane by daylight and by scattered light of lamps: means of the batches [lx].
+    """Illuminance of a plane by daylight and by light of lamps: means of the batches [lx].
 
-    Light that arrives from a lamp without scattering is not included.
+    Light that arrives from a lamp without scattering or reflection is not included.
 
     Args:
-        sums: (batches, 3) unscattered light of the sun, unscattered light of the sky, scattered light.
+        sums: (batches, 3) direct light of the sun, direct light of the sky, light that was scattered or reflected.
     """
 
     sums: Array
 
     @property
     def total(self) -> BatchMean:
-        """Total illuminance by sun, sky and scattered light."""
+        """Total illuminance by sun, sky, and light that was scattered or reflected."""
         return _estimate(self.sums.sum(1))
 
     @property
     def sun(self) -> BatchMean:
-        """Unscattered light of the sun."""
+        """Illuminance by direct light of the sun."""
         return _estimate(self.sums[:, 0])
 
     @property
     def sky(self) -> BatchMean:
-        """Unscattered light of the sky."""
+        """Illuminance by direct light of the sky."""
         return _estimate(self.sums[:, 1])
 
 
 class KernelScene(NamedTuple):
-    """A `ReferenceScene` in the form of the compiled kernels, without the lamps of zero intensity."""
+    """A `ReferenceScene` and `Effort.plain` in the form of the compiled kernels, without lamps of zero intensity."""
 
     absorption: float
     scattering: float
@@ -269,6 +269,7 @@ def pixel_light(
         ray: the pixel.
         effort: number of walks, and seed.
         bin_edges_px: lower edges of the bins of blurred light, from 0, see `PixelLight`; the last bin is open.
+
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
     """
@@ -285,6 +286,7 @@ def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Ef
         point_m: (3,) a point of the plane above the floor, in world axes.
         normal: (3,) unit normal of the plane; light that arrives from the side of the normal counts.
         effort: number of walks, and seed.
+
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
     """
@@ -303,9 +305,9 @@ def refined(
 
     Args:
         light_of: computes the light of one round, e.g. with `pixel_light` or `plane_light`.
-        enough: whether the standard errors of the light of all rounds so far are small enough.
+        enough: returns whether the standard errors of the light of all rounds so far are small enough.
         effort: size of each round; the rounds differ by their seeds.
-        most_walks: largest number of walks of all rounds; the first round is always computed.
+        most_walks: largest number of walks of all rounds, as counted in `Effort`; the first round is always computed.
     """
     light, rounds = light_of(effort), 1
     while (rounds + 1) * effort.walks <= most_walks and not enough(light):
@@ -322,7 +324,7 @@ def _in_threads(trace: Callable[[np.random.Generator], Array], rngs: Sequence[np
 
 
 def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
-    """Returns the number of walks of a batch and the random stream of each batch.
+    """Returns the number of walks (or pairs of walks) of a batch, and the random stream of each batch.
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
@@ -347,7 +349,10 @@ def lamps_in_world(sources: LightSources, world_from_camera: Array, band: int) -
 
 
 def ratio(part: Array, whole: Array) -> BatchMean:
-    """Returns the ratio of two means over batches; its error is that of the linearised ratio (delta method)."""
+    """Returns the ratio of two means over batches, given the batches (n,) of both; NaN if the mean of `whole` is 0.
+
+    Its standard error is that of the linearised ratio (delta method).
+    """
     if whole.mean() == 0:
         return BatchMean(np.nan, np.nan)
     value = part.mean() / whole.mean()
@@ -379,4 +384,4 @@ def _view(ray: PixelRay) -> Array:
     """Returns the camera and the pixel as the argument `view` (5, 3) of `walk.bin_of`."""
     pose, rig = ray.world_from_camera, ray.rig
     pixel = ray.pixel[0] - rig.cx_px, ray.pixel[1] - rig.cy_px, rig.focal_px
-    return np.vstack([pose[:3, :3].T, pose[:3, 3], pixel])
+    return np.ascontiguousarray(np.vstack([pose[:3, :3].T, pose[:3, 3], pixel]))

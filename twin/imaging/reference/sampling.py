@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-GUIDE_G = 0.9  # mean cosine of the lobe around a lamp
+GUIDE_G = 0.9  # mean cosine of the wider lobe around a lamp, see `sample_guide`
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -18,7 +18,7 @@ def density_at(density_per_sr, cosine):
 
 @njit(cache=True, nogil=True)
 def cell_of(cumulative, u):
-    """Returns the cell i of a table for which cumulative[i] <= u < cumulative[i + 1]."""
+    """Returns the cell i of a table for which cumulative[i] <= u < cumulative[i + 1], for u in [0, 1)."""
     low, high = 0, cumulative.shape[0] - 1
     while high - low > 1:
         middle = (low + high) >> 1
@@ -49,9 +49,10 @@ def sample_angle(cumulative_angle, rng):
 
 @njit(cache=True, nogil=True)
 def turn(x, y, z, cosine, sine, azimuth):
-    """Returns the unit vector at a polar angle and an azimuth around the unit vector (x, y, z).
+    """Returns the unit vector at a polar angle and an azimuth [rad] around the unit vector (x, y, z).
 
-    The frame around the axis is that of Duff et al. (2017, J. Comput. Graph. Tech. 6, 1).
+    `cosine` and `sine` are those of the polar angle. The frame around the axis is that of Duff et al. (2017, J. Comput.
+    Graph. Tech. 6, 1).
     """
     sign = 1.0 if z >= 0 else -1.0
     a = -1 / (sign + z)
@@ -91,9 +92,9 @@ def guide_density(density_per_sr, beyond, angle_integral, cosine):
     """Returns the density [1/sr] of `sample_guide` at the cosine of the angle from the lamp.
 
     Args:
-        density_per_sr: (n,) phase function table.
+        density_per_sr: (n,) phase function table [1/sr].
         beyond: (n + 1,) integral of the phase function over the angle, from each cell boundary to pi [rad/sr].
-        angle_integral: integral of phase function times angle.
+        angle_integral: integral of phase function times angle from 0 to pi [rad^2/sr].
         cosine: cosine of the angle from the lamp.
     """
     g, cells = GUIDE_G, density_per_sr.shape[0]

@@ -11,13 +11,13 @@ from the truncated exponential distribution. Each vertex of the walk is connecte
   by both squared distances is (1/D) d(alpha) d(t) d(azimuth). If t is sampled in proportion to p(t) t, and alpha
   uniformly between 0 and t, the weight has neither the peak of p nor the poles 1/d^2 (compare Georgiev et al. 2013).
 
-Light that is scattered last at a point of the water is sampled both by these connections and by the walk;
+Light of a lamp whose first scattering is at a point of the water is sampled both by these connections and by the walk;
 `share_of_walk` weights the two. Vertices are connected directly to the sun, and the sky is sampled by walks that leave
 the water; a sun with a disc is sampled in both ways.
 
-The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), and
-lobes around the lamps and the sun. Absorption reduces the weight of a walk. Russian roulette ends walks of small
-weight; no contribution is clipped.
+The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), lobes
+around the lamps and the sun, and, for downward walks in daylight, the upper hemisphere. Absorption reduces the weight
+of a walk. Russian roulette ends walks of small weight; no contribution is clipped.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ from twin.imaging.reference.sampling import (
 DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
 GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around lamps and sun
 UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
-WEAK, STEPS = 0.002, 10000  # relative weight at which the roulette starts; largest number of vertices
+#: Kinds of vertices. As an argument, an `int` constant would make numba compile each function once for each value.
+ON_FLOOR, IN_WATER = np.int64(0), np.int64(1)
+WEAK, STEPS = 0.002, 10000  # weight relative to the first below which the roulette starts; most vertices of a walk
 
 
 @njit(cache=True, nogil=True)
@@ -61,12 +63,12 @@ def response(scene, kind, normal, direction, ox, oy, oz):
     """Returns the scattering function of a vertex for light from a direction, back along the path [1/sr].
 
     Args:
-        kind: 0 floor (albedo / pi times the cosine), 1 water (phase function).
-        normal: unit normal of the floor.
+        kind: ON_FLOOR (albedo / pi times the cosine) or IN_WATER (phase function).
+        normal: unit normal of the floor; not used in water.
         direction: unit direction in which the backward path arrived.
         ox, oy, oz: unit direction from the vertex towards the light.
     """
-    if kind == 0:
+    if kind == ON_FLOOR:
         return scene.albedo / np.pi * max(normal[0] * ox + normal[1] * oy + normal[2] * oz, 0.0)
     return density_at(scene.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
 
@@ -157,7 +159,7 @@ def sunlight(scene, kind, point, normal, direction, guided, rng):
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
         return 0.0
-    has_disc = kind == 1 and scene.sun_cosine < 1
+    has_disc = kind == IN_WATER and scene.sun_cosine < 1
     if has_disc:
         sx, sy, sz = turn_by_cosine(sx, sy, sz, 1 - rng.random() * (1 - scene.sun_cosine), rng)
         if sz <= 0:
@@ -224,7 +226,7 @@ def axis_of(scene, k, point):
 def upward_share(scene, kind, direction, guided):
     """Returns the share of upward samples among the directions that are not sampled around a lamp or the sun."""
     sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
-    return UPWARDS if sunny and kind == 1 and guided > 0 and direction[2] < 0 else 0.0
+    return UPWARDS if sunny and kind == IN_WATER and guided > 0 and direction[2] < 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -234,7 +236,7 @@ def next_direction(scene, kind, point, normal, direction, guided, rng):
     if n > 0 and rng.random() < guided:
         x, y, z = axis_of(scene, min(int(n * rng.random()), n - 1), point)
         x, y, z = turn_by_cosine(x, y, z, sample_guide(scene.cumulative_angle, rng), rng)
-    elif kind == 0:
+    elif kind == ON_FLOOR:
         x, y, z = turn_by_cosine(normal[0], normal[1], normal[2], np.sqrt(rng.random()), rng)
     elif rng.random() < upward_share(scene, kind, direction, guided):
         x, y, z = turn_by_cosine(0.0, 0.0, 1.0, np.sqrt(rng.random()), rng)
@@ -250,13 +252,13 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
 
     Args:
-        kind: 0 floor, 1 water.
+        kind: ON_FLOOR or IN_WATER.
         direction: unit direction in which the backward path arrived at the vertex.
         guided: share of the directions that are sampled around lamps and sun.
         own: response of the vertex to the direction (x, y, z); divided by the albedo of a floor, it is the density of
             directions sampled by reflection or scattering.
     """
-    own = own / scene.albedo if kind == 0 else own
+    own = own / scene.albedo if kind == ON_FLOOR else own
     upwards = upward_share(scene, kind, direction, guided)
     if upwards > 0:
         own = (1 - upwards) * own + upwards * max(z, 0.0) / np.pi
@@ -297,8 +299,10 @@ def bin_of(view, bin_edges_px, x, y, z):
     The last bin has no upper limit and also holds points behind the camera.
 
     Args:
-        view: (5, 3) axes of the camera as rows, its position, and (column, row) of the pixel relative to the
-            principal point and the focal length [px].
+        view: (5, 3) axes of the camera in the world as rows, its position [m], and (column, row) of the pixel relative
+            to the principal point and the focal length [px].
+        bin_edges_px: (n,) lower edges of the bins, from 0.
+        x, y, z: the point in the world [m].
     """
     a, b, c = x - view[3, 0], y - view[3, 1], z - view[3, 2]
     depth = a * view[2, 0] + b * view[2, 1] + c * view[2, 2]
@@ -320,22 +324,24 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 
     Args:
         scene: `pixel_light.KernelScene`.
-        kind: 0 if the first vertex is the floor point of the pixel, 1 if it is a scattering on the pixel's ray.
+        view, bin_edges_px: see `bin_of`.
+        kind: ON_FLOOR if the first vertex is the floor point of the pixel, IN_WATER if it is a scattering on its ray.
         point: (3,) first vertex.
         direction: (3,) unit direction in which the backward path arrives there.
         weight: weight of the first vertex.
+        rng: random stream.
         sums: (FIRST_BIN + 2 n,) sums of light [cd/m2], modified in place: DIRECT, LAMP_SCATTERED, VEIL_ONCE and
             VEIL_MORE; then the light from the floor that was scattered on its way to the camera, in n bins for light
-            that had illuminated the floor without scattering, and in n bins for all other light.
+            that had illuminated the floor without scattering or reflection, and in n bins for all other light.
     """
-    unscattered, before_floor, at_first_floor = kind == 0, kind == 1, False
+    unscattered, before_floor, at_first_floor = kind == ON_FLOOR, kind == IN_WATER, False
     n_bins, at_bin, start = bin_edges_px.shape[0], 0, weight
     before, density, step_m = point, 0.0, 0.0
     normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
     for order in range(STEPS):
         first = order == 0
-        shared = 0.0 if scene.plain or kind == 0 else density  # density is 0 at the first vertex
-        guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == 0 else GUIDED_IN_WATER)
+        shared = 0.0 if scene.plain or kind == ON_FLOOR else density  # density is 0 at the first vertex
+        guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == ON_FLOOR else GUIDED_IN_WATER)
         once = weight * sunlight(scene, kind, point, normal, direction, guided, rng)
         once += weight * straight(scene, kind, point, normal, direction, before, shared, step_m)
         more = 0.0
@@ -369,17 +375,17 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
         step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
         if step_m >= surface_m and surface_m <= floor_m:
-            above = light_above(scene, kind == 1, density, surface_m, x, y, z)
+            above = light_above(scene, kind == IN_WATER, density, surface_m, x, y, z)
             sums[to] += weight * np.exp(-scene.absorption * surface_m) * above
             return
         if step_m == np.inf and floor_m == np.inf:
             return
-        kind = 1 if step_m < floor_m else 0
+        kind = IN_WATER if step_m < floor_m else ON_FLOOR
         step_m = min(step_m, floor_m)
         weight *= np.exp(-scene.absorption * step_m)
         before = point
         point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
-        if kind == 0:
+        if kind == ON_FLOOR:
             normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
             point = (point[0] + LIFT_M * normal[0], point[1] + LIFT_M * normal[1], point[2] + LIFT_M * normal[2])
             if normal[0] * x + normal[1] * y + normal[2] * z >= 0 or scene.albedo <= 0:
@@ -393,7 +399,8 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2] by component and bin, ordered as `sums` of `walk`.
 
-    It is the mean over `n_walks` pairs of walks: one that starts at the floor and one that starts in the water.
+    It is the mean over `n_walks` pairs of walks: one that starts at the floor and one that starts in the water. The
+    arguments are those of `walk`.
     """
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
@@ -413,28 +420,33 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
         shown = (centre[0] + floor_m * x, centre[1] + floor_m * y, centre[2] + floor_m * z)
         up = floor_normal(scene.is_plane, scene.field, shown[0], shown[1])
         shown = (shown[0] + LIFT_M * up[0], shown[1] + LIFT_M * up[1], shown[2] + LIFT_M * up[2])
-        direct = straight(scene, 0, shown, up, ray, shown, 0.0, 0.0) + sunlight(scene, 0, shown, up, ray, 0.0, rng)
+        direct = straight(scene, ON_FLOOR, shown, up, ray, shown, 0.0, 0.0)
+        direct += sunlight(scene, ON_FLOOR, shown, up, ray, 0.0, rng)
         sums[DIRECT] = n_walks * arrives * direct
     for k in range(n_walks):
         if seen and (scene.scattering > 0 or scene.sky.shape[0] > 1):
-            walk(scene, view, bin_edges_px, 0, shown, ray, arrives, rng, sums)
+            walk(scene, view, bin_edges_px, ON_FLOOR, shown, ray, arrives, rng, sums)
         if share > 0:
             at_m = -np.log(1 - share * (k + rng.random()) / n_walks) / scene.scattering
             weight = share * np.exp(-scene.absorption * at_m)
             point = (centre[0] + at_m * x, centre[1] + at_m * y, centre[2] + at_m * z)
-            walk(scene, view, bin_edges_px, 1, point, ray, weight, rng, sums)
+            walk(scene, view, bin_edges_px, IN_WATER, point, ray, weight, rng, sums)
     return sums / n_walks
 
 
 @njit(cache=True, nogil=True)
 def trace_plane(scene, point, normal, n_walks, rng):
-    """Returns the illuminance (3,) of a plane that does not disturb the light: sun, sky, and all scattered light [lx].
+    """Returns the illuminance (3,) of a plane that does not disturb the light [lx].
+
+    Its elements are direct light of the sun, direct light of the sky, and light that was scattered or reflected. Direct
+    light of lamps is not included.
 
     Args:
         scene: `pixel_light.KernelScene`.
         point: a point of the plane.
         normal: unit normal of the plane.
         n_walks: number of walks.
+        rng: random stream.
     """
     out, sums, no_view, edges = np.zeros(3), np.zeros(FIRST_BIN + 2), np.zeros((5, 3)), np.zeros(1)
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
@@ -445,11 +457,12 @@ def trace_plane(scene, point, normal, n_walks, rng):
         attenuation = scene.absorption + scene.scattering
         out[0] = n_walks * facing * scene.sun_lx * np.exp(-attenuation * (scene.surface_m - point[2]) / sz)
     for _ in range(n_walks):
-        x, y, z = next_direction(scene, 0, point, normal, normal, guided, rng)
+        x, y, z = next_direction(scene, ON_FLOOR, point, normal, normal, guided, rng)
         cosine = normal[0] * x + normal[1] * y + normal[2] * z
         if cosine <= 0:
             continue
-        weight = cosine / direction_density(scene, 1, point, (0.0, 0.0, 1.0), guided, cosine / np.pi, x, y, z)
+        own = cosine / np.pi
+        weight = cosine / direction_density(scene, IN_WATER, point, (0.0, 0.0, 1.0), guided, own, x, y, z)
         floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
         surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
         step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
@@ -459,19 +472,19 @@ def trace_plane(scene, point, normal, n_walks, rng):
             continue
         if step_m == np.inf and floor_m == np.inf:
             continue
-        kind = 1 if step_m < floor_m else 0
-        if kind == 0 and scene.albedo <= 0:
+        kind = IN_WATER if step_m < floor_m else ON_FLOOR
+        if kind == ON_FLOOR and scene.albedo <= 0:
             continue
         step_m = min(step_m, floor_m)
         weight *= np.exp(-scene.absorption * step_m)
         next_point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
-        if kind == 0:
+        if kind == ON_FLOOR:
             up = floor_normal(scene.is_plane, scene.field, next_point[0], next_point[1])
             next_point = (
                 next_point[0] + LIFT_M * up[0], next_point[1] + LIFT_M * up[1], next_point[2] + LIFT_M * up[2]
             )  # fmt: skip
-            first = straight(scene, 0, next_point, up, (x, y, z), next_point, 0.0, 0.0)
-            first += sunlight(scene, 0, next_point, up, (x, y, z), 0.0, rng)
+            first = straight(scene, ON_FLOOR, next_point, up, (x, y, z), next_point, 0.0, 0.0)
+            first += sunlight(scene, ON_FLOOR, next_point, up, (x, y, z), 0.0, rng)
             sums[LAMP_SCATTERED] += weight * first
         walk(scene, no_view, edges, kind, next_point, (x, y, z), weight, rng, sums)
     out[2] = sums.sum()

@@ -1,0 +1,19 @@
+"""Tests of the storage of the keyframes' images."""
+
+import numpy as np
+
+from twin.estimate.vision import image_spool, matching
+
+
+def test_a_pair_larger_than_the_cache_is_still_returned(tmp_path, monkeypatch):
+    monkeypatch.setattr(image_spool, "_CACHE_BYTES", 1000)
+    spool = image_spool.ImageSpool(tmp_path)
+    images = np.random.default_rng(0).integers(0, 256, (4, 24, 32, 3), np.uint8)
+    levels = [matching.gray(image) for image in images]
+    for row in (0, 1):
+        spool.put(row, images[2 * row], images[2 * row + 1], (levels[2 * row], levels[2 * row + 1]))
+    for row in (0, 1):
+        for got, image, expected in zip(spool.gray(row), spool.pair(row), levels[2 * row : 2 * row + 2], strict=True):
+            np.testing.assert_allclose(got, expected, atol=0.0625)  # half precision below 256
+            np.testing.assert_allclose(matching.gray(image), expected)
+    spool.close()
