@@ -14,7 +14,7 @@ import numpy as np
 from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.exchange.attitude import yaw_pitch_roll_deg
-from twin.exchange.image_copy import copy_image
+from twin.exchange.image_copy import copy_images
 from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunContents
 
 VERSION = "v2.1.0"
@@ -29,18 +29,11 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     otherwise, the file has only poses in local coordinates. Times count from 1970-01-01, because a simulated survey has
     no date.
     """
-    (folder / "images").mkdir(exist_ok=True)
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
     items: dict[str, Any] = {}
-    for k, frame in enumerate(contents.frames):
-        sides = (("left", frame.left, np.eye(4)), ("right", frame.right, contents.rig.left_from_right))
-        for side, file, left_from_camera in sides:
-            if file is not None:
-                stem = folder / "images" / f"{side}_{frame.index:06d}"
-                copied = copy_image(file, stem, contents.jpeg_quality)
-                pose = path.world_from_camera[frame.index] @ left_from_camera
-                items[copied.name] = _item(contents, frame, copied, pose)
-        contents.progress((k + 1) / len(contents.frames))
+    for image in copy_images(contents, folder / "images", contents.rig.left_from_right):
+        pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
+        items[image.name] = _item(contents, image.frame, folder / "images" / image.name, pose)
     target = folder / "ifdo.json"
     text = json.dumps({"image-set-header": _header(contents), "image-set-items": items}, indent=1)
     target.write_text(text, encoding="utf-8")

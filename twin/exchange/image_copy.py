@@ -2,13 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
+import numpy as np
 
+from twin.core.records import Array
 from twin.errors import TwinError
+from twin.exchange.run_contents import RecordedFrame, RunContents
 
 _PNG_END = b"IEND\xaeB`\x82"  # last bytes of a complete PNG file
+
+
+class CopiedImage(NamedTuple):
+    """An image in an exported data set.
+
+    Args:
+        name: name of the file.
+        frame: frame of the image.
+        camera: "left" or "right".
+        left_from_camera: (4, 4) pose of the camera in the axes of the left camera [m].
+    """
+
+    name: str
+    frame: RecordedFrame
+    camera: str
+    left_from_camera: Array
+
+
+def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> Iterator[CopiedImage]:
+    """Copies all images to `folder`, which is created, as CAMERA_FRAME, and yields each; missing images are left out.
+
+    Args:
+        contents: recorded frames, quality of JPEG images, and progress, which is reported.
+        folder: folder of the copies.
+        left_from_right: (4, 4) pose of the right camera in the axes of the left camera [m].
+
+    Raises:
+        TwinError: an image is truncated or no PNG image.
+        OSError: an image cannot be read or written.
+    """
+    folder.mkdir(exist_ok=True)
+    for k, frame in enumerate(contents.frames):
+        for camera, file, pose in (("left", frame.left, np.eye(4)), ("right", frame.right, left_from_right)):
+            if file is not None:
+                copied = copy_image(file, folder / f"{camera}_{frame.index:06d}", contents.jpeg_quality)
+                yield CopiedImage(copied.name, frame, camera, pose)
+        contents.progress((k + 1) / len(contents.frames))
 
 
 def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Path:

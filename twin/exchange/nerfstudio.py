@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.exchange.image_copy import copy_image
+from twin.exchange.image_copy import copy_images
 from twin.exchange.run_contents import RunContents
 
 #: OpenGL camera axes (x right, y up, z backward) in those of OpenCV (x right, y down, z forward).
@@ -23,27 +23,21 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     the corner of the first pixel at (0, 0), so the principal point is larger by 0.5 px than in OpenCV.
     """
     rig = contents.true or contents.believed
-    (folder / "images").mkdir(exist_ok=True)
     poses = contents.poses.world_from_camera
     frames = []
-    for k, frame in enumerate(contents.frames):
-        sides = [("left", frame.left, np.eye(4), rig.left), ("right", frame.right, rig.left_from_right, rig.right)]
-        for side, file, left_from_camera, camera in sides:
-            if file is None:
-                continue
-            copied = copy_image(file, folder / "images" / f"{side}_{frame.index:06d}", contents.jpeg_quality)
-            world_from_camera = poses[frame.index] @ left_from_camera @ OPENCV_FROM_OPENGL
-            (width, height), matrix = camera.size_px, camera.matrix
-            k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
-            frames.append(
-                {
-                    "file_path": f"images/{copied.name}",
-                    "transform_matrix": world_from_camera.tolist(),
-                    **{"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2] + 0.5, "cy": matrix[1, 2] + 0.5},
-                    **{"w": width, "h": height, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2},
-                }
-            )
-        contents.progress((k + 1) / len(contents.frames))
+    for image in copy_images(contents, folder / "images", rig.left_from_right):
+        world_from_camera = poses[image.frame.index] @ image.left_from_camera @ OPENCV_FROM_OPENGL
+        camera = rig.left if image.camera == "left" else rig.right
+        (width, height), matrix = camera.size_px, camera.matrix
+        k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
+        frames.append(
+            {
+                "file_path": f"images/{image.name}",
+                "transform_matrix": world_from_camera.tolist(),
+                **{"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2] + 0.5, "cy": matrix[1, 2] + 0.5},
+                **{"w": width, "h": height, "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2},
+            }
+        )
     file = folder / "transforms.json"
     file.write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}, indent=1), encoding="utf-8")
     return [file, folder / "images"]

@@ -25,7 +25,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         for name, path in contents.trajectories.items()
         if len(path)
     ]
-    lists = {"rgb": "rgb", "right": "right"}
+    lists = ("rgb", "right")
     if contents.frames:
         for name in lists:
             (folder / name).mkdir(exist_ok=True)
