@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
-from scipy.ndimage import gaussian_filter, uniform_filter1d
+from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
 from controllers.segments import Reference
 
@@ -59,9 +59,9 @@ def surface_above_floor(
     """Returns the surface that the camera follows at an altitude above the smoothed floor.
 
     The floor is averaged twice over the footprint, along x and y (a triangular window, twice as long as the footprint),
-    and sampled at nodes about 1/8 of the shorter side of the footprint apart. Around steep parts it is raised, by as
-    little as possible, until its slope is at most `max_slope`; a Gaussian filter with a standard deviation of one node
-    then rounds the edges.
+    and sampled at nodes about 1/8 of the shorter side of the footprint apart, but not closer than `spacing_m`. Around
+    steep parts it is raised, by as little as possible, until its slope is at most `max_slope`; a Gaussian filter with a
+    standard deviation of one node distance then rounds the edges.
 
     Args:
         height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
@@ -78,18 +78,16 @@ def surface_above_floor(
             smooth = np.asarray(uniform_filter1d(smooth, side, axis, mode="nearest"), np.float64)
     ny, nx = height_m.shape
     step_m = max(min(footprint_m) / 8, spacing_m)
-    rows, cols = (
-        np.unique(np.rint(np.linspace(0, n - 1, max(4, round((n - 1) * spacing_m / step_m) + 1))).astype(int))
-        for n in (ny, nx)
-    )
-    coarse = smooth[np.ix_(rows, cols)]
-    coarse = gaussian_filter(_limit_slope(coarse, step_m, max_slope), 1.0, mode="nearest")
+    rows, cols = (np.linspace(0, n - 1, max(4, round((n - 1) * spacing_m / step_m) + 1)) for n in (ny, nx))
+    coarse = map_coordinates(smooth, np.meshgrid(rows, cols, indexing="ij"), order=1)
+    coarse = _limit_slope(coarse, rows[1] * spacing_m, cols[1] * spacing_m, max_slope)
+    coarse = gaussian_filter(coarse, 1.0, mode="nearest")
     x, y = corner_m[0] + cols * spacing_m, corner_m[1] + rows * spacing_m
     return CameraSurface(RectBivariateSpline(x, y, coarse.T + altitude_m))
 
 
 @njit(cache=True, nogil=True)
-def _limit_slope(height_m, step_m, max_slope):
+def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
     """Returns heights raised as little as possible, so that the slope to each of 8 neighbours is at most `max_slope`.
 
     Two sweeps in opposite directions propagate the limit over the whole grid (chamfer distance transform, Borgefors
@@ -97,7 +95,6 @@ def _limit_slope(height_m, step_m, max_slope):
     """
     result = height_m.copy()
     rows, cols = result.shape
-    straight, diagonal = max_slope * step_m, max_slope * step_m * np.sqrt(2)
     for sweep in range(2):
         back = 1 - 2 * sweep  # the visited neighbours precede the node in the first sweep and follow it in the second
         for i in range(rows):
@@ -107,6 +104,6 @@ def _limit_slope(height_m, step_m, max_slope):
                 for dr, dc in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
                     nr, nc = r + back * dr, c + back * dc
                     if 0 <= nr < rows and 0 <= nc < cols:
-                        least = result[nr, nc] - (straight if dr * dc == 0 else diagonal)
+                        least = result[nr, nc] - max_slope * np.hypot(dr * step_y_m, dc * step_x_m)
                         result[r, c] = max(result[r, c], least)
     return result

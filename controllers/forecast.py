@@ -24,8 +24,8 @@ class Forecast(NamedTuple):
         n_frames_per_keyframe: N, frames from one keyframe to the next.
         keyframes_per_swath: M, number of keyframes on a leg of mean length or on a loop.
         n_tracks: L, number of planned tracks.
-        n_keyframes, n_frames: totals of the survey, without station keeping.
-        duration_s, path_m: totals of the survey, without station keeping.
+        n_keyframes, n_frames: number of keyframes and of frames of the survey, without station keeping.
+        duration_s, path_m: duration of the survey and horizontal length of its path, without station keeping.
         speed_mps: cruise speed along the swaths.
         footprint_m: width (across the heading) and height (along the heading) of the image on the floor.
         keyframe_spacing_m: distance between consecutive keyframes.
@@ -117,6 +117,7 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
     area_m2 = (north - south) * (np.ptp(path[:, 0]) + 2 * along_m)
     sample_m = max(sample_m, math.sqrt(area_m2 / MAX_CLEARANCE_SAMPLES))
+    path = _without_gaps(path, 2 * across_m)
     # Processed row by row to limit memory on a large floor.
     tops = []
     for y in np.linspace(south, north, round((north - south) / sample_m) + 2):
@@ -128,3 +129,14 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     height, u, v = max(tops)
     x, y = (float(c) for c in plan.area.to_scene(u, v))
     return Clearance(plan.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*outline.T)).all()))
+
+
+def _without_gaps(path: Array, max_step_m: float) -> Array:
+    """Returns a path of points (u, v) [m], (n, 2), with points added so that v changes by at most `max_step_m`."""
+    n_steps = np.maximum(1, np.ceil(np.abs(np.diff(path[:, 1])) / max_step_m)).astype(int)
+    if (n_steps == 1).all():
+        return path
+    segment = np.repeat(np.arange(len(n_steps)), n_steps)
+    step = np.arange(len(segment)) - (np.cumsum(n_steps) - n_steps)[segment]
+    at, known = np.append(segment + step / n_steps[segment], len(path) - 1), np.arange(len(path))
+    return np.column_stack([np.interp(at, known, path[:, k]) for k in range(2)])

@@ -1,9 +1,10 @@
-"""Lawnmower survey: L tracks of two legs and two short segments (Negahdaripour & Madjidi 2003, section III-A).
+"""Lawnmower survey: L tracks of two legs, joined by short segments (Negahdaripour & Madjidi 2003, section III-A).
 
 By default the bow always points along the first leg (east if the heading is 0), and every second leg is flown
 backwards, so the images of all legs have the same orientation. With `turns` = "bow_first" the vehicle turns by 180
-degrees at the end of each leg, alternately counter-clockwise and clockwise so that a tether is not twisted. In both
-cases consecutive keyframes are displaced along the image height, neighbouring swaths along the image width.
+degrees at the end of each leg except the last, alternately counter-clockwise and clockwise so that a tether is not
+twisted. In both cases consecutive keyframes are displaced along the image height, neighbouring swaths along the image
+width.
 """
 
 from __future__ import annotations
@@ -82,8 +83,8 @@ def _corners(
 ) -> list[tuple[float, float]]:
     """Returns the corners (u, v) of a track (numbered from 1) in the axes of the legs [m].
 
-    They are the two ends of the first leg, the two ends of the return leg and, except for the last track, the start of
-    the next track.
+    They are the two ends of the first leg, the two ends of the return leg and, unless `last`, the start of the next
+    track.
     """
     first = 2 * (track - 1)  # index of the track's first leg
     south = (2 * track - 1.5) * spacing_m - area.size_m[1] / 2

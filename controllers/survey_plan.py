@@ -38,7 +38,8 @@ class SurveyRequest(NamedTuple):
         image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
         acceleration_mps2: greatest acceleration of the camera.
         area: area to cover, of extent `area_m`; None: a rectangle or disc at the origin, with legs along x.
-        turns: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns at the end of each leg.
+        turns: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns by 180 degrees at
+            the end of each leg except the last.
         along_scale, across_scale: factors on the spacing of keyframes and of swaths that follows from the footprint on
             the reference plane; below 1 if the floor is nearer to the cameras than the plane.
         surface: planned height z of the camera as a function of x and y; None: `altitude_m` everywhere.
@@ -83,8 +84,8 @@ class SurveyPlan:
         swath_spacing_m: greatest distance between neighbouring swaths.
         n_tracks_to_fill: number of tracks that fill the area, of which the first `n_tracks` are planned.
         footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.
-        side_along_m: side of the footprint along which consecutive keyframes are displaced.
-        side_across_m: side of the footprint along which neighbouring swaths are displaced.
+        side_along_m: side of the footprint along which consecutive keyframes are displaced; the shorter one for loops.
+        side_across_m: side of the footprint along which neighbouring swaths are displaced; the shorter one for loops.
         focal_px: focal length of the cameras.
         acceleration_mps2: greatest acceleration of the camera.
         surface: planned height z of the camera, which replaces z of the paths; None: `altitude_m` everywhere.
@@ -241,8 +242,8 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
         request: the requirements; `tracks` = 0 means all tracks.
         n_filling: number of tracks that fill the area.
     Raises:
-        TwinError: more tracks are requested than fill the area, or there are more tracks than `MAX_TRACKS` to fly or
-            `MAX_FILLING` to fill the area.
+        TwinError: the requested number of tracks is negative or greater than the number that fills the area, or more
+            than `MAX_TRACKS` tracks are to be flown, or more than `MAX_FILLING` fill the area.
     """
     n_flown = request.tracks or n_filling
     if n_flown > MAX_TRACKS or n_filling > MAX_FILLING:

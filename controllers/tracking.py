@@ -38,7 +38,7 @@ class HullModel(NamedTuple):
 def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
     """Returns the wrench (6,) that sustains a body velocity (3,) in still water against drag and the Munk moment.
 
-    The Munk moment -v x M_A v (v body velocity, M_A added mass) turns a hull broadside to the flow. At survey speed it
+    The Munk moment -v x M_A v (v body velocity, M_A added mass) turns a hull broadside to the flow. Above 0.33 m/s it
     exceeds the righting moment of the BlueROV2 in pitch.
     """
     u, v, w = velocity

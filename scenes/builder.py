@@ -112,7 +112,7 @@ def _empty_model(image_width_px: int, image_height_px: int, timestep_s: float) -
 
 
 def _add_vehicle(spec: MjSpec, vehicle: VehicleParameters) -> MjsBody:
-    """Adds the rigid body with its origin at the centre of gravity, a visual hull and a site at each thruster."""
+    """Adds and returns the body: origin at the centre of gravity, a visual hull and a site at each thruster."""
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint(name="vehicle")
     body.explicitinertial = True

@@ -99,9 +99,10 @@ def _faces(n_rows: int, n_cols: int) -> NDArray[np.int32]:
 def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Returns the texture of a tile with margins, and the texture coordinates of its nodes.
 
-    The margins repeat the texture of the neighbouring tiles. Filtering therefore reads the same texels on both sides of
-    a border, and no seam is visible. The tile's texture starts and ends at multiples of 16 texels of the terrain's
-    texture, which aligns the mip-map levels of adjacent tiles.
+    The margins repeat the texture of the neighbouring tiles or, beyond the terrain, the texels of its edge. Filtering
+    therefore reads the same texels on both sides of a border between tiles, and no seam is visible. The tile's texture
+    starts and ends at multiples of 16 texels of the terrain's texture, which aligns the mip-map levels of adjacent
+    tiles.
 
     Returns:
         (h, w, 3) uint8 texture; (nodes, 2) texture coordinates, 0 to 1, from the north-west corner of this texture.

@@ -85,7 +85,7 @@ def generate_from(
 
 
 def default_cover(kind: str) -> str:
-    """Returns the cover of a generated terrain of a kind whose cover is not given."""
+    """Returns the cover used for a kind of floor (a key of `DEFAULT_COVERS`) when the scenario chooses none."""
     return DEFAULT_COVERS[kind]
 
 

@@ -37,7 +37,8 @@ def read_geotiff(
         Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m]; vertical axis; position of
         the centre of the raster in its CRS, None if the file has no coordinates.
     Raises:
-        TwinError: the file cannot be read, is an image or too large, or its grid or one of its units is not supported.
+        TwinError: the file cannot be read, is an image or too large, or its grid or the unit of its heights is not
+            supported.
     """
     try:
         with warnings.catch_warnings():
@@ -49,10 +50,10 @@ def read_geotiff(
 
 
 def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
-    """Returns heights, grid spacing, vertical axis and position of an open file, as `read_geotiff` does.
+    """Returns heights, grid spacing, vertical axis and georeference of an open raster, as `read_geotiff` does.
 
     Raises:
-        TwinError: the file is an image, has too many heights, or its grid or one of its units is not supported.
+        TwinError: the file is an image, has too many heights, or its grid or the unit of its heights is not supported.
     """
     if source.count != 1 or source.dtypes[0] in ("uint8", "int8"):
         bands = f"{source.count} band(s) of {source.dtypes[0]}"

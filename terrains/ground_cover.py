@@ -1,7 +1,7 @@
-"""Materials of generated floors: sand, rubble, reef rock, algae, coral, seagrass and mud, with their structure.
+"""Materials of generated floors, such as sand, reef rock, algae, coral and seagrass, with their structure.
 
-A material is a ramp of colours from dark to bright, and a structure that moves each texel along this ramp: stones with
-dark gaps, cracks, polyps, blades, burrows or shells.
+A material is a ramp of colours from dark to bright, and a structure that moves each texel along this ramp: grains,
+stones with dark gaps, cracks, polyps, blades, burrows or shells.
 """
 
 from __future__ import annotations

@@ -23,11 +23,11 @@ class HeightGrid(NamedTuple):
     """Heights as read from a file.
 
     Args:
-        values: (ny, nx) elevations or depths in the unit of `axis`, row 0 = north, NaN in holes.
+        values: (ny, nx) elevations or depths in the unit of `axis`, row 0 = north, not finite in holes.
         spacing_m: grid spacing [m].
         axis: vertical axis as the file describes it.
-        georeference: position of the centre of the raster, with the zero of the vertical datum as z = 0; None if the
-            file has no coordinates.
+        georeference: position of the centre of the raster in its CRS, at the elevation 0; None if the file has no
+            coordinates.
     """
 
     values: NDArray[np.float64]
@@ -55,7 +55,8 @@ def load(
         seed: seed of the texture if it is generated.
         z: direction in which the values of the file increase; None: determined from the file.
     Raises:
-        TwinError: a file is missing, invalid or too large, or the direction of its values is not clear.
+        TwinError: a file is missing, invalid or too large, the direction of the heights is not clear, or the cover is
+            unknown.
     """
     read = read_heights(Path(height_file), height_spacing_m, height_range_m)
     upward_m = upward_sign(read.values, read.axis, z, Path(height_file)) * read.axis.metres_per_unit
@@ -91,8 +92,8 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
         height_spacing_m: grid spacing if the file does not contain one.
         height_range_m: height difference between white and black in a PNG.
     Raises:
-        TwinError: the file cannot be read, does not contain heights, is all NaN, has a single row or column, or has
-            more than MAX_NODES heights.
+        TwinError: the file is missing, cannot be read, contains no heights or no finite one, has a single row or
+            column or more than MAX_NODES heights, or its grid or unit is not supported.
     """
     if not file.is_file():
         raise TwinError(HEIGHT_FIELD, f"no such file {str(file)!r}", HEIGHT_FORMATS)
@@ -147,7 +148,8 @@ def _read_npy(file: Path) -> NDArray[np.float64]:
     """Reads the heights (rows, cols) of a .npy file [m].
 
     Raises:
-        TwinError: the file cannot be read, is too large, or is not a two-dimensional array of numbers other than uint8.
+        TwinError: the file cannot be read, is too large, or is not a two-dimensional array of real numbers other than
+            uint8.
     """
     try:
         array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read

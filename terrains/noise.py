@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 def fractal_field(
     shape: tuple[int, int], coarsest_px: float, gain: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Generates a fractional Brownian surface; octave k has wavelength coarsest_px / 2^k and amplitude gain^k.
+    """Generates an approximate fractional Brownian surface as a sum of octaves of interpolated random values.
+
+    The random values of octave k are coarsest_px / 2^k cells apart, at least one cell; its amplitude is gain^k.
 
     Args:
         shape: (rows, cols) of the field.
-        coarsest_px: wavelength of the coarsest octave [cells]; values below 2 count as 2.
+        coarsest_px: distance between the random values of the coarsest octave [cells]; below 2, it is 2.
         gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
         rng: random generator.
     Returns:
@@ -42,9 +44,8 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
     """Generates 8-bit pink noise.
 
     The random values of every octave have the same standard deviation, so an image of a floor with this texture shows
-    detail at any distance. Starting
-    with the coarsest octave, the field is repeatedly doubled in size and the next octave is added. The total
-    computing time is 4/3 of that of the finest octave.
+    detail at any distance. Starting with the coarsest octave, the field is repeatedly doubled in size and the next
+    octave is added. The total computing time is 4/3 of that of the finest octave.
 
     Args:
         shape: (rows, cols) of the result.
@@ -52,7 +53,7 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
         contrast: standard deviation of the random values of an octave, before interpolation [grey levels].
         rng: random generator.
     Returns:
-        (rows, cols) uint8 with mean 128.
+        (rows, cols) uint8 with a mean of about 128.
     """
     sizes = [tuple(-(-n // 2**k) for n in shape) for k in range(octaves)][::-1]
     value = np.full(sizes[0], 128, np.uint8)

@@ -37,12 +37,12 @@ def lay_orthophoto(
         texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
         file: the orthophoto.
         extent_m: extent of the floor along x and y; its centre is the origin of the scene.
-        georeference: position of the scene in the CRS of the DEM.
+        georeference: position of the scene in the CRS of the DEM; None if the DEM has no coordinates.
     Returns:
         Share of the texels that the orthophoto covers.
     Raises:
-        TwinError: the DEM has no coordinates, or the orthophoto is missing, invalid, too large or does not overlap
-            the DEM.
+        TwinError: the DEM has no coordinates, or no CRS although the orthophoto has one; or the orthophoto is missing,
+            invalid or too large, has no coordinates, or does not overlap the DEM.
     """
     if georeference is None:
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be placed: the DEM has no coordinates",
@@ -90,7 +90,7 @@ def _read(
     if source.crs is not None and floor_crs is None:
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is in {_name(source.crs)}, but the DEM names no CRS",
                         "a DEM with a CRS, or an orthophoto without one in the coordinates of the DEM")  # fmt: skip
-    target = floor_crs or CRS.from_epsg(3857)  # without any CRS both are in the same plane; its name has no effect
+    target = floor_crs or CRS.from_epsg(3857)  # without any CRS: both are taken to be in this one
     _check_overlap(source, file, target, array_bounds(shape[0], shape[1], grid))
     _check_resolution(source, file, target, grid)
     with WarpedVRT(
@@ -161,5 +161,5 @@ def _bounds(source: rasterio.DatasetReader, target: CRS) -> tuple[float, float, 
 
 
 def _name(crs: CRS) -> str:
-    """Returns the short name of a CRS, e.g. EPSG:32755."""
+    """Returns the EPSG code of a CRS, e.g. "EPSG:32755"; "a CRS of its own" if it has none."""
     return crs.to_string() if crs.to_epsg() else "a CRS of its own"

@@ -1,7 +1,7 @@
 """Textures without visible repetition from one photo: image quilting.
 
-The photo is cut into overlapping square blocks that are laid in rows. Each block is taken from a random place of the
-photo where the overlap agrees well with the blocks that are already laid, and is joined along the path of least
+The texture is filled with overlapping square blocks of the photo, row by row. Each block is taken from a random place
+of the photo where it agrees well with the previous blocks in the overlap, and is joined to them along the path of least
 difference through the overlap (Efros & Freeman 2001, Image quilting for texture synthesis and transfer, sec. 2).
 """
 
@@ -15,17 +15,17 @@ BLOCK_FRACTION = 5  #: shorter side of the photo divided by the side of a block
 OVERLAP_FRACTION = 4  #: side of a block divided by the overlap of neighbouring blocks
 CANDIDATES = 60  #: random places of the photo that are compared for each block
 TOLERANCE = 1.2  #: places whose difference is at most this many times the least one are equally likely
-LIGHTING_SAMPLES = 250_000  #: pixels of a photo to which its slow variation of brightness is fitted
+LIGHTING_SAMPLES = 250_000  #: approximate number of pixels to which the slow variation of brightness is fitted
 LIGHTING_ROWS = 128  #: rows of a photo that are divided by this variation at a time
 MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 
 
 def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Removes slow variations of brightness from a photo of a floor; its mean brightness remains.
+    """Removes slow variations of brightness from a photo of a floor; the mean brightness stays about the same.
 
-    The photo is divided by a polynomial of degree 2 in row and column, fitted by least squares to its brightness. Of a
-    large photo, about LIGHTING_SAMPLES pixels on a regular grid are fitted. The memory beyond photo and result is that
-    of the fitted pixels and of a few blocks of LIGHTING_ROWS rows.
+    The photo is divided by a polynomial of degree 2 in row and column, fitted by least squares to its brightness, and
+    multiplied by its mean brightness. In a large photo, the polynomial is fitted to about LIGHTING_SAMPLES pixels on a
+    regular grid. The memory beyond photo and result is that of these pixels and of a few blocks of LIGHTING_ROWS rows.
 
     Args:
         photo: (h, w, 3) uint8 RGB.
@@ -57,7 +57,7 @@ def _terms(v: NDArray[np.float32], u: NDArray[np.float32]) -> tuple[NDArray[np.f
 def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Makes a texture of any size from blocks of a photo, with the scale of the photo.
 
-    A texture that is not larger than the photo is a part of it.
+    A texture that has at most the rows and columns of the photo is its upper left part.
 
     Args:
         photo: (h, w, 3) uint8 RGB; h, w >= BLOCK_FRACTION * MIN_BLOCK_PX.

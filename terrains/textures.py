@@ -17,7 +17,7 @@ from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.errors import TwinError
 
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`
-_QUILT_SEED = 1  #: a floor from files is the same for every seed of a survey
+_QUILT_SEED = 1  #: a texture from a photo is the same for every seed of a survey
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def texture_from_photo(
 
 
 def _scaled(photo: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Returns a photo (h, w, 3) with rows and columns multiplied by a factor; unchanged if they are the same number."""
+    """Returns a photo (h, w, 3) with rows and columns multiplied by a factor and rounded."""
     rows, cols = (max(1, round(n * factor)) for n in photo.shape[:2])
     if (rows, cols) == photo.shape[:2]:
         return photo

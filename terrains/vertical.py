@@ -1,4 +1,4 @@
-"""Vertical axis of a height file: direction and unit of its values, read from the file or given by `terrain.z`."""
+"""Vertical axis of a height file: direction and unit of its values. `terrain.z` may give the direction."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class VerticalAxis(NamedTuple):
     Args:
         direction: direction of the axis of the vertical CRS or of the CF attributes; None if the file has neither.
         metres_per_unit: length of the unit; 1 if the file does not name one.
-        band_name: description or long name of the band.
+        band_name: description, long name or standard name of the band, the first that is given; "" if none is.
         texts: file name, names and tags that may name the quantity of the values.
         datum: name of the vertical CRS; "" if there is none.
     """
@@ -70,7 +70,7 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
     """Returns +1 if the values increase upwards, -1 if they are depths, which increase downwards.
 
     Args:
-        values: (rows, cols) values of the file, NaN in holes.
+        values: (rows, cols) values of the file, NaN in holes, but not everywhere.
         axis: vertical axis as the file describes it.
         asked: `terrain.z` of the scenario, which takes precedence; None: determined from the file.
         file: the file, for the error message.

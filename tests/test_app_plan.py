@@ -2,16 +2,18 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from twin.app import plan_summary
+from twin.app import expected_error, plan_summary
 from twin.app.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
-from twin.surrogate.error_model import ScatterLaw
+from twin.surrogate.error_model import BinningFactors, ScatterLaw
+from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 
 SMALL = ["terrain.texture_px_m=0.02", "plan.tracks=1", "plan.area_m=[2.0, 1.6]"]
@@ -70,6 +72,41 @@ def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2
     sigma_px = narrow.error.sigma_m / per_px
     assert np.ptp(sigma_px) < 1e-6 * sigma_px.mean()
     assert np.median(narrow.error.sigma_m) == pytest.approx(2 * np.median(wide.error.sigma_m), rel=0.02)
+
+
+FITTED = error_model_file.load()
+
+
+def _expected_over_a_flat_floor(binning, model, monkeypatch):
+    """Returns the expected error where the estimators bin the images, with a bound of 0.05 px of the matched images."""
+    mission = prepare(load_scenario("reef", [*SMALL, "terrain.kind=flat", "terrain.relief_m=0.0"]))
+    fitted = replace(FITTED, model=model)
+    monkeypatch.setattr(expected_error.error_model_file, "load", lambda _: fitted)
+    matching = SimpleNamespace(
+        binning=binning, depths_m=np.array([1.0, 3.0]), bounds_px=np.full(2, 0.05), lamp_share=1.0
+    )
+    monkeypatch.setattr(expected_error, "Matchability", lambda *_: matching)
+    return expected_error.expected_error(mission, forecast_over_floor(mission))
+
+
+@pytest.mark.parametrize(("binning", "law"), [(1, 0.4), (2, 0.5)])
+def test_the_expected_error_scatters_over_cells_by_the_share_of_the_error_model(binning, law, monkeypatch):
+    """The logarithm of the error, over a level floor at one depth, has the standard deviation 0.6 times the law."""
+    model = FITTED.model._replace(
+        depth_cell_scatter=ScatterLaw(0.4, 0.0), depth_binned_scatter=BinningFactors(0.5, 0.5), error_scatter_share=0.6
+    )
+    found = _expected_over_a_flat_floor(binning, model, monkeypatch)
+    assert np.log(found.sigma_m).std() == pytest.approx(0.6 * law, rel=0.01)  # 20,000 even quantiles
+
+
+def test_the_expected_error_of_binned_images_has_the_factor_of_the_error_model(monkeypatch):
+    """A pixel of binned images is two pixels wide, so the same error in pixels is twice as large in metres."""
+    none = BinningFactors(0.0, 0.0)
+    model = FITTED.model._replace(
+        depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_binned_scatter=none, depth_binned_error=BinningFactors(1.5, 2.0)
+    )
+    full, binned = (_expected_over_a_flat_floor(by, model, monkeypatch).sigma_m for by in (1, 2))
+    np.testing.assert_allclose(binned / full, 2 * 1.5, rtol=1e-9)
 
 
 def test_a_plan_on_the_plane_warns_of_the_overlap_that_the_floor_lacks(summary):

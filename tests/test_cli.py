@@ -78,6 +78,13 @@ def test_the_exit_status_depends_on_the_outcome_of_the_survey(twin_command, chan
     assert twin_command("run", "quickstart", outcome=result(**changes)).status == status
 
 
+@pytest.mark.parametrize(("command", "units"), [("look", ("[m]", "[m/s]", "[deg/s]")), ("export", ("[m]",))])
+def test_the_help_shows_units_in_brackets(twin_command, command, units):
+    """Unless they are escaped, Rich takes them for style tags and removes them."""
+    text = twin_command(command, "--help").out
+    assert all(unit in text for unit in units)
+
+
 def test_with_json_stdout_contains_nothing_else(twin_command):
     done = twin_command("run", "quickstart", "--json", outcome=result())
     assert json.loads(done.out) == METRICS

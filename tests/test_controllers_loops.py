@@ -144,6 +144,15 @@ def test_clearance_ignores_the_corners_of_the_square_but_not_the_inside_of_a_loo
     assert not least_clearance(p, lambda x, y: np.where(y > 4.8, np.nan, 0.0)).inside
 
 
+def test_clearance_covers_the_whole_loop_where_its_waypoints_are_farther_apart_than_an_image():
+    p = plan(area_m=(200.0, 200.0), altitude_m=0.5, tracks=1)  # waypoints 1.7 m apart, images 0.35 x 0.47 m
+
+    def ridge(x, y):  # crosses the loop, of radius 50 m about (50, 0), at its sides, where it runs along y
+        return np.where(np.abs(y - 0.87) < 0.1, 0.3, 0.0)
+
+    assert least_clearance(p, ridge).least_m == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

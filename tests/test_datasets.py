@@ -15,7 +15,7 @@ from twin.datasets import image_files
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
-from twin.datasets.frames import RecordedFrames
+from twin.datasets.frames import RecordedFrames, increasing
 from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, read_rgb
 from twin.datasets.readers import read_dataset
 from twin.datasets.rectification import rectification
@@ -217,9 +217,36 @@ def test_a_frame_that_cannot_be_used_is_skipped_and_counted(euroc):
     assert dict(frames.skipped) == {
         "left image: truncated": 1,
         "right image: missing": 1,
-        "time not after that of the frame before": 1,
+        "time out of order": 1,
         "left image: another size": 1,
     }
+
+
+@pytest.mark.parametrize(
+    ("times_s", "kept"),
+    [
+        ([9, 1, 2, 3], [1, 2, 3]),  # one wrong time at the start loses one frame, not all others
+        ([1, 9, 2, 3], [0, 2, 3]),
+        ([1, 1, 2, 2], [0, 2]),
+        ([1, 2, 3, 4, 5, 1, 2, 3], [0, 1, 2, 3, 4]),  # the clock was set back
+        ([1], [0]),
+    ],
+)
+def test_a_largest_set_of_frames_with_increasing_times_is_kept(times_s, kept):
+    assert np.flatnonzero(increasing(np.array(times_s, float))).tolist() == kept
+
+
+def test_the_number_of_bits_is_that_of_both_cameras(euroc):
+    """8 bits in the left images, 16 in the right ones: these must not be saturated."""
+    files = list((euroc / "mav0" / "cam1" / "data").iterdir())
+    for file in files:
+        cv2.imwrite(str(file), np.where(np.eye(*GRAY.shape) > 0, 255, cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)))
+    dataset, _ = read_dataset(euroc)
+    expected = [frame.right for frame in RecordedFrames(dataset, dataset.calibration)]
+    for file in files:
+        cv2.imwrite(str(file), cv2.imread(str(file)).astype(np.uint16) * 257)
+    found = [frame.right for frame in RecordedFrames(dataset, dataset.calibration)]
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_an_image_of_too_many_pixels_is_not_called_one_of_another_size(monkeypatch):
@@ -292,6 +319,13 @@ def test_times_of_a_plain_folder_come_from_its_list_or_from_the_names(tmp_path):
     dataset, _ = read_dataset(tmp_path / "a")
     np.testing.assert_allclose(np.diff([frame.time_s for frame in dataset.images]), 0.05, atol=1e-6)
     assert dataset.notes == ()
+
+
+def test_two_images_of_the_same_name_are_refused(tmp_path):
+    recorded.write_folder(tmp_path, frames_of(2))
+    cv2.imwrite(str(tmp_path / "right" / "0001.jpg"), GRAY)
+    with pytest.raises(TwinError, match=r"right: has several images called '0001' .*one suffix"):
+        read_dataset(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["../../../secret.png", "/etc/passwd", "a\0b"])

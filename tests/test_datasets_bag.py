@@ -171,7 +171,7 @@ def test_unpaired_late_and_unknown_images_are_counted(frames, tmp_path):
     assert found.skipped == {
         "right image without left image": 1,
         "right image: missing": 1,
-        "time not after that of the frame before": 1,
+        "time out of order": 1,
         "left image: encoding 'yuv999' is not supported": 1,
     }
 

@@ -76,6 +76,67 @@ def test_the_run_folder_is_that_of_a_survey(replayed):
     assert recording.write_recording(replayed.folder).is_file()
 
 
+def test_a_still_sequence_stays_in_place(tmp_path):
+    """Each frame is compared with the one keyframe, so noise does not add up; measured: 0.3 mm over 60 frames."""
+    still = np.repeat(PATH[:1], 20, axis=0)
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(still))
+    found = twin.replay(folder, tmp_path / "run", ReplayOptions(outputs=()))
+    moved_m = np.linalg.norm(found.result.final.positions - found.result.final.positions[0], axis=1)
+    assert found.status == "complete" and len(found.result.final) == 20 and moved_m.max() < 0.002
+
+
+def test_a_replay_without_a_tenth_of_its_frames_is_degraded(frames, tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", frames)
+    for name in ("0003.png", "0004.png"):
+        (folder / "left" / name).write_bytes(b"")
+    found = twin.replay(folder, tmp_path / "run", ReplayOptions(outputs=())).metrics
+    assert found["status"] == "degraded"
+    assert found["reason"] == "2 of 10 frames of the data set could not be used, see replay.skipped"
+
+
+class Known:
+    """Estimator of another package that knows the motion: the map must follow from its poses."""
+
+    def __init__(self, setup):
+        self.start, self.n = setup.start, 0
+
+    def update(self, frame):
+        self.n += 1
+        return self.start @ geometry.inverse(PATH[0]) @ PATH[frame.index]
+
+    def covariance(self):
+        return None
+
+    def finish(self):
+        return None
+
+
+class Broken(Known):
+    def update(self, frame):
+        return super().update(frame) if self.n < 4 else 1 / 0
+
+
+def test_an_estimator_of_another_package_replays(euroc, tmp_path):
+    options = ReplayOptions(outputs=(), estimator="test_datasets_replay:Known")
+    found = twin.replay(euroc, tmp_path / "run", options)
+    assert found.status == "complete" and found.metrics["trajectory"]["final"]["ate_max_m"] < 1e-6
+    assert "those of the plug-in test_datasets_replay:Known" in found.metrics["warning"]
+    assert len(found.result.keyframe_rows) >= 2 and len(found.result.links) == 0
+    height_m = found.elevation.height_m[np.isfinite(found.elevation.height_m)]
+    assert height_m.size > 1000 and np.ptp(np.percentile(height_m, [2, 98])) < 0.12  # hills of 0.1 m
+    assert load_run(tmp_path / "run").scenario["estimate"]["plugin"] == "test_datasets_replay:Known"
+
+
+def test_a_fault_of_an_estimator_of_another_package_is_named(euroc, tmp_path):
+    with pytest.raises(TwinError, match="--estimator: nothing: no installed package registers this name"):
+        twin.replay(euroc, tmp_path / "none", ReplayOptions(estimator="nothing"))
+    assert not (tmp_path / "none").exists()
+    options = ReplayOptions(outputs=(), estimator="test_datasets_replay:Broken")
+    found = twin.replay(euroc, tmp_path / "run", options).metrics
+    assert found["status"] == "aborted" and found["timing"]["frames"] == 4
+    assert "--estimator test_datasets_replay:Broken: update raised ZeroDivisionError" in found["reason"]
+
+
 def measured(tree, name=""):
     """Returns the names of the numbers in a tree of dictionaries and lists."""
     if isinstance(tree, dict | list):

@@ -395,11 +395,14 @@ def test_the_oldest_overlapping_node_is_linked_even_if_others_overlap_more():
     assert 0 in chosen_of(earlier, node, 3)
 
 
-def test_links_to_another_swath_are_spread_along_it():
-    second = along(1, np.arange(-0.6, 0.61, 0.15), 0.4)  # numbers 1 to 9, number 5 straight abeam
+@pytest.mark.parametrize("stride", [1, 3])
+def test_links_to_another_swath_are_spread_along_it(stride):
+    second = along(1, np.arange(-0.6, 0.61, 0.15), 0.4)  # nodes 1 to 9, node 5 straight abeam
     earlier, node = along(0, [0.1], 0.8) + second + away(10), over_flat_floor(13, 0.02, 0.0)
-    assert chosen_of(earlier, node, 4) == [0, 5, 7, 3]
-    assert chosen_of(earlier, node, 8) == [0, 5, 7, 3, 9, 1, 6, 4]  # no choice left: neighbours too
+    for key in [*earlier, node]:
+        key.number *= stride
+    assert chosen_of(earlier, node, 4) == [stride * k for k in [0, 5, 7, 3]]
+    assert chosen_of(earlier, node, 8) == [stride * k for k in [0, 5, 7, 3, 9, 1, 6, 4]]  # neighbours at last
 
 
 def test_links_of_one_node_together_have_the_information_of_one_link():
@@ -627,6 +630,17 @@ def test_after_alignment_the_online_covariance_is_that_of_the_last_node():
     carry = geometry.adjoint(geometry.inverse(turned[5]) @ turned[6])
     before = np.linalg.inv(carry) @ aligned @ np.linalg.inv(carry).T
     np.testing.assert_allclose(navigator.filter.cov, before + LINK_COV, rtol=1e-4, atol=1e-12)
+
+
+def test_a_track_without_keyframes_does_not_repeat_the_correction_of_the_online_pose():
+    """The current frame is the last keyframe, so the online pose is that of the keyframe after every alignment."""
+    poses = [scene.down_camera(0.1 * (k % 3), 0.0, 2.4) for k in range(9)]
+    navigator = navigated(Script(poses, rng=np.random.default_rng(2)), [1] * 9, use_f2m=False)
+    last = navigator.network.keyframes[-1]
+    assert np.abs(last.world_from_camera - navigator.log.online[-1]).max() > 1e-4
+    np.testing.assert_allclose(navigator.filter.world_from_camera, last.world_from_camera, atol=1e-12)
+    navigator.align_track(2)
+    np.testing.assert_allclose(navigator.filter.world_from_camera, last.world_from_camera, atol=1e-12)
 
 
 def test_resampling_error_of_the_mosaic_bounds_the_f2m_covariance():

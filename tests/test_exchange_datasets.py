@@ -201,6 +201,18 @@ def test_positions_are_in_the_crs_of_the_export(contents, tmp_path):
     assert item["image-datetime"] == "1970-01-01 00:00:00.600000"
 
 
+@pytest.mark.parametrize("replayed", [False, True])
+def test_an_ifdo_file_calls_the_images_of_a_replay_recorded(contents, tmp_path, replayed):
+    scenario = {"replay": {"dataset": "reef", "reader": "euroc"}} if replayed else {"lamps": [{"flux_lm": 1500.0}]}
+    (file, _) = ifdo.export(replace(contents, scenario=scenario), tmp_path)
+    header = json.loads(file.read_text())["image-set-header"]
+    origin = {key: json.dumps(value) for key, value in header.items() if "simulated" in json.dumps(value)}
+    keys = {"image-context", "image-abstract", "image-copyright", "image-platform", "image-sensor"}
+    assert set(origin) == (set() if replayed else keys) and keys <= set(header)
+    assert header["image-license"]["name"] == ("unknown" if replayed else "CC-BY-4.0")
+    assert header.get("image-illumination") == (None if replayed else "artificial light")
+
+
 def test_jpeg_is_written_on_request(contents, tmp_path):
     euroc.export(replace(contents, jpeg_quality=90), tmp_path)
     dataset, _ = read_dataset(tmp_path)

@@ -1,10 +1,13 @@
 """Map files: values and georeference survive a round trip; the mesh has the right axes, colours and triangles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rasterio
 import trimesh
 
+from twin.core import geometry
 from twin.core.grid_triangles import grid_triangles, raster_triangles
 from twin.core.records import ElevationMap, MapGrid
 from twin.exchange import geotiff, mesh
@@ -67,6 +70,14 @@ def test_the_mesh_has_the_colours_of_the_mosaic(elevation):
     surface = mesh.map_mesh(elevation)
     first = np.flatnonzero(np.isfinite(elevation.height_m).ravel())[0]
     np.testing.assert_array_equal(surface.visual.vertex_colors[0, :3], elevation.mosaic.reshape(-1, 3)[first])
+
+
+def test_the_mesh_of_a_tilted_rig_is_in_the_world(elevation, tmp_path):
+    pose = geometry.pose(geometry.so3_exp(np.array([np.deg2rad(60), 0, 0])), np.array([0.3, -0.2, 1.0]))
+    mesh.write_glb(tmp_path / "mesh.glb", replace(elevation, map_from_world=pose))
+    vertices = np.asarray(trimesh.load(tmp_path / "mesh.glb", force="mesh").vertices)
+    x, y, z = geometry.transform(pose, np.column_stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]])).T
+    np.testing.assert_allclose(z, 0.5 * x - 0.2 * y, atol=1e-5)
 
 
 def test_a_large_map_is_subsampled_and_an_empty_one_gives_an_empty_scene(elevation, tmp_path):

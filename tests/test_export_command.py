@@ -133,6 +133,19 @@ def test_a_damaged_list_of_frames_is_refused(tmp_path):
         run_contents(tmp_path)
 
 
+@pytest.mark.parametrize("kept", [0, 100])
+def test_a_truncated_file_of_true_poses_is_refused(kept, tmp_path):
+    with FrameRecorder(run_folder(tmp_path, Scenario()), "all") as recorder:
+        for k in range(3):
+            recorder.add(frame(k, True), np.eye(4), np.zeros(6))
+    poses = tmp_path / "frames" / "truth.npz"
+    poses.write_bytes(poses.read_bytes()[:kept])
+    true_layers = run_contents(tmp_path).true_layers
+    assert true_layers is not None
+    with pytest.raises(TwinError, match="truth.npz: cannot be read"):
+        true_layers()
+
+
 def test_the_scenario_key_record_does_not_change_the_fingerprint():
     assert Scenario(record="all").fingerprint() == Scenario().fingerprint() != Scenario(seed=1).fingerprint()
 
@@ -278,3 +291,13 @@ def test_a_truncated_list_of_frames_is_refused(recorded_run, tmp_path, kept, mes
     table.write_text("".join(lines[: int(kept)]) + (lines[3][:20] if kept % 1 else ""))
     with pytest.raises(TwinError, match=message):
         export(recorded_run, ["euroc"], tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["colmap", "nerfstudio", "ifdo", "metashape"])
+def test_images_of_a_killed_run_are_exported_and_formats_with_poses_are_refused(recorded_run, tmp_path, name):
+    """A process that is killed leaves images, but no trajectories."""
+    with pytest.raises(TwinError, match=rf"--to {name}: .* has neither a true nor a final trajectory"):
+        export(recorded_run, ["euroc", name], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (written,) = export(recorded_run, ["euroc"], tmp_path / "out")["euroc"]
+    assert len(list((written / "cam0" / "data").iterdir())) == 3

@@ -84,6 +84,16 @@ def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
     env.close()
 
 
+def test_a_step_lasts_to_the_next_planned_keyframe_over_the_drawn_floor():
+    """The plan keeps the overlap over the floor: 12 frames per keyframe with the seed of the scenario, 6 with this."""
+    env = make("terrain.kind=reef", "terrain.relief_m=0.8", "plan.altitude_m=1.2")
+    env.reset(seed=4)
+    *_, info = env.step(np.zeros(4, np.float32))
+    assert info["time_s"] == pytest.approx(6 / 10)
+    assert env.unwrapped.frames_per_step == 6
+    env.close()
+
+
 @pytest.mark.parametrize(("status", "corrected_m"), [("ok", 0.5), ("too few matches", 0.0)])
 def test_a_position_that_was_predicted_without_vision_is_not_corrected(status, corrected_m):
     """As in a survey: the deviation of a predicted position from the reference is unknown."""

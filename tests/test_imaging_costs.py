@@ -31,7 +31,7 @@ CASES = {
     "640x480, marine snow": ((*LARGE, "snow.density_per_m3=500"), 1.7),
     "640x480, all but snow and refraction, plain sensor": ((*LARGE, *EFFECTS), 2.8),
     "640x480, all but snow and refraction, [sensor]": ((*LARGE, *EFFECTS, "sensor.bits=12"), 2.9),
-    "640x480, everything": (EVERYTHING, 5.5),
+    "640x480, everything": (EVERYTHING, 4.0),
 }
 N_PAIRS, WARM_UP = 60, 10
 

@@ -1,10 +1,11 @@
 """Multiple scattering: energy, the kernels against closed forms and a random walk, and the image that is blurred."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.forward_scatter import ForwardScatter, level_sigma_px, place_of
+from twin.imaging.forward_scatter import ForwardScatter, _add_upsampled, level_sigma_px, place_of
 from twin.imaging.illumination import Illumination, daylight_at
 from twin.imaging.lamp_light import LampLight
 from twin.imaging.lamps import light_sources_in_camera
@@ -192,3 +193,15 @@ def test_mixtures_are_narrow_and_wide_enough_for_the_kernels():
     """The light within the narrowest and beyond half of the widest Gaussian of a lamp is below 10 %."""
     weights = lamp_mixture(Absorbed(0.06, 1.0, PETZOLD), (2.0,), "floor")[0]
     assert weights[0] < 0.1 * weights.sum() and weights[LAMP_SIGMA_RAD > 0.6].sum() < 0.2 * weights.sum()
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (7, 9), (8, 9), (7, 10), (3, 2), (2, 2)])
+def test_the_finest_level_is_upsampled_as_by_opencv(shape):
+    rng = np.random.default_rng(0)
+    small = rng.random(((shape[0] + 1) // 2, (shape[1] + 1) // 2, 3), np.float32)
+    light = rng.random((*shape, 3), np.float32)
+    expected = light + cv2.pyrUp(small, dstsize=shape[::-1])
+    flat = light.reshape(shape[0], -1)
+    for first, end in ((0, 1), (1, shape[0])):
+        _add_upsampled(small.reshape(len(small), -1), flat, first, end)
+    np.testing.assert_allclose(light, expected, atol=5e-7)  # values up to 2, rounded in single precision

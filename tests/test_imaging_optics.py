@@ -13,7 +13,7 @@ from twin.imaging.illumination import Illumination, daylight_at
 from twin.imaging.lamp_light import LampLight
 from twin.imaging.lamps import LED_BEAM, beam_share, colour, light_sources_in_camera
 from twin.imaging.light_spectra import spectrum_of
-from twin.imaging.optics import Optics, WaterSurface
+from twin.imaging.optics import FloorView, Optics, WaterSurface
 from twin.imaging.phase_function import henyey_greenstein
 from twin.imaging.water import (
     downwelling_per_m,
@@ -171,6 +171,28 @@ def test_the_direct_signal_agrees_with_the_formula(jerlov):
             lux = lux + strength / d**2 * (from_lamp[..., 2:] / d) * np.exp(-water.attenuation_per_m * d)
         expected = lux / np.pi * np.exp(-water.attenuation_per_m * range_m)
         np.testing.assert_allclose(direct, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("beam", [LED_BEAM, ((0.0, 1.0), (10.0, 0.5), (20.0, 0.05), (30.0, 0.0))])
+@pytest.mark.parametrize("jerlov", ["IB", "II", "3C"])
+def test_a_shadow_removes_the_unscattered_light_of_a_lamp(jerlov, beam):
+    """Scattered and all light are tables over angle and distance: within 0.5 % of all light in the brightest pixel."""
+    water = medium(WaterConfig(jerlov=jerlov))
+    lamp = LampConfig(position_m=(0.2, 0.3, 0.0), pan_deg=-8.0, beam=beam)
+    optics = optics_with(WaterConfig(jerlov=jerlov), (lamp,), DARK, scattering="full")
+    source = light_sources_in_camera(RIG, (lamp,), NO_DAYLIGHT, 0)
+    for depth_m in (0.8, 2.0, 4.0):
+        scene = floor(depth_m)
+        shape = scene[1].shape
+        views = [FloorView(lit=np.full((1, *shape), lit, np.uint8)) for lit in (1, 0)]
+        lit, dark = (optics.parts(*scene, 0, view).direct for view in views)
+        points = rays() * (depth_m / rays()[..., 2:])
+        from_lamp = points - source.position_m[0]
+        d = np.linalg.norm(from_lamp, axis=-1)[..., None]
+        strength = lamp.intensity_cd * beam_share((from_lamp / d) @ source.axis[0], np.array(beam))[..., None]
+        lux = strength / d**2 * (from_lamp[..., 2:] / d) * np.exp(-water.attenuation_per_m * d)
+        expected = lux / np.pi * np.exp(-water.attenuation_per_m * np.linalg.norm(points, axis=-1)[..., None])
+        assert (np.abs(lit - dark - expected) < 5e-3 * lit.max(axis=(0, 1))).all()
 
 
 def test_daylight_is_attenuated_by_kd_and_depth_below_the_surface():

@@ -93,16 +93,6 @@ def test_rows_equal_those_of_images_rendered_from_the_poses_of_the_rows(twist):
     assert np.abs(rolled - still).max() > 0.1
 
 
-def test_every_fourth_pixel_has_the_exposure_time_of_its_row():
-    """The middle of the sampled rows is half a row from that of the image: 0.5 px / 240 px of the whole motion."""
-    depth = depth_of(FLOOR_PER_M)
-    motion = ExposureMotion(TWISTS[3], 0.0, READOUT_S)
-    light = texture(floor_points(depth))
-    whole, coarse, still = (CAMERAS.sample(light, depth, 0, *of) for of in ((1, motion), (4, motion), (4, None)))
-    np.testing.assert_allclose(coarse, whole[2::4, 2::4], atol=0.01)
-    assert np.abs(coarse - still).max() > 0.1
-
-
 def test_without_motion_rays_are_sampled_at_their_intersections():
     depth = depth_of(FLOOR_PER_M)
     light = np.random.default_rng(0).random((*depth.shape, 3), np.float32)

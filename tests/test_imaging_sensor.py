@@ -144,6 +144,31 @@ def test_left_images_do_not_depend_on_the_use_of_the_right_camera(sensor):
         np.testing.assert_array_equal(a.left, c.left)
 
 
+def test_frames_after_the_first_meter_the_light_of_their_left_image():
+    """The first frame is exposed for its own light at rest, the others for that of the frames before."""
+    camera = camera_of(small(PHYSICAL))
+    sensor, exposed, metered = camera._sensor, [], []
+    image, meter = sensor.image, sensor.meter
+    sensor.image = lambda light, setting, rng: exposed.append(light) or image(light, setting, rng)
+    sensor.meter = lambda light: metered.append(light) or meter(light)
+    for _ in range(3):
+        camera.capture(DOWN, False, MOVING)
+    assert len(metered) == len(exposed) == 3 and metered[1] is exposed[1] and metered[2] is exposed[2]
+    assert metered[0] is not exposed[0]
+    np.testing.assert_allclose(metered[0].mean(axis=(0, 1)), exposed[0].mean(axis=(0, 1)), rtol=0.05)
+
+
+@pytest.mark.parametrize("sensor", [None, PHYSICAL | {"white_balance": "grey_world"}])
+def test_the_exposure_of_the_next_frame_is_known_before_it_is_metered(sensor):
+    scenario, rng = small(sensor), np.random.default_rng(3)
+    model = sensor_of(scenario)
+    assert model.setting is None
+    for k in range(4):
+        known, light = model.setting, rng.gamma(2, 20 * (k + 1), (48, 64, 3)).astype(np.float32)
+        setting = model.meter(light)
+        assert known is None if k == 0 else known == setting
+
+
 def test_the_plain_sensor_ignores_motion():
     scenario = small()
     light = ImageFormation(scenario, illumination_of(scenario), FLAT, None)

@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +16,14 @@ from twin import cli, survey
 from twin.app import doctor
 from twin.app.termination import sigterm_as_interrupt
 from twin.core.interrupts import StageGuard
+from twin.core.timing import Stopwatch
 from twin.estimate.pipeline import Navigator
 from twin.exchange import mesh
 from twin.report import recording, survey_page
 from twin.report.run_folder import load_run
+from twin.report.run_writer import RunFolder, SurveyRecord
 from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
 
 SMALL = [
     'imaging.fidelity="surrogate"',
@@ -106,6 +110,23 @@ def test_an_interrupt_ends_only_the_current_stage(tmp_path, monkeypatch, stage):
     assert metrics["timing"]["frames"] > 50
     aligned = [line for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines() if '"aligned"' in line]
     assert len(aligned) == (1 if stage == "alignment" else 2)  # of the track, and of all keyframes
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_an_interrupt_of_the_map_files_keeps_an_orthomosaic_that_was_finished(tmp_path, monkeypatch, finished):
+    def interrupted(folder, _):
+        (folder.path / "dem.tif").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunFolder, "_write_trajectories", lambda *_: None)
+    monkeypatch.setattr(RunFolder, "_write_maps", interrupted)
+    result: Any = None
+    metrics = {"status": "complete", "reason": ""}
+    with RunFolder(tmp_path, Scenario(), ()) as folder:
+        (tmp_path / "mosaic.tif").touch()
+        record = SurveyRecord(result, None, None, None, Stopwatch(), metrics, has_orthomosaic=finished)
+        assert folder.finish(record, StageGuard())["reason"] == "interrupted; maps skipped"
+    assert {file.name for file in tmp_path.glob("*.tif")} == ({"mosaic.tif"} if finished else set())
 
 
 def test_an_interrupted_flight_and_an_interrupted_map_are_both_named(tmp_path, monkeypatch):

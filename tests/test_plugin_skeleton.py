@@ -1,5 +1,6 @@
 """`twin new-plugin` writes packages that are installed by pip and fly."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -37,6 +38,16 @@ def test_a_new_plugin_is_installed_by_pip_and_passes_its_own_test(tmp_path, kind
     run_tests(folder, tmp_path / "site")
 
 
+def test_the_readme_of_a_new_plugin_names_the_commands_that_use_it(tmp_path):
+    for kind, command in (
+        ("estimator", "twin replay DATASET --estimator my_plugin"),
+        ("reader", "twin replay DATASET"),
+    ):
+        skeleton.write(kind, tmp_path / kind / "my_plugin")
+        readme = (tmp_path / kind / "my_plugin" / "README.md").read_text()
+        assert readme.splitlines()[-1].strip() == command and f"Plug-in ({kind}) for" in readme
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["estimator", "terrain"])
 def test_a_new_estimator_and_a_new_terrain_fly(tmp_path, kind):
@@ -59,6 +70,18 @@ def test_a_folder_that_names_no_package_is_refused(tmp_path, folder, message):
     with pytest.raises(TwinError, match=message):
         skeleton.write("terrain", tmp_path / folder)
     assert not (tmp_path / folder).exists()
+
+
+def test_a_calibration_that_the_new_reader_cannot_read_may_be_replaced_by_the_user(tmp_path):
+    """As the interface `Reader` demands, an error in the calibration is returned, not raised."""
+    skeleton.write("reader", tmp_path / "pairs_reader")
+    spec = importlib.util.spec_from_file_location("made", tmp_path / "pairs_reader" / "pairs_reader" / "__init__.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    (tmp_path / "pairs.csv").write_text("time_s,left,right\n0.0,l0.png,r0.png\n")
+    dataset = module.Reader().read(tmp_path)
+    assert len(dataset.images) == 1
+    assert isinstance(dataset.calibration, TwinError) and "calibration.yaml" in str(dataset.calibration)
 
 
 def test_a_word_that_is_no_kind_is_refused():

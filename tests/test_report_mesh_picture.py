@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,16 @@ GRID = MapGrid(-2.0, 1.5, 0.05, 60, 80)
 ASPECT = mesh_picture.WIDTH_PX / mesh_picture.HEIGHT_PX
 
 
-def write_surface(file: Path, height_m: np.ndarray) -> Path:
-    """Writes the mesh of a map that is red in the west and green in the east."""
+def elevation(height_m: np.ndarray, map_from_world: np.ndarray) -> ElevationMap:
+    """Returns a map that is red in the west and green in the east."""
     colours = np.zeros((*height_m.shape, 3), np.uint8)
     colours[:, :40, 0], colours[:, 40:, 1] = 200, 200
-    mesh.write_glb(file, ElevationMap(GRID, height_m.astype(np.float32), np.full_like(height_m, 0.01), colours))
+    return ElevationMap(GRID, height_m.astype(np.float32), np.full_like(height_m, 0.01), colours, map_from_world)
+
+
+def write_surface(file: Path, height_m: np.ndarray) -> Path:
+    """Writes the mesh of `elevation` in the world."""
+    mesh.write_glb(file, elevation(height_m, np.eye(4)))
     return file
 
 
@@ -37,6 +43,22 @@ def test_the_picture_has_the_colours_of_the_mosaic_with_west_on_the_left(picture
     west, east = (red > 100) & (green < 50) & (blue < 50), (green > 100) & (red < 50) & (blue < 50)
     assert west.mean() > 0.2 and east.mean() > 0.2
     assert np.average(columns, weights=west.sum(axis=0)) < np.average(columns, weights=east.sum(axis=0)) - 200
+
+
+def test_the_mesh_of_a_tilted_rig_is_shown_in_the_frame_of_its_map(monkeypatch, tmp_path):
+    height_m = np.random.default_rng(0).normal(size=(60, 80))
+    pose = geometry.pose(geometry.so3_exp(np.array([1.2, -0.3, 0.5])), np.array([0.3, -0.2, 1.0]))
+    plain, tilted = (mesh.map_mesh(elevation(height_m, turned)).vertices for turned in (np.eye(4), pose))
+    assert np.abs(tilted - plain).max() > 1
+    np.testing.assert_allclose(mesh_picture.in_map_frame(tilted, pose), plain, atol=1e-6)
+
+    shown = {}
+    monkeypatch.setattr("twin.report.survey_page.surface_picture", shown.__setitem__)
+    (tmp_path / "keyframes").mkdir()
+    (tmp_path / "keyframes" / "index.json").write_text(json.dumps({"map_from_world": pose.tolist()}))
+    (tmp_path / "scenario.resolved.toml").write_text("")
+    write_report(tmp_path)
+    np.testing.assert_array_equal(shown[tmp_path / "mesh.glb"], pose)
 
 
 def test_slopes_facing_north_west_are_brighter():
@@ -68,7 +90,7 @@ def test_the_report_shows_the_surface_unless_rendering_fails(picture, tmp_path, 
     mesh_file = write_surface(tmp_path / "mesh.glb", np.zeros((60, 80)))
     (tmp_path / "scenario.resolved.toml").write_text("")
     with monkeypatch.context() as patch:
-        patch.setattr("twin.report.survey_page.surface_picture", {mesh_file: picture}.__getitem__)
+        patch.setattr("twin.report.survey_page.surface_picture", lambda file, _: {mesh_file: picture}[file])
         assert '<section id="surface">' in write_report(tmp_path).read_text()
     monkeypatch.setenv("PYOPENGL_PLATFORM", "no such platform")
     page = write_report(tmp_path).read_text()

@@ -1,6 +1,7 @@
 """Rerun recording: it has every entity on both timelines and stays small."""
 
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from judge_synthetic import SCENARIO, survey, write_folder
 from rerun.chunk import RrdReader
 
 from twin.core import geometry
-from twin.core.records import Estimate, Frame, MapGrid, Readings
+from twin.core.records import Estimate, Frame, MapGrid, Readings, StereoRig, Trajectory
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.report import recording, recording_surfaces
@@ -81,6 +82,51 @@ def test_every_triangle_of_the_map_appears_once_and_none_covers_a_hole(folder):
     whole = surface.points[surface.triangles[(group[surface.triangles] < 2).all(axis=1)]].reshape(-1, 9)
     assert len(shown) == len(whole) > 10_000
     np.testing.assert_array_equal(shown[np.lexsort(shown.T)], whole[np.lexsort(whole.T)])
+
+
+def test_a_map_in_the_plane_of_a_tilted_rig_is_shown_in_the_world(folder, tmp_path):
+    """The same survey in a world turned by 120 degrees: as many parts of the map appear, where the cameras see them."""
+    run, rig = load_run(folder), SCENARIO.believed_rig()
+    map_from_world = geometry.pose(geometry.so3_exp(np.array([2.1, 0.0, 0.0])), np.array([0.5, -2.0, 1.0]))
+    paths = {
+        name: Trajectory(path.times_s, geometry.inverse(map_from_world) @ path.world_from_camera)
+        for name, path in run.trajectories.items()
+    }
+    turned = replace(run, trajectories=paths, keyframes=run.keyframes._replace(map_from_world=map_from_world))
+    parts = []
+    for number, shown in enumerate((run, turned)):
+        stream = rr.RecordingStream("map_test")
+        stream.save(tmp_path / f"{number}.rrd")
+        recording.log_map(stream, shown, rig)
+        stream.flush()
+        stream.disconnect()
+        parts.append({name for name in contents(tmp_path / f"{number}.rrd") if name.startswith("/world/map/")})
+    assert parts[0] == parts[1] and len(parts[0]) > 10
+
+
+def test_a_surface_in_the_world_keeps_its_angles_between_normals_and_edges():
+    height = np.random.default_rng(0).normal(0, 0.1, (8, 9))
+    surface = recording_surfaces.floor_surface(Raster(MapGrid(0, 0, 0.5, 8, 9), height))
+    map_from_world = geometry.pose(geometry.so3_exp(np.array([0.3, -1.2, 0.7])), np.array([0.5, -2.0, 1.0]))
+    turned = recording_surfaces.in_world(surface, map_from_world)
+    np.testing.assert_allclose(geometry.transform(map_from_world, turned.points), surface.points, atol=1e-12)
+    edges, turned_edges = (s.points[s.triangles[:, 1]] - s.points[s.triangles[:, 0]] for s in (surface, turned))
+    first = surface.triangles[:, 0]
+    np.testing.assert_allclose(
+        (turned_edges * turned.normals[first]).sum(1), (edges * surface.normals[first]).sum(1), atol=1e-12
+    )
+
+
+def test_the_camera_model_of_an_upright_image_has_the_size_of_the_logged_image():
+    """480 x 640 px become 240 x 320 px, as the longest side of a logged image is 320 px."""
+    logged = {}
+
+    class Stream:
+        def log(self, entity, *components, static):
+            logged[entity] = components[-1]
+
+    recording.log_rig(Stream(), StereoRig(480, 640, 500.0, 0.1))  # pyright: ignore[reportArgumentType]
+    assert logged["world/rig/left"].resolution.as_arrow_array().to_pylist() == [[240, 320]]
 
 
 @pytest.mark.parametrize("most_px", [10**6, 5000, 900])

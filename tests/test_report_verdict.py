@@ -231,6 +231,13 @@ def test_a_scenario_with_every_effect_idealises_nothing():
     assert idealisations(load_scenario("reef", REAL)) == []
 
 
+@pytest.mark.parametrize("key", ["absorption", "scattering"])
+def test_water_whose_given_coefficients_are_zero_is_ideal(key):
+    given = {"absorption": "[0.1,0.1,0.1]", "scattering": "[0.1,0.1,0.1]", key: "[0,0,0]"}
+    values = [f"water.{name}_per_m={value}" for name, value in given.items()]
+    assert idealisations(load_scenario("reef", [*REAL, *values])) == [f"The water is ideal: no {key}."]
+
+
 @pytest.mark.parametrize("override", REAL)
 def test_each_effect_removes_its_own_phrase(override):
     without = idealisations(load_scenario("reef", [other for other in REAL if other != override]))

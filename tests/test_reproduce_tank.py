@@ -9,7 +9,7 @@ import pytest
 from twin.core import geometry
 from twin.core.records import SurveyResult, Trajectory
 from twin.reproduce import tank_survey
-from twin.reproduce.tank import TABLES, flagged_share, sizes_table
+from twin.reproduce.tank import TABLES, TITLES, flagged_share, sizes_table
 from twin.reproduce.tank_path import N_LOOP, STEP_M, lawnmower_path, two_loops_path
 from twin.reproduce.tank_scene import OBJECTS, tank_floor
 from twin.reproduce.tank_sizes import measure, true_size
@@ -67,6 +67,14 @@ def test_the_closure_error_is_the_distance_between_a_repeated_frame_and_the_firs
     found = closures(result, (30, 60))
     np.testing.assert_allclose([c[1:] for c in found], [[0.015, 0.003, 0], [0.030, 0.006, 0]], atol=1e-12)
     assert [c.frame for c in found] == [31, 61]
+
+
+def test_the_two_loops_touch_at_the_start_without_crossing():
+    """They lie on either side of the line through the start, along which both begin."""
+    first, second = two_loops_path(1).planned_m[: N_LOOP + 1], two_loops_path(1).planned_m[N_LOOP:]
+    assert first[1:-1, 0].min() > 1e-3 and second[1:-1, 0].max() < -1e-3
+    np.testing.assert_allclose(first[[0, -1], 0], 0, atol=1e-12)
+    assert "touch at the start" in TITLES["tank2"]
 
 
 @pytest.mark.parametrize("path", [lawnmower_path(130, 1), two_loops_path(1)], ids=["legs", "loops"])

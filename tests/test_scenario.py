@@ -113,7 +113,10 @@ BAD_FILES = [
     ),
     (
         '[terrain]\nkind = "lava"',
-        ["2: terrain.kind: 'lava': not allowed (allowed: 'flat', 'ripples', 'fractal', 'reef', 'cliffs' or 'file')"],
+        [
+            "2: terrain.kind: 'lava': not allowed "
+            "(allowed: 'flat', 'ripples', 'fractal', 'reef', 'cliffs', 'file' or 'mesh')"
+        ],
     ),
     ('[require]\n"map.le90_m" = "x"', ["2: require.map.le90_m: 'x': not allowed (allowed: a number)"]),
     (
@@ -127,6 +130,15 @@ BAD_FILES = [
     ('extends = "bad.toml"', ["1: extends: the file extends itself (allowed: another file)"]),
     ("seed = 3\n[calibration]\nfocal_error = 0.1", ["2: calibration: renamed to calibration_error"]),
     ("calibration.focal_error = 0.1", ["1: calibration: renamed to calibration_error"]),
+    (
+        "[plan]\narea_m = ['4', true]",
+        [
+            "2: plan.area_m.0: '4': not allowed (allowed: a number)",
+            "2: plan.area_m.1: True: not allowed (allowed: a number)",
+        ],
+    ),
+    ("[terrain]\ntexture_px_m = '0.01'", ["2: terrain.texture_px_m: '0.01': not allowed (allowed: a number)"]),
+    ("[require]\n'map.le90_m' = '1'", ["2: require.map.le90_m: '1': not allowed (allowed: a number)"]),
     (
         '[calibration]\n[imaging]\ncalibration = "x.toml"',
         [
@@ -177,6 +189,8 @@ BAD_OVERRIDES = [
     ("name.x=3", "--set name.x=3: name is a value, not a section"),
     ("lamps.0.intensity_cd=-1", "--set: lamps.0.intensity_cd: -1: not allowed (allowed: greater than or equal to 0)"),
     ("lamps.tilt_deg=1", "--set lamps.tilt_deg=1: an item of the list must be named, as in lamps.0.tilt_deg=..."),
+    ("lamps.².tilt_deg=1", "--set lamps.².tilt_deg=1: no item ² (allowed: 0 to 1)"),
+    ("lamps.0=1", "--set lamps.0=1: an item cannot be replaced (allowed: a key of an item, or lamps=[...])"),
 ]
 
 
@@ -339,6 +353,14 @@ def test_a_renamed_key_is_reported_in_the_base_file_that_contains_it(tmp_path):
     with pytest.raises(ScenarioError) as raised:
         load_scenario(written(tmp_path, 'extends = "base.toml"', "top.toml"))
     assert raised.value.lines == [f"{base}:2: calibration: renamed to calibration_error"]
+
+
+@pytest.mark.parametrize(("text", "line"), [("imaging = {calibration = 'x'}", 3), ("calibration.focal_error = 0.1", 1)])
+def test_a_renamed_key_is_reported_in_a_long_file_that_is_not_searched_for_every_key(tmp_path, text, line):
+    file = written(tmp_path, f"#{'-' * 50_000}\n\n{text}")
+    with pytest.raises(ScenarioError, match=rf"bad.toml:{line}: (imaging.)?calibration: renamed to ") as raised:
+        load_scenario(file)
+    assert len(raised.value.lines) == 1
 
 
 def test_an_error_in_a_base_file_is_reported_there_even_where_the_file_on_top_has_the_section(tmp_path):

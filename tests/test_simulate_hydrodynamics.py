@@ -181,9 +181,13 @@ def test_a_frame_is_a_whole_number_of_physics_steps(rate_hz):
     assert v.time_s == pytest.approx(1 / rate_hz)
 
 
-def test_a_fraction_of_a_physics_step_is_rejected():
-    with pytest.raises(ValueError, match="not a whole number of timesteps"):
-        vehicle().step(IDLE, 0.3 * STEP_S)
+@pytest.mark.parametrize("steps", [0.3, 1.5])
+def test_a_fraction_of_a_physics_step_is_rejected(steps):
+    for body in (vehicle(), CompiledVehicle(VehicleConfig(), np.zeros(3), np.eye(4), STEP_S)):
+        start = body.world_from_body
+        with pytest.raises(ValueError, match="not a whole number of timesteps"):
+            body.step(IDLE, steps * STEP_S)
+        np.testing.assert_array_equal(body.world_from_body, start)
 
 
 def test_the_compiled_vehicle_moves_as_mujoco_does():

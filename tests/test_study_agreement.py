@@ -105,6 +105,12 @@ def test_metrics_are_compared_only_between_both_fidelities(tmp_path):
         study_of(tmp_path, GATE, ('["rendered", "surrogate"]', '["surrogate"]'))
 
 
+def test_a_metric_that_can_be_negative_has_no_ratio_and_is_refused(tmp_path):
+    signed = ('compare = ["map.le90_m", ', 'compare = ["map.bias_m", "orthomosaic.bias_east_m", ')
+    with pytest.raises(ScenarioError, match=r"compare: map.bias_m can be negative.*\n.*orthomosaic.bias_east_m can be"):
+        study_of(tmp_path, GATE, signed)
+
+
 def test_a_study_without_compare_has_no_agreement(tmp_path):
     analysis = analyse(tmp_path)
     analysis.study = analysis.study.model_copy(update={"compare": ()})

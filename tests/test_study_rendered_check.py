@@ -12,7 +12,7 @@ from twin.study.flight import row_of
 from twin.study.progress import StudyProgress
 from twin.study.rendered_check import FOLDER, RenderedCheck, check, nearest_surveys, summary
 from twin.study.results_log import ResultsLog
-from twin.study.surveys import surveys
+from twin.study.surveys import refusals, surveys
 
 STUDY = """
 scenario = "reef"
@@ -96,6 +96,26 @@ def test_rendered_surveys_have_scenario_and_seed_of_their_surrogate_surveys_and_
     again = Calls(lambda survey: row_with(survey, 0.0199))
     assert check(study, analysis, 6, tmp_path, again, StudyProgress()).rendered.all()
     assert again.flown == []
+
+
+def test_a_study_with_refused_samples_is_checked(tmp_path):
+    """About half of the altitudes are negative, so that the scenarios of these samples are not valid."""
+    text = STUDY.replace("water.turbidity = { log_uniform = [1.0, 4.0] }", "plan.altitude_m = { uniform = [-2, 2] }")
+    study, log = study_of(tmp_path, text), ResultsLog(tmp_path)
+    refused = refusals(study)
+    assert 0 < len(refused) < 12
+    for survey in surveys(study, tmp_path, without=refused):
+        log.add(row_with(survey, 0.019))
+    engine = Calls(lambda survey: row_with(survey, 0.0199))
+    checked = check(study, StudyAnalysis(log.table(), study), 12, tmp_path, engine, StudyProgress())
+    assert len(checked.rendered) == len(engine.flown) == 12 - len(refused)
+
+
+def test_a_check_whose_rendered_surveys_all_failed_says_so(tmp_path):
+    study, analysis = analysed(tmp_path)
+    engine = Calls(lambda survey: row_of(survey, "failed", "disk full"))
+    checked = check(study, analysis, 6, tmp_path, engine, StudyProgress())
+    assert checked.exit_status == 1 and "6 rendered surveys were refused or failed" in checked.sentence()
 
 
 class Interrupted(Calls):

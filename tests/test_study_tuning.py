@@ -8,10 +8,11 @@ from study_surveys import SerialEngine, study_of
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import load_scenario
 from twin.study import tuning_report
-from twin.study.candidates import Candidate, CandidateSurveys, pareto_front, tuning_config
+from twin.study.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
 from twin.study.flight import row_of
 from twin.study.progress import StudyProgress
 from twin.study.statistics import wilson_interval
+from twin.study.surveys import refusals
 from twin.study.tuning import tune
 
 TUNING = """
@@ -132,6 +133,19 @@ def test_a_plan_without_sampled_keys_is_confirmed_with_as_many_different_surveys
     assert len({survey.scenario_hash for survey in surveys}) == len(surveys) == 4  # tune.confirm
 
 
+@pytest.mark.filterwarnings("error")  # scipy warns if a Sobol design has another number of points
+@pytest.mark.parametrize(("method", "n_search"), [("sobol", 2), ("saltelli", 6), ("lhs", 2)])
+@pytest.mark.parametrize("factor", [3, 4])
+def test_a_plan_is_confirmed_with_a_multiple_of_the_surveys_of_the_search(method, n_search, factor, tmp_path):
+    text = TUNING.replace('"lhs"', f'"{method}"').replace("trials = 24", f"confirm = {factor}")
+    study = study_of(tmp_path, text)
+    searched = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    assert searched.n_surveys == n_search
+    surveys = list(searched.confirmation(()).surveys(0, {"plan.altitude_m": 2.0, "estimate.node_stride": 1}))
+    assert len({survey.scenario_hash for survey in surveys}) >= 2 * factor
+    assert len(surveys) == factor * n_search
+
+
 def test_failed_surveys_are_not_counted_and_flown_again(evaluate):
     failed = {"status": "failed", "map.le90_m": 1.0, "require.map.le90_m.passed": False}
     candidate, again = evaluate({}, failed, {}, {}, {})
@@ -197,6 +211,16 @@ def test_an_error_of_the_search_is_reported_with_its_line(tmp_path, old, new, me
     with pytest.raises(ScenarioError) as error:
         search(study_of(tmp_path, TUNING, (old, new)), tmp_path / "out")
     assert any(line.startswith(f"{tmp_path / 'study.toml'}:{message}") for line in error.value.lines), error.value.lines
+
+
+def test_a_search_starts_although_its_first_sample_is_refused(tmp_path):
+    changes = ("uniform = [4.0, 6.0]", "grid = [-4.0, 6.0]"), ('method = "lhs"\nsamples = 2', "seeds = 1")
+    study = study_of(tmp_path, TUNING, *changes)
+    assert list(refusals(study)) == [0]
+    check_bounds(study, tuning_config(study))
+    with pytest.raises(ScenarioError, match=r"plan.altitude_m: -1.5: not allowed"):
+        other = study_of(tmp_path, TUNING, *changes, ("[1.5, 3.0]", "[-1.5, 3.0]"))
+        check_bounds(other, tuning_config(other))
 
 
 def test_a_study_without_a_search_is_rejected(tmp_path):

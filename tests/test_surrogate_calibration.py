@@ -7,6 +7,7 @@ import pytest
 
 from twin import survey
 from twin.app import study_command
+from twin.core import geometry
 from twin.core.records import StereoObservation
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, TwinError
@@ -198,6 +199,26 @@ SPARSE = ["plan.overlap_along=0.3", 'plan.overlap_reference="plane"']
 
 def world(*sets, fitted=None):
     return SurrogateWorld(prepare(scenario(*sets)), Stopwatch(), fitted or error_model_file.load())
+
+
+@pytest.mark.parametrize("name", ["focal", "distortion", "flat port"])
+def test_beacons_are_detected_where_the_true_cameras_image_them(name):
+    """The noise of both surveys is the same, so that it cancels."""
+    beacons = ['navigation.aiding=["beacons"]', "beacons=[{position_m=[-0.4,-0.7,0.3]},{position_m=[-1.2,-0.3,0.6]}]"]
+    pixels = []
+    for sets in ((), ERRORS[name]):
+        made = world(*beacons, *sets)
+        first = made.mission.planned_frames(1)
+        made.start_sequence(first, 1)
+        detected = made.observe(first[0]).readings.beacons
+        assert detected is not None and [beacon.beacon for beacon in detected] == [0, 1]
+        pixels.append(np.array([beacon.pixel for beacon in detected]))
+    cameras = made.mission.true_cameras
+    surveyed = np.array([beacon.position_m for beacon in made.mission.scenario.beacons])
+    points_m = geometry.transform(geometry.inverse(made.world_from_camera), surveyed)
+    expected = cameras.project(points_m) - made.mission.rig.project(points_m)
+    assert np.abs(expected).max() > 0.02
+    np.testing.assert_allclose(pixels[1] - pixels[0], expected, atol=1e-9)
 
 
 def test_a_survey_outside_the_fit_is_refused_with_quantity_value_and_range():

@@ -32,7 +32,7 @@ def fly(out: Path, *overrides: str, progress=lambda _: None, report=False) -> su
     """Flies a small survey; report and recording, which take longer than the flight, are written where asked for."""
     scenario = scenario_file.load_scenario("reef", [*SMALL, *overrides])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twin.report.survey_page.surface_picture", lambda _: None)
+        patch.setattr("twin.report.survey_page.surface_picture", lambda *_: None)
         return survey.run(scenario, out, progress, outputs=OPTIONAL_OUTPUTS if report else ())
 
 

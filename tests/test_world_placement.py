@@ -128,7 +128,16 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "content", ["{", "[]", "7", '{"type": "Point"}', '{"type": "Polygon", "coordinates": [[[1]]]}']
+    "content",
+    [
+        "{",
+        "[]",
+        "7",
+        '{"type": "Point"}',
+        '{"type": "Polygon", "coordinates": [[[1]]]}',
+        '{"type": "Polygon", "coordinates": {"ring": []}}',
+        '{"type": "FeatureCollection", "features": {"first": {}}}',
+    ],
 )
 def test_a_damaged_geojson_file_is_an_error(dem, tmp_path, content):
     (tmp_path / "bad.geojson").write_text(content)

@@ -44,6 +44,18 @@ def raised(height_m):
     return floor(lambda x, y: np.full_like(x, height_m))
 
 
+@pytest.mark.parametrize("height", ["plane", "floor"])
+def test_the_map_contains_the_footprints_on_a_floor_below_the_reference_plane(height, monkeypatch):
+    mission = over(raised(-1.0), monkeypatch, f"plan.height={height}")
+    cameras, rig, grid = planned_keyframes(mission.plan, "lawnmower").world_from_camera, mission.rig, mission.grid
+    corners = [[0, 0], [rig.width_px, 0], [0, rig.height_px], [rig.width_px, rig.height_px]]
+    rays = np.column_stack([rig.normalised(np.array(corners, float)), np.ones(4)]) @ cameras[:, :3, :3].mT
+    on_floor = cameras[:, None, :2, 3] - rays[..., :2] * ((cameras[:, 2, 3, None] + 1.0) / rays[..., 2])[..., None]
+    west_south = [grid.west_m, grid.north_m - grid.rows * grid.cell_m]
+    east_north = [grid.west_m + grid.cols * grid.cell_m, grid.north_m]
+    assert (on_floor >= west_south).all() and (on_floor <= east_north).all()
+
+
 def test_over_the_reference_plane_both_references_give_the_same_plan():
     flat = raised(0.0)
     for pattern in ("plan.pattern=lawnmower", "plan.pattern=loops"):
@@ -161,6 +173,8 @@ def test_a_surface_above_a_level_floor_is_level_and_a_cliff_is_climbed_before_it
     x = np.linspace(-4, 3.9, 400)
     z = surface_above_floor(cliff, 0.1, (-4.0, -3.0), 2.0, (0.6, 0.8), 0.3).height_at(x, np.zeros(400))
     assert np.abs(np.diff(z) / np.diff(x)).max() <= 0.3 * 1.02  # the spline between its knots
+    uneven = surface_above_floor(cliff, 0.1, (-4.0, -3.0), 2.0, (1.2, 1.2), 0.3)  # an eighth of the image is 1.5 nodes
+    assert np.abs(np.diff(uneven.height_at(x, np.zeros(400))) / np.diff(x)).max() <= 0.3 * 1.02
     foot = np.interp(-1.0, x, z)  # 1 m before the cliff, whose smoothed top begins about 0.6 m behind its edge
     assert 4.0 - 0.3 * 1.9 < foot < 4.0 - 0.3 * 1.0
 

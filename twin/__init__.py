@@ -21,7 +21,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def __getattr__(name: str) -> Any:
-    """Returns `twin.World`, which is imported at its first use because it needs the simulator."""
+    """Returns `twin.World`, which is imported at its first use because it needs the simulator.
+
+    Raises:
+        AttributeError: the module has no attribute of this name.
+    """
     if name == "World":
         from twin.session.stepped_world import SteppedWorld
 
@@ -30,15 +34,15 @@ def __getattr__(name: str) -> Any:
 
 
 def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Reads and validates a scenario.
+    """Returns the validated scenario of a file.
 
     Args:
         path: a TOML file, or the name of a scenario in scenes/.
         overrides: strings `key=value` that replace values of the file, for example `plan.tracks=2`.
 
     Raises:
-        ScenarioError: the scenario is invalid; the message lists every error as
-            `FILE:LINE: key: problem (allowed: ...)`.
+        ScenarioError: the scenario is invalid; the message lists the errors, each as
+            `FILE:LINE: key: problem (allowed: ...)`, or as `--set: ...` for an override.
     """
     from twin.scenario.file import load_scenario
 
@@ -58,6 +62,7 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
         TwinError: the run folder cannot be written, or the world cannot be created.
+        OSError: metrics.json cannot be written at the end.
     """
     from twin import survey
 

@@ -1,7 +1,8 @@
 """Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 the survey is not complete or missed a requirement; 2 invalid input or missing system library;
-130 interrupted by Ctrl-C; 143 terminated by SIGTERM.
+Exit status: 0 success; 1 a survey is not complete, or a requirement is missed; 2 invalid input, missing system library
+or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by SIGTERM. `twin view` returns the status of
+the viewer.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ reproductions = typer.Typer(
 )
 app.add_typer(reproductions, name="reproduce")
 
+# In help texts, a bracket is escaped, because Rich takes words in brackets for style tags.
 SceneArgument = Annotated[
     str, typer.Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")
 ]
@@ -49,8 +51,10 @@ SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of a
 OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
 PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-plan.png.")]
 SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-look.png.")]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Smaller plans, images or selections.")]
-WalksOption = Annotated[int, typer.Option("--walks", min=64, help="Most random walks per cell of the Monte Carlo.")]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Use smaller plans, images or selections of cases.")]
+WalksOption = Annotated[
+    int, typer.Option("--walks", min=64, help="Largest number of random walks for a value of light.")
+]
 PhaseOption = Annotated[
     str,
     typer.Option("--phase", help="Phase function for lamps, in model and reference: a value of water.phase_function."),
@@ -60,14 +64,14 @@ ReadmeOption = Annotated[Path | None, typer.Option("--readme", help="README whos
 TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None,
-    typer.Option("--at", metavar="X,Y,Z", help="Position of the left camera [m]. Default: centre of the survey."),
+    typer.Option("--at", metavar="X,Y,Z", help="Position of the left camera \\[m]. Default: centre of the survey."),
 ]
 TwistOption = Annotated[
     str | None,
     typer.Option(
         "--twist",
         metavar="VX,VY,VZ,WX,WY,WZ",
-        help="Velocity of the vehicle during the exposure: forward, left, up [m/s], and about these axes [deg/s]. "
+        help="Velocity of the vehicle during the exposure: forward, left, up \\[m/s], and about these axes \\[deg/s]. "
         "Default: at rest.",
     ),
 ]
@@ -151,6 +155,17 @@ TopicsOption = Annotated[
     str | None,
     typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
 ]
+AidingOption = Annotated[
+    bool, typer.Option("--aiding/--no-aiding", help="Use recorded readings of pressure, attitude and DVL.")
+]
+EstimatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        metavar="NAME",
+        help="Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
+    ),
+]
 AlignOption = Annotated[
     str,
     typer.Option("--align", metavar="NAME", help="Alignment with the truth before the comparison: first, se3 or none."),
@@ -178,7 +193,8 @@ FormatOption = Annotated[
 ExportOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: RUN/export.")]
 CrsOption = Annotated[str | None, typer.Option("--crs", help="CRS of the exported coordinates, as in EPSG:32633.")]
 OriginOption = Annotated[
-    str | None, typer.Option("--origin", metavar="E,N,H", help="Scene origin in --crs; H is its elevation [m].")
+    str | None,
+    typer.Option("--origin", metavar="E,N,H", help="Scene origin in --crs; H is its elevation \\[m], by default 0."),
 ]
 JpegOption = Annotated[
     int | None, typer.Option("--jpeg", metavar="QUALITY", help="Write images as JPEG of this quality, 1 to 100.")
@@ -262,7 +278,7 @@ def look(
     at: AtOption = None,
     twist: TwistOption = None,
     out: SheetOption = None,
-    as_json: JsonOption = False,
+    as_json: SummaryOption = False,
 ) -> None:
     """Render the stereo pair at one position, draw its light components as one sheet, and print the image quality."""
     from twin.app import look as viewing
@@ -306,7 +322,7 @@ def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: Summary
 def light(
     out: TurbidityOutOption = Path("runs/light"),
     quick: QuickOption = False,
-    walks: WalksOption = 400_000,
+    walks: WalksOption = 1_500_000,
     phase: PhaseOption = "sea",
     as_json: SummaryOption = False,
 ) -> None:
@@ -364,7 +380,7 @@ def tank1(
 def tank2(
     out: TurbidityOutOption = Path("runs/tank2"), quick: QuickOption = False, as_json: SummaryOption = False
 ) -> None:
-    """Survey objects in a tank with 61 stereo pairs on two loops that cross at the start (Figs. 11 and 12)."""
+    """Survey objects in a tank with 61 stereo pairs on two loops that touch at the start (Figs. 11 and 12)."""
     _reproduce("tank2", out, quick, as_json)
 
 
@@ -474,6 +490,8 @@ def replay(
     out: ReplayOutOption = None,
     preview: PreviewOption = False,
     topics: TopicsOption = None,
+    estimator: EstimatorOption = None,
+    aiding: AidingOption = True,
     as_json: JsonOption = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
@@ -481,7 +499,10 @@ def replay(
     from twin.datasets import replay as recorded
 
     alignment, pattern = recorded.alignment_name(align), recorded.bayer_pattern(bayer)
-    options = recorded.ReplayOptions(calibration, truth, alignment, pattern, topics=recorded.image_topics(topics))
+    pair = recorded.image_topics(topics)
+    options = recorded.ReplayOptions(
+        calibration, truth, alignment, pattern, topics=pair, estimator=estimator, aiding=aiding
+    )
     name = outputs.file_stem(dataset.resolve().name)
     if preview:
         file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))

@@ -7,9 +7,9 @@ class TwinError(Exception):
     """Invalid user input or a missing system library; the command line reports it and exits with status 2.
 
     Args:
-        field: dotted scenario key (``plan.altitude_m``), or the name of the file or argument that is invalid.
+        field: dotted scenario key (``plan.altitude_m``), or the name of the file, argument or command concerned.
         problem: the invalid value and why it is invalid, in a few words.
-        allowed: the valid values.
+        allowed: the valid values, or the remedy.
     """
 
     def __init__(self, field: str, problem: str, allowed: str = ""):
@@ -18,7 +18,7 @@ class TwinError(Exception):
 
 
 class ScenarioError(TwinError):
-    """All errors of one scenario; the message has one line per error, with file and line number."""
+    """All errors of one scenario; the message has one line per error, with file and line number or with its `--set`."""
 
     def __init__(self, lines: list[str]):
         self.lines = lines
@@ -26,4 +26,4 @@ class ScenarioError(TwinError):
 
 
 class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
-    """The survey cannot continue (physics diverged, disk full, vision lost); partial results are kept."""
+    """The survey cannot continue (physics diverged, vision lost, alignment failed); partial results are kept."""

@@ -28,7 +28,7 @@ except ImportError as error:
 ENVIRONMENT = "SeabedTwin-v0"
 #: Turn rate at full yaw action [rad/s]; speed at full velocity action / planned speed.
 YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
-#: An episode ends if the left camera comes closer to the floor below it [m].
+#: An episode ends if the left camera is less than this above the floor below it [m].
 LEAST_CLEARANCE_M = 0.1
 
 Observation = dict[str, Any]
@@ -39,8 +39,8 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     A step lasts from one keyframe to the next: `frames_per_step` frames, the last of which has both images. The
     estimators of the scenario run in the loop and give the believed pose. The truth is only in `info` and in the
-    reward. An episode is truncated after the last frame of the plan, and terminated if the left camera leaves the
-    terrain or comes closer than 0.1 m to the floor, or if the survey is aborted.
+    reward. An episode is truncated after the last frame of the plan. It is terminated if, at the end of a step, the
+    left camera is outside the terrain or less than 0.1 m above the floor, or if the survey is aborted.
 
     Observation (dictionary):
         left, right: (H, W, 3) uint8 RGB, rectified stereo pair.
@@ -48,16 +48,16 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             [m/s]. Zero where `available` is 0.
         available: (3,) int8, whether there are readings of pressure, attitude and DVL.
         pose: (7,) float64, believed pose of the left camera in the world: x, y, z [m], quaternion x, y, z, w.
-        reference: (4,) float64, planned x, y, z [m] and yaw [rad] of the left camera at this time.
+        reference: (4,) float64, planned x, y, z [m] of the left camera and yaw [rad] of the vehicle at this time.
 
     Action, each value in [-1, 1]:
         "velocity": (4,) forward, left and up velocity of the left camera, and yaw rate to the left. 1 is 1.5 times
             plan.speed_mps, or 0.5 rad/s. The controller of the scenario steers, by the believed pose, to the
             position and yaw that follow from integration of these velocities.
-        "thrust": (8,) thruster commands.
+        "thrust": (8,) thruster commands of a rigid vehicle.
 
     Reward of a step:
-        "coverage": part of the asked area that both cameras saw for the first time [m2].
+        "coverage": part of the asked area that both cameras saw for the first time, in a keyframe [m2].
         "track": minus the distance of the true left camera from its planned position at the end of the step [m].
 
     Info: `time_s`; `truth`, with `world_from_camera` (4, 4), `cross_track_m` (distance from the planned position) and
@@ -93,7 +93,6 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise TwinError("reward", f"{reward!r}: no such reward", '"coverage" or "track"')
         self._world = SteppedWorld(given)
         self._velocity_action, self._reward, self.render_mode = action == "velocity", reward, render_mode
-        self.frames_per_step = self._world.mission.plan.n_frames_per_keyframe
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
         self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else 8,), np.float32)
         shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
@@ -108,6 +107,11 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             }
         )
 
+    @property
+    def frames_per_step(self) -> int:
+        """Number of frames of a step. It depends on the floor, and therefore on the seed of the scenario."""
+        return self._world.mission.plan.n_frames_per_keyframe
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -120,6 +124,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Raises:
             ScenarioError: the survey cannot be flown with the drawn seed.
+            TwinError: the simulated world cannot be created.
         """
         super().reset(seed=seed)
         self._frame = self._world.reset(int(self.np_random.integers(2**31)))

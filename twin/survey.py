@@ -34,8 +34,8 @@ def run(
     """Runs the survey of a scenario and writes a run folder, with the partial results if the survey is aborted.
 
     An interrupt (Ctrl-C) during the flight ends the flight. A later interrupt ends only the current stage: alignment,
-    elevation map, evaluation, map files, report or recording. The results of all other stages are written, and
-    metrics.json in any case.
+    elevation map, orthomosaic, evaluation, map files, report or recording. The results of all other stages are written,
+    and metrics.json in any case.
 
     Args:
         scenario: description of the survey.
@@ -51,6 +51,7 @@ def run(
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
         TwinError: the run folder cannot be written, or the world cannot be created.
+        OSError: metrics.json cannot be written at the end.
     """
     mission = prepare(scenario)
     stopwatch, guard = Stopwatch(), StageGuard()
@@ -89,7 +90,6 @@ def fly(
 ) -> None:
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
-    If tracking is poor or lost, the vehicle slows down or stops on its path until tracking recovers (`MissionActions`).
     After each track, the vehicle keeps station while the navigator runs a global alignment.
 
     Args:
@@ -97,7 +97,12 @@ def fly(
         world: simulates the vehicle, which executes the commands, and returns the frames.
         navigator: estimates the pose from the frames.
         observe: called with the estimate and its frame after every update of the navigator.
-        actions: chooses the pace along the path; None: the vehicle always flies at the planned speed.
+        actions: chooses the pace along the path: the vehicle slows down or stops if tracking is poor or lost, until it
+            recovers; None: the vehicle always flies at the planned speed.
+
+    Raises:
+        SurveyAborted: the physics diverged, an alignment or a plug-in failed, or `observe` aborted the survey.
+        OSError: images could not be read or written.
     """
     pilot = make_pilot(mission)
     flight = Flight(mission, world, world.fast_forward(navigator, pilot))

@@ -1,8 +1,8 @@
 """Levels of detail of a mesh, by clustering of vertices (Rossignac & Borrel 1993).
 
-The vertices of each cell of a cubic grid become one vertex, their mean; triangles with two corners in one cell vanish.
-No point of the surface moves by more than the diagonal of a cell, so the cell bounds the error of a level. Colours are
-averaged over a cell too, which filters them as a mip-map filters a texture.
+The vertices of each cell of a cubic grid become one vertex, their mean; triangles with two corners in one cell are
+removed. No point of the surface moves by more than the diagonal of a cell, so the cell bounds the error of a level.
+Colours are averaged over a cell too, which filters them as a mip-map filters a texture.
 """
 
 from __future__ import annotations
@@ -63,6 +63,13 @@ def clustered(mesh: Mesh, cell_m: float) -> Mesh:
     positions = _means(mesh.vertices_m, vertex_of, count)
     colours = _means(mesh.colours, vertex_of, count)
     return Mesh(positions.astype(np.float32), faces.astype(np.int32), np.rint(colours).astype(np.uint8))
+
+
+def cell_colours(mesh: Mesh, cell_m: float) -> NDArray[np.uint8]:
+    """Returns the mean colour (n, 3) of the vertices in the cubic cell of side `cell_m` of each vertex."""
+    cells = np.floor((mesh.vertices_m - mesh.vertices_m.min(axis=0)) / cell_m).astype(np.int64)
+    _, vertex_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
+    return np.rint(_means(mesh.colours, vertex_of, count)).astype(np.uint8)[vertex_of]
 
 
 def _smallest_first(faces: NDArray[np.int64]) -> NDArray[np.int64]:

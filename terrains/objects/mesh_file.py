@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from twin.errors import TwinError
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
 MAX_BYTES = 500_000_000  #: size of the largest file that is read
+MAX_TEXELS = 250_000_000  #: of all textures of a floor together
 TEXTURED_FACES = 200_000  #: largest number of triangles of a divided mesh, whose corners sample the texture
 
 Array = NDArray[np.float64]
@@ -34,19 +36,104 @@ def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: 
     Raises:
         TwinError: the file is missing, unreadable, empty, too large or not a manifold mesh.
     """
+    parts = _read(
+        file, field, lambda loaded: [_coloured(part, albedo, TEXTURED_FACES // len(loaded)) for part in loaded]
+    )
+    mesh = _joined([part for part in parts if len(part.faces)])
+    _check(mesh, file, field)
+    return _upright(mesh, y_up)
+
+
+class TexturedMesh(NamedTuple):
+    """Mesh whose triangles have the colours of textures or of their vertices.
+
+    Args:
+        mesh: triangles, with the colours of their vertices; a vertex without a colour is white.
+        uv: (n, 2) float32 texture coordinates of the vertices, which increase to the right and upwards; textures repeat
+            beyond 0 to 1.
+        texture: (m,) int32 number, from 0, of the texture of each triangle; -1: the colours of its vertices.
+        images: the textures, (h, w, 3) uint8 each.
+    """
+
+    mesh: Mesh
+    uv: NDArray[np.float32]
+    texture: NDArray[np.int32]
+    images: tuple[NDArray[np.uint8], ...]
+
+
+def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMesh:
+    """Returns the mesh of a file with its textures, in the unit of the file.
+
+    Args:
+        file: path of a PLY, OBJ or GLB file.
+        field: scenario key of the file, for error messages.
+        y_up: whether y of the file points up, instead of z.
+    Raises:
+        TwinError: the file is missing, unreadable, empty, too large, not a manifold mesh, or without colours.
+    """
+    parts = [part for part in _read(file, field, lambda loaded: [_part(p) for p in loaded]) if len(part.mesh.faces)]
+    mesh = _joined([part.mesh for part in parts])
+    _check(mesh, file, field)
+    if not any(part.coloured for part in parts):
+        raise TwinError(field, f"{file.name!r} has no colours", "a mesh with a texture or with colours of its vertices")
+    images, numbers = [], []
+    for part in parts:
+        number = -1
+        if part.image is not None:
+            number = next((k for k, image in enumerate(images) if image is part.image), len(images))
+            images += [part.image] if number == len(images) else []
+        numbers.append(np.full(len(part.mesh.faces), number, np.int32))
+    n_texels = sum(image.size[0] * image.size[1] for image in images)
+    if n_texels > MAX_TEXELS:
+        raise TwinError(field, f"{file.name!r} has textures of {n_texels} texels", f"at most {MAX_TEXELS} texels")
+    uv = np.concatenate([part.uv for part in parts])
+    arrays = tuple(np.asarray(image.convert("RGB"), np.uint8) for image in images)
+    return TexturedMesh(_upright(mesh, y_up), uv, np.concatenate(numbers), arrays)
+
+
+class _Part(NamedTuple):
+    """Mesh of one material: triangles, (n, 2) texture coordinates, PIL image of the texture or None, any colours."""
+
+    mesh: Mesh
+    uv: NDArray[np.float32]
+    image: Any
+    coloured: bool
+
+
+def _part(part: Any) -> _Part:
+    """Returns a trimesh mesh with its texture, or with the colours of its vertices if it has no texture."""
+    n, texture = len(part.vertices), _texture_of(part)
+    colours = np.full((n, 3), 255, np.uint8)
+    if texture is not None:
+        image, uv = texture
+        finite = np.nan_to_num(np.asarray(uv, np.float32)[:, :2], posinf=0.0, neginf=0.0)
+        return _Part(_mesh(part.vertices, part.faces, colours), finite, image, True)
+    coloured = hasattr(part.visual, "vertex_colors") and part.visual.defined
+    if coloured:
+        colours = np.asarray(part.visual.vertex_colors)[:, :3]
+    return _Part(_mesh(part.vertices, part.faces, colours), np.zeros((n, 2), np.float32), None, coloured)
+
+
+def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> list[Any]:
+    """Returns what `convert` makes of the trimesh meshes of a file; the size of the file is checked first.
+
+    Raises:
+        TwinError: the file is missing, unreadable or too large.
+    """
     if not is_file(file):
         raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
     _check_size(file, field)
     try:
-        loaded = _parts(_loaded(file))
-        parts = [_coloured(part, albedo, TEXTURED_FACES // len(loaded)) for part in loaded]
+        return convert(_parts(_loaded(file)))
     except MemoryError:
         raise
     except Exception as error:  # trimesh raises any of many types for a damaged file
         reason = " ".join(str(error).split())[:200]
         raise TwinError(field, f"{file.name!r} cannot be read: {type(error).__name__}: {reason}", FORMATS) from error
-    mesh = _joined([part for part in parts if len(part.faces)])
-    _check(mesh, file, field)
+
+
+def _upright(mesh: Mesh, y_up: bool) -> Mesh:
+    """Returns a mesh with z up; `y_up`: its y points up."""
     return mesh._replace(vertices_m=mesh.vertices_m @ _Z_FROM_Y_UP.T) if y_up else mesh
 
 
@@ -54,7 +141,7 @@ _Z_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
 
 
 def _check_size(file: Path, field: str) -> None:
-    """Raises TwinError if the file or the number of triangles that it declares is too large."""
+    """Raises TwinError if the file is too large, declares too many triangles, or is not a readable mesh file."""
     try:
         n_bytes = file.stat().st_size
         n_faces = 0 if n_bytes > MAX_BYTES else face_count(file)
@@ -111,20 +198,27 @@ def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
 def _textured(part: Any, most_faces: int) -> Mesh | None:
     """Returns a trimesh mesh with the colours of its texture at its vertices.
 
-    All triangles are divided into four as long as there are at most `most_faces`. Returns None if the mesh has no
-    texture image or no texture coordinates.
+    All triangles are divided into four, repeatedly, as long as this makes at most `most_faces`. Returns None if the
+    mesh has no texture image or no texture coordinates.
     """
     import trimesh
 
-    material, uv = part.visual.material, part.visual.uv
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is None or uv is None or len(uv) != len(part.vertices):
+    texture = _texture_of(part)
+    if texture is None:
         return None
+    image, uv = texture
     divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
     while 0 < len(divided[1]) * 4 <= most_faces:
         divided = trimesh.remesh.subdivide(*divided[:2], vertex_attributes=divided[2])
     vertices, faces, attributes = divided
     return _mesh(vertices, faces, _sampled(np.asarray(image.convert("RGB")), attributes["uv"]))
+
+
+def _texture_of(part: Any) -> tuple[Any, Any] | None:
+    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it has no texture."""
+    material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    return None if image is None or uv is None or len(uv) != len(part.vertices) else (image, uv)
 
 
 def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:

@@ -8,12 +8,12 @@ from collections import Counter
 from pathlib import Path
 
 FORMATS = "a PLY, OBJ or GLB file with triangles"
-_LONGEST_HEADER = 65_536  # characters of a PLY header
+_LONGEST_HEADER = 65_536  # bytes of a PLY header, and of a piece in which a line of an OBJ file is read
 _LONGEST_JSON = 16_777_216  # bytes of the description in a GLB file
 
 
 def face_count(file: Path) -> int:
-    """Returns the number of faces that a PLY, OBJ or GLB file declares; an OBJ file is scanned line by line.
+    """Returns the number of triangles that a PLY, OBJ or GLB file declares; each face of a PLY file counts as one.
 
     Raises:
         ValueError: the file is not a mesh of a known format; the message states why.
@@ -26,7 +26,7 @@ def face_count(file: Path) -> int:
 
 
 def _ply_faces(file: Path) -> int:
-    """Returns the number of faces in a PLY header; raises ValueError if there is no header or no face."""
+    """Returns the number of faces in a PLY header; raises ValueError if it or its element `face` is missing."""
     with file.open("rb") as stream:
         header = stream.read(_LONGEST_HEADER)
     if not header.startswith(b"ply") or b"end_header" not in header:
@@ -51,8 +51,7 @@ def _obj_faces(file: Path) -> int:
 def _glb_faces(file: Path) -> int:
     """Returns the number of triangles of a binary glTF file, from the accessors of its meshes.
 
-    A mesh counts once for each node that places it; a mesh that no node places counts once, because
-    it is loaded, too.
+    A mesh counts once for each node that places it; a mesh that no node places counts once, because it is loaded too.
 
     Raises:
         ValueError: the file has no GLB header, or its description is too long or invalid.

@@ -1,4 +1,7 @@
-"""Built-in shapes of reef organisms: corals, sponge, sea star and kelp; their largest extent is about 1."""
+"""Built-in shapes of reef organisms: corals, sponge, sea star and kelp; their largest extent is about 1.
+
+Each function makes a mesh from the albedo (3,) for R, G, B and a random generator.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from terrains.objects.primitives import Array, mottled, noise, resampled, sphere
 
 
 def brain_coral(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a brain coral: a dome with meandering ridges, brighter than the grooves between them."""
+    """Returns a brain coral: a flattened ball with meandering ridges, brighter than the grooves between them."""
     ball, faces = sphere()
     bumps = 1 + 0.05 * noise(ball, 1.2, 2, rng)
     meander = np.tanh(2.5 * np.sin(4.0 * noise(ball, 0.55, 2, rng, gain=0.3)))
@@ -19,7 +22,7 @@ def brain_coral(albedo: Array, rng: np.random.Generator) -> Mesh:
 
 
 def branching_coral(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a branching coral: a thicket of branches that fork and taper, with bright tips."""
+    """Returns a branching coral: a thicket of branches that fork and taper, brighter towards the top."""
     parts: list[Mesh] = []
     for angle in rng.uniform(0, 2 * np.pi, 9):
         lean = rng.uniform(0.1, 0.9)
@@ -95,7 +98,7 @@ def sea_star(albedo: Array, rng: np.random.Generator) -> Mesh:
 
 
 def kelp(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a kelp of height 1: ribbons with wavy edges that rise from a holdfast."""
+    """Returns a kelp about 1 high: ribbons with wavy edges that rise from a common base."""
     return joined([_blade(angle, albedo, rng) for angle in rng.uniform(0, 2 * np.pi, 12)])
 
 

@@ -70,7 +70,8 @@ def place(
         taken: objects of other entries, which scattered objects do not overlap.
         seed: seed of the scenario.
     Raises:
-        TwinError: an object is outside the terrain, or scattered objects are too many or do not fit.
+        TwinError: an object with a given position reaches beyond the terrain; there would be no scattered object or too
+            many, or they do not fit.
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, number]))
     if group.position_m is not None:
@@ -102,7 +103,7 @@ def _scattered(
     """Returns objects at random positions that do not overlap each other or the objects in `taken`.
 
     Raises:
-        TwinError: they do not fit into the area without overlap.
+        TwinError: there would be none or too many, or they do not fit into the area without overlap.
     """
     field = f"objects.{number}.per_m2"
     low, high = _region(group, terrain)
@@ -165,8 +166,9 @@ def _free_position(
 ) -> tuple[float, float] | None:  # fmt: skip
     """Returns a random position (x, y) [m] where an object may stand; None if none is found.
 
-    The circle of the object does not overlap the circles `around` (n, 3): x, y, radius [m]. Its centre is at least
-    `group.spacing_m` from their centres.
+    The position lies between the south-west and the north-east of `corners`, at least `group.spacing_m` from the
+    centres of the circles `around` (n, 3): x, y, radius [m]. The circle of radius `radius_m` about it overlaps none of
+    these circles.
     """
     if (corners[0] >= corners[1]).any():
         return None
@@ -194,7 +196,9 @@ def _at(
 ) -> PlacedObject:  # fmt: skip
     """Returns an object at a position (x, y) [m].
 
-    Its height, heading and tilt are those of its group; a heading that is not given is random."""
+    Where the group gives no height, the object stands on the floor, sunk by a share of its height; where it gives no
+    heading, the heading is random. An object that is not upright is tilted to the normal of the floor.
+    """
     x, y = position_m
     heading, phase = rng.uniform(0, 2 * np.pi, 2)
     if group.heading_deg is not None:

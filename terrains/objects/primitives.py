@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
+#: Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from outside.
 Surface = tuple[Array, Faces]
 
-SPHERE_DIVISIONS = 5  #: of the 20 faces of an icosahedron, each into four: 20,480 triangles
+SPHERE_DIVISIONS = 5  #: times that each of the 20 faces of an icosahedron is divided into four: 20,480 triangles
 
 
 def sphere() -> Surface:
@@ -109,7 +110,7 @@ def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
 
 
 def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator, gain: float = 0.5) -> Array:
-    """Returns smooth random values (n,) at points (n, 3), with standard deviation 1.
+    """Returns smooth random values (n,) at points (n, 3), with a standard deviation of about 1.
 
     Each octave is a sum of plane waves with random directions and phases; octave k has the wavelength coarsest / 2^k
     and the amplitude gain^k.

@@ -1,4 +1,7 @@
-"""Built-in shapes of inanimate objects: boulder, pipe, crate, tyre and bottle; their largest extent is about 1."""
+"""Built-in shapes of inanimate objects: boulder, pipe, crate, tyre and bottle; their largest extent is about 1.
+
+Each function makes a mesh from the albedo (3,) for R, G, B and a random generator.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ def pipe(albedo: Array, rng: np.random.Generator, width: float = 0.125) -> Mesh:
 
 
 def crate(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a wooden crate whose sides are slats with gaps between them."""
+    """Returns a closed wooden crate whose sides are slats with grooves between them."""
     size = (1.0, 0.7, 0.5)
     points, faces = box(size, (72, 52, 36))
     outward = np.abs(points) >= np.array(size) / 2 - 1e-9
@@ -50,7 +53,7 @@ def crate(albedo: Array, rng: np.random.Generator) -> Mesh:
 
 
 def tyre(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a tyre that lies flat: a torus with a flattened section and treads."""
+    """Returns a tyre that lies flat: a torus with a flattened section and a tread."""
     angle = 2 * np.pi * np.arange(72) / 72
     section = np.stack([0.36 + 0.14 * np.cos(angle), 0.11 * np.tanh(1.6 * np.sin(angle)) / np.tanh(1.6)], axis=1)
     points, faces = turned(section, 144)

@@ -12,7 +12,7 @@ from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, project
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
-_N_COLUMNS = 13  # columns of the grid of directions for the fit
+_N_COLUMNS = 13  # columns, and rows, of the grid of pixels for the fit
 _RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as fractions of the planned altitude
 
 
@@ -27,8 +27,12 @@ def true_calibration(scenario: Scenario) -> RigCalibration:
 
     The true image of a point is that of `TrueCameras.project`, which follows the rays through port, lens and
     rectification. Camera matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted to
-    these images by least squares at 0.6, 1 and 1.4 times the planned altitude; `residual_px` is the RMS residual. For
-    cameras without errors, lens or port the result is exact, and the residual is zero.
+    the images of points at depths of 0.6, 1 and 1.4 times the planned altitude by least squares; `residual_px` is the
+    RMS distance that remains. For cameras without lens distortion, port and calibration errors (except that of the
+    baseline), the result is exact, and `residual_px` is zero.
+
+    Raises:
+        TwinError: the cameras of the scenario are invalid, see `make_true_cameras`.
     """
     cameras = make_true_cameras(scenario)
     rig = scenario.believed_rig()
@@ -45,7 +49,7 @@ def true_calibration(scenario: Scenario) -> RigCalibration:
 
 
 def _points(rig: StereoRig, altitude_m: float) -> Array:
-    """Returns points (n, 3) [m] in camera axes that fill the image at the depths of `_RANGES`."""
+    """Returns points (n, 3) [m] in camera axes that fill the image at depths of `_RANGES` times the altitude."""
     columns = np.linspace(0, rig.width_px - 1, _N_COLUMNS)
     rows = np.linspace(0, rig.height_px - 1, _N_COLUMNS)
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
@@ -63,8 +67,8 @@ def _fitted(
     Args:
         cameras: the true cameras.
         camera: 0 left, 1 right.
-        points_m: (n, 3) points in the axes of the rendered camera.
-        rig: believed calibration, the start of the fit.
+        points_m: (n, 3) points in the axes of the rendered camera [m]; those without an image are left out.
+        rig: believed calibration; it has the image size and is the start of the fit.
     """
     seen = cameras.project(points_m, camera)
     known = np.isfinite(seen).all(axis=1)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def print_error(text: str) -> None:
-    """Prints an error on stderr, without line wrapping or colours; control characters are shown as escapes."""
+    """Prints a text on stderr, without line wrapping or colours; characters that cannot be printed become escapes."""
     printable = (c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
     print("".join(printable), file=sys.stderr)
 
@@ -33,7 +33,7 @@ def accept_any_text() -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
-    """Shows a progress bar if stderr is a terminal; yields the function that updates it."""
+    """Shows the progress bar of a survey if stderr is a terminal; yields the function that updates it."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda _: None
@@ -68,7 +68,7 @@ def progress_note(now: SurveyProgress) -> str:
 
 
 def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
-    """Prints a table on stdout; up to 120 characters wide if stdout is not a terminal, to avoid wrapped rows."""
+    """Prints a table on stdout, as wide as the terminal at most; up to 120 characters wide if it is not a terminal."""
     console = Console(width=None if sys.stdout.isatty() else 120, markup=False, emoji=False)
     grid = Table(title=title, title_justify="left", show_header=False)
     for row in rows:
@@ -94,7 +94,7 @@ def print_plan(summary: PlanSummary) -> None:
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """Prints the verdict on a survey, the reasons and warnings, the key figures, and which requirements it meets."""
+    """Prints the verdict on a survey or replay, its reasons and warnings, the key figures and the requirements."""
     from twin.report.verdict import badge, first_lines
     from twin.report.wording import key_figures, plain, replay_summary
 

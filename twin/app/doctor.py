@@ -1,4 +1,4 @@
-"""Checks of this machine (Python, packages, rendering, disk space), each with a remedy if it fails.
+"""Checks of this machine (Python, packages, rendering, disk space, processors), with a remedy for each failure.
 
 `python -m twin.app.doctor` renders a test image. `check_rendering` runs this command in a separate process, because a
 faulty graphics driver can crash the process that renders.
@@ -55,7 +55,7 @@ def check_machine(folder: Path) -> list[Check]:
 
 
 def check_rendering() -> Check:
-    """Returns whether OpenGL can render an image without a display."""
+    """Returns the result of rendering an image with OpenGL, without a display, in a separate process."""
     try:
         command = [sys.executable, "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)

@@ -13,7 +13,15 @@ from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.core.records import StereoRig
 from twin.surrogate import error_model_file
-from twin.surrogate.map_model import WINDOW_PX, edge_roughness, relief_error_px, roughness
+from twin.surrogate.error_model import ErrorModel
+from twin.surrogate.map_model import (
+    EDGE_VIEWS_EXPONENT,
+    WINDOW_PX,
+    edge_strength,
+    relief_error_px,
+    roughness,
+    step_slope,
+)
 from twin.surrogate.matchability import Matchability
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import FloorForecast
@@ -28,9 +36,10 @@ class ExpectedError(NamedTuple):
     """Expected height error of the map.
 
     Args:
-        sigma_m: (n,) standard deviation of the height at floor points spread evenly over the images [m].
-        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height.
-        bound_px: largest Cramér-Rao bound of image matching over the depths of the plan [px of the matched images].
+        sigma_m: (n,) standard deviation of the height error at floor points spread evenly over the images [m].
+        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height, without the
+            losses at edges and near the border of the images.
+        bound_px: largest Cramér-Rao bound of image matching at the depths of these points [px of the matched images].
         fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
     """
 
@@ -85,32 +94,44 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
     sigma_px = np.interp(depth, matching.depths_m, model.depth_error.sigma_px(table, matching.lamp_share))
+    sigma_px *= model.depth_binned_error(matching.binning)
     in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
     poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
     step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
     share = float(model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m))
-    scatter = np.interp(depth, matching.depths_m, model.depth_cell_scatter(table))
+    scatter = np.interp(depth, matching.depths_m, _error_scatter(model, table, matching.binning))
     evenly = (0.5 + np.arange(len(depth)) * _GOLDEN_RATIO) % 1
     sigma_px *= np.exp(scatter * ndtri(np.clip(evenly, 1e-6, 1 - 1e-6)))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
     per_px = depth**2 / (rig.focal_px * rig.baseline_m)
     relief = per_px * relief_error_px(rough_m / per_px, model.relief_error_gain, model.relief_error_limit_px)
-    sigma_m = np.sqrt(vertical**2 + lateral**2 + relief**2 + (model.edge_error_gain * edge_m) ** 2)
+    walls = np.interp(depth, matching.depths_m, [model.edge_error(b) for b in table]) * edge_m
+    walls *= (1 - overlap) ** EDGE_VIEWS_EXPONENT
+    sigma_m = np.sqrt(vertical**2 + lateral**2 + relief**2 + walls**2)
     return ExpectedError(
         sigma_m, float(in_view.mean()) if len(depth) else 0.0,
         float(bound.max(initial=0.0)), model.bound_range_px[1],
     )  # fmt: skip
 
 
-def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array, Array]:
-    """Returns the floor at points spread evenly over the images.
+def _error_scatter(model: ErrorModel, bounds_px: Array, binning: int) -> Array:
+    """Returns the standard deviation (m,) over map cells of the logarithm of the disparity error, at bounds (m,) [px].
 
-    It returns depths (n,) [m], slopes (n,) [m/m], roughness (n,) [m] and `edge_roughness` (n,) [m].
+    It is `ErrorModel.error_scatter_share` times that of the reported standard deviation, which depends on the binning.
+    """
+    binned = np.full(len(bounds_px), model.depth_binned_scatter(binning))
+    return model.error_scatter_share * (model.depth_cell_scatter(bounds_px) if binning == 1 else binned)
+
+
+def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array, Array]:
+    """Returns properties of the floor at n points spread evenly over the images.
+
+    Returned are depth (n,) [m], slope (n,) [m/m], roughness (n,) [m] and `MapModel.edge_m` (n,).
 
     Args:
         mission: the survey.
-        forecast: floor points in the keyframes.
+        forecast: poses of the keyframes and depths of the floor in their images.
         matched: calibration of the images that are matched, which may be binned.
     """
     rig, grid = mission.rig, mission.grid
@@ -125,7 +146,8 @@ def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig)
     typical_m = float(np.median(depth)) if len(depth) else 1.0
     window_cells = WINDOW_PX * typical_m / matched.focal_px / grid.cell_m
     rough, steepness = roughness(heights, window_cells), np.hypot(down, east)
-    edge = edge_roughness(rough, steepness, window_cells)
+    per_m = matched.focal_px * matched.baseline_m / typical_m**2
+    edge = edge_strength(rough * np.float32(per_m), step_slope(heights, grid.cell_m), window_cells) / per_m
     rows = np.clip(((grid.north_m - y) / grid.cell_m).astype(int), 0, grid.rows - 1)
     cols = np.clip(((x - grid.west_m) / grid.cell_m).astype(int), 0, grid.cols - 1)
     at = rows, cols

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from twin.app.camera_models import believed_calibration, true_calibration
 from twin.app.outputs import new_folder
 from twin.core.georeference import Georeference
-from twin.core.records import Array, ElevationMap, Exposure, Image, Readings, StereoRig
+from twin.core.records import Array, ElevationMap, Exposure, Image, Readings
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
@@ -68,8 +68,8 @@ def export(
 
     Raises:
         TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
-            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or an image of
-            the run is damaged.
+            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or an image or
+            the true poses of the run are damaged; the formats before the one that needs them were written.
         OSError: a file cannot be written.
     """
     chosen = chosen_formats(names)
@@ -126,7 +126,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     if scenario is not None:
         rig = scenario.believed_rig()
     assert rig is not None
-    frames = _frames(run, rig)
+    frames = _frames(run)
     elevation = _elevation(run)
     return RunContents(
         folder=folder,
@@ -148,7 +148,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
 
 
 def _true_layers(folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...]):
-    """Returns the function that renders the true layers again; None without a rendered world or true poses."""
+    """Returns the function that renders the true layers; None without a rendered world or recorded true poses."""
     if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
         return None
     from twin.app import true_layers
@@ -220,8 +220,10 @@ def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.fl
     return raster.values.astype(np.float32)
 
 
-def _frames(run: Run, rig: StereoRig) -> tuple[RecordedFrame, ...]:
+def _frames(run: Run) -> tuple[RecordedFrame, ...]:
     """Returns the frames of a run whose left image was recorded, in the order of time.
+
+    Without frames.csv, as in a replay, these are keyframes; their times are those of the online or the true trajectory.
 
     Raises:
         TwinError: frames.csv is damaged or lacks a keyframe.
@@ -258,7 +260,12 @@ def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
 
 
 def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
-    """Returns index, time, exposure and readings of a line of frames.csv; raises ValueError if it is incomplete."""
+    """Returns index, time, exposure and readings of a line of frames.csv.
+
+    Raises:
+        ValueError: the line has too few or too many cells, or a cell is not a number.
+        KeyError: a column is missing.
+    """
     if None in row or None in row.values():
         raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
     return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
@@ -271,7 +278,7 @@ def _exposure(row: dict[str, str]) -> Exposure | None:
 
 
 def _readings(row: dict[str, str]) -> Readings:
-    """Returns the readings of a line of frames.csv."""
+    """Returns the readings of a line of frames.csv, which has no detected beacons."""
     cells = [row[name] for name in READING_COLUMNS]
 
     def vector(first: int) -> Array | None:

@@ -51,12 +51,12 @@ def render_view(
 ) -> ViewLayers:
     """Renders a stereo pair and the light components of its left image.
 
-    The cameras look straight down and the bow points along the first leg.
+    The cameras look straight down, and the bow has the heading of the survey area (`SurveyArea.heading`).
 
     Args:
         mission: the survey.
         at_m: position of the left camera in the world [m]; None: above the centre of the survey area, at the
-            planned altitude.
+            planned altitude above the reference plane.
         twist_body: (6,) [angular, linear] velocity of the body in its own axes during the exposure [rad/s, m/s];
             None: at rest.
 
@@ -78,7 +78,7 @@ def render_view(
 
 
 def parse_position(text: str) -> tuple[float, float, float]:
-    """Returns the position (x, y, z) [m] of a string X,Y,Z. Raises TwinError unless it is three finite numbers."""
+    """Returns the position (x, y, z) [m] of a text X,Y,Z. Raises TwinError unless it is three finite numbers."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -106,7 +106,7 @@ def parse_twist(text: str) -> Array:
 
 
 def _check_rig(mission: Mission, world_from_left: Array) -> None:
-    """Raises TwinError unless both cameras and all lamps are over the terrain and `NEAR_M` above the sea floor."""
+    """Raises TwinError unless both cameras and all lamps are over the terrain, at least `NEAR_M` above the floor."""
     rig = mission.rig
     world_from_body = world_from_left @ geometry.inverse(rig.body_from_camera)
     cameras = [world_from_left[:3, 3], (world_from_left @ rig.left_from_right)[:3, 3]]
@@ -118,7 +118,14 @@ def _check_rig(mission: Mission, world_from_left: Array) -> None:
 
 
 def _check_above(mission: Mission, field: str, name: str, position: Array, world_from_left: Array) -> None:
-    """Raises TwinError unless a position (3,) is over the terrain and at least `NEAR_M` above the sea floor."""
+    """Raises TwinError unless a position is over the terrain and at least `NEAR_M` above the sea floor.
+
+    Args:
+        mission: the survey.
+        field, name: option or scenario key, and name of the camera or lamp, for the error.
+        position: (3,) position of the camera or lamp in the world [m].
+        world_from_left: (4, 4) pose of the left camera, from which the error computes the lowest allowed `--at`.
+    """
     terrain = mission.terrain
     x, y, z = position
     floor_m = float(terrain.height_at(x, y))
@@ -141,9 +148,10 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
         Position of the left camera in the world [m] and median depth [m]; exposure time [ms] and gain of a physical
         sensor; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean, as a
         fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
-        noise. `veil_share`: backscattered fraction of the light. `saturated_share`: fraction of saturated pixels.
-        `snr`: mean / standard deviation of the noise. `texture_snr`: median local standard deviation of the image
-        without noise / standard deviation of the noise; a low value limits matching.
+        noise, in windows as wide as `WINDOW_SHARE` of the image. `veil_share`: backscattered fraction of the light.
+        `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise. `texture_snr`:
+        median local standard deviation of the image without noise / standard deviation of the noise; a low value
+        limits matching.
     """
     a = view.decomposed
     signal = a.components.total.astype(np.float64) * a.gain if a.linear else a.noise_free / 255
@@ -167,7 +175,7 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
 
 
 def _exposure(decomposed: DecomposedImage) -> dict[str, float]:
-    """Returns exposure time [ms] and analogue gain of a physical sensor; empty without a [sensor] section."""
+    """Returns exposure time [ms] and analogue gain of a physical sensor; empty without a section [sensor]."""
     if decomposed.raw is None:
         return {}
     return {"exposure_ms": 1000 * decomposed.setting.exposure_s, "analogue_gain": decomposed.setting.analogue_gain}
@@ -184,7 +192,7 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def noise_image(view: ViewLayers) -> Array:
-    """Returns the image noise (H, W, 3): left image minus the same image without noise [grey levels, 0 to 255]."""
+    """Returns the image noise (H, W, 3): left image minus the same image without noise [grey levels of 8 bits]."""
     return view.stereo_pair.left.astype(np.float64) - view.decomposed.noise_free
 
 

@@ -113,7 +113,8 @@ def _light(
 
     A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
     Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
-    or for gain 0 the value that is displayed as white.
+    or for gain 0 the value that is displayed as white. A component whose `percentile` is zero is displayed as black,
+    with the note "none".
 
     Args:
         title, unit: name and unit of the component.
@@ -122,7 +123,7 @@ def _light(
             contain the component.
         linear: whether the image is proportional to the radiance; if not, the note of the panel states that the
             brightness is that before tone curve and white balance.
-        percentile: percentile of the values that determines the scale.
+        percentile: percentile of the values that determines the scale, 0 to 100.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:

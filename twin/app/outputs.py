@@ -35,7 +35,7 @@ def unused_folder(first: Path) -> Path:
 
 
 def output_file(file: Path, option: str = "--out") -> Path:
-    """Returns `file`. Raises TwinError if this path exists but is not a regular file, or if it cannot be written."""
+    """Returns `file`. Raises TwinError if this path exists but is not a file, or if its folder cannot be written."""
     _check_path(file, option, "the path of a file")
     if file.exists() and not file.is_file():
         raise TwinError(option, f"{file} is not a file", "the path of a file")
@@ -53,7 +53,7 @@ def writing(path: Path, option: str = "--out") -> Iterator[None]:
 
 
 def file_stem(name: str) -> str:
-    """Returns the name of a scenario or study for use in a file name: without separators, at most 100 bytes."""
+    """Returns the name of a scenario or study for use in a file name: without path separators, at most 100 bytes."""
     text = "".join("_" if character in "/\\\0" else character for character in name)
     return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
 
@@ -71,7 +71,10 @@ def _check_path(path: Path, option: str, allowed: str) -> None:
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError unless the path, or the closest folder above it that exists, can be written."""
+    """Raises TwinError unless a file can be created in the path, if that is a folder, or in the closest folder above.
+
+    Folders that do not exist are skipped.
+    """
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest
     try:

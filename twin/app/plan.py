@@ -23,7 +23,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
     """Writes a PNG of the plan from above; returns its path.
 
     The left panel shows sea floor, planned path, footprint of the first image and survey area. The right panel shows
-    the overlap over the floor and marks where it is less than required.
+    the survey area and the overlap over the floor, and marks where the overlap is less than required.
     """
     mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):
@@ -45,7 +45,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
     """Draws the overlap of each image pair midway between its two camera positions.
 
-    Outlined markers show overlaps below the required one.
+    Outlined markers show overlaps that are more than `OVERLAP_TOLERANCE` below the required one.
     """
     floor, required = summary.floor, required_overlaps(summary.mission)
     t = summary.mission.terrain
@@ -70,7 +70,7 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
 
 
 def _draw_floor(axes: Axes, mission: Mission) -> None:
-    """Draws the shaded sea floor with height contours."""
+    """Draws the shaded sea floor, with height contours unless it is level."""
     t = mission.terrain
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
     height = t.height_at(*np.meshgrid(x, y))

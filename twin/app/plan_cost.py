@@ -16,7 +16,10 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    """Estimated computing cost of a survey: wall time on an idle 2-core machine [s], peak memory and disk [MB]."""
+    """Estimated computing cost of a survey: time on an idle 2-core machine [s], peak memory and disk [MB].
+
+    The time is fitted to processor times.
+    """
 
     wall_s: float
     memory_mb: float
@@ -55,6 +58,7 @@ _IMAGES_MB_PER_MPX = 300.0
 _SURROGATE_MB = 380.0
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
 _NODE_MB, _TEXEL_MB = 400e-6, 9e-6
+_FACE_MB, _MESH_TEXEL_MB = 80e-6, 4e-6  #: memory of a mesh floor [MB], per triangle and per texel of its textures
 
 
 def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
@@ -73,9 +77,18 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
         )  # fmt: skip
     window = n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks))
     texels = mission.terrain.texture.size / 3
-    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels
+    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels + _mesh_mb(mission)
     return ComputingCost(
         _RENDERED_S.total(n_frames, n_keyframes, megapixels),
         _RENDERED_MB.total(n_frames, round(window), megapixels) + _IMAGES_MB_PER_MPX * megapixels + floor_mb,
         _RENDERED_DISK_MB.total(n_frames, n_keyframes, megapixels),
     )
+
+
+def _mesh_mb(mission: Mission) -> float:
+    """Returns the memory of the triangles and the textures of a mesh floor [MB]; 0 for another floor."""
+    if mission.mesh_floor is None:
+        return 0.0
+    tiles, textures = mission.mesh_floor.tiles
+    n_faces = sum(len(tile.placed.model.levels[0].mesh.faces) for tile in tiles)
+    return _FACE_MB * n_faces + _MESH_TEXEL_MB * len(textures.texels) * 3 / 4

@@ -47,7 +47,7 @@ class PlanSummary:
 
     Args:
         mission: the survey.
-        plane: properties of the plan; footprint, overlaps and disparity refer to the reference plane.
+        plane: properties of the plan; footprint, overlaps, disparity and depth error refer to the reference plane.
         floor: properties of the planned images over the floor.
         error: expected height error of the map.
         cost: computing time, memory and disk space of the simulation.
@@ -210,7 +210,7 @@ def cost_text(cost: ComputingCost) -> str:
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
-    """Returns the table of the image properties over the floor: name, minimum, 5th percentile, median and maximum."""
+    """Returns a header and the image properties over the floor: label, minimum, 5th percentile, median, maximum."""
     table: list[tuple[str, ...]] = [("", "minimum", "5 %", "median", "maximum")]
     for key, values in floor_spreads(summary).items():
         label, write = _PROPERTIES[key]
@@ -236,7 +236,12 @@ def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
 
 
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
-    """Returns the summary as a JSON object: lengths in metres, shares from 0 to 1, missing values null."""
+    """Returns the summary as a JSON object: lengths in metres, shares from 0 to 1, missing values null.
+
+    Args:
+        summary: the summary of the plan.
+        picture: path of the drawing of the plan, which is copied to the object.
+    """
     mission, error = summary.mission, summary.error
     plane = summary.plane._asdict()
     hold_s = mission.scenario.control.hold_s * len(mission.tracks)

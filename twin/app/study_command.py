@@ -33,7 +33,8 @@ class StudyOptions(NamedTuple):
         resume: run only surveys that are missing in the folder or failed.
         live: print a line for each finished survey.
         as_json: print only a summary, as JSON.
-        verify: number of rendered surveys that check the results or the recommended plan; None: the default.
+        verify: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune:
+            number of rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file.
         extrapolate: fly surrogate surveys outside the fitted range of the error model.
     """
 
@@ -179,7 +180,8 @@ def _print_result(study: Study, result: StudyResult) -> None:
         console.print_table(agreement_report.verdict_line(compared), agreement_report.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
-        console.print_table(f"{len(analysis.refused_samples)} samples cannot be flown: surveys, reason", reasons)
+        samples = wording.sample_count(len(analysis.refused_samples))
+        console.print_table(f"{samples} cannot be flown: surveys, reason", reasons)
     for warning, count in analysis.warning_counts.items():
         print(f"Warning in {count} of {analysis.rows.num_rows} surveys: {warning}")
     if result.throughput.surveys:

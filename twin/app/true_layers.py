@@ -1,9 +1,10 @@
-"""True layers of recorded frames: the world is rendered again at the true poses of a run."""
+"""True layers of recorded frames: the images of the world are rendered again at the true poses of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -17,7 +18,6 @@ from twin.exchange.run_contents import FrameTruth, RecordedFrame, TrueLayers
 from twin.imaging.camera import DecomposedImage, StereoCamera
 from twin.imaging.facets import Heights
 from twin.imaging.image_formation import ImageFormation
-from twin.imaging.object_view import Objects
 from twin.scenario.model import Scenario, SnowConfig, WaterConfig
 from twin.world.mission import Mission, prepare
 from twin.world.rendered_world import RenderedWorld
@@ -36,7 +36,8 @@ def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, .
         frames: the recorded frames.
 
     Raises:
-        TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared.
+        TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared; or, from the
+            iterator `TrueLayers.frames`, a recorded image cannot be read.
     """
     poses, twists = _true_motion(folder / "frames" / "truth.npz", max(frame.index for frame in frames))
     mission = prepare(scenario)
@@ -60,7 +61,7 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
         if poses.shape != (n, 4, 4) or twists.shape != (n, 6) or n <= last or not np.isfinite(poses).all():
             raise ValueError(f"{n} poses, {last + 1} needed")
         return poses, twists
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
         raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
 
 
@@ -108,11 +109,14 @@ def _truth(
         compared: recorded left image, and `FrameTruth.identical`.
     """
     recorded, identical = compared
-    normals = floor_normals(mission.terrain, view.depth, world_from_camera, mission.rig)
+    normals = floor_normals(mission.rendered_terrain, view.depth, world_from_camera, mission.rig)
     labels = np.zeros(view.depth.shape, np.uint16)
     if view.objects is not None:
         labels = view.objects.label
         normals = np.where(labels[..., None] > 0, view.objects.normal, normals)
+        labels = np.where(
+            labels > len(mission.objects), np.uint16(0), labels
+        )  # the tiles of a mesh floor are the floor
     light = {name: getattr(view.components, key) for name, key in _LIGHT.items()}
     return FrameTruth(
         frame, view.depth, normals, view.albedo, view.albedo,
@@ -122,10 +126,10 @@ def _truth(
 
 
 def _difference(recorded: Image, noise_free: Image) -> float:
-    """Returns the RMS of recorded minus factor times rendered image [grey levels], over pixels below full scale.
+    """Returns the RMS of recorded minus factor times rendered image [grey levels], over values below full scale.
 
     The factor is the one with the smallest RMS. It is needed because auto-exposure follows the light with a delay, and
-    the image rendered again is exposed without this delay.
+    the image rendered again is exposed without this delay. 0 if no value is below full scale in both images.
     """
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
@@ -142,8 +146,8 @@ def _camera_in_clear_water(mission: Mission, world: RenderedWorld) -> StereoCame
     clear = {"water": WaterConfig(jerlov="clear"), "snow": SnowConfig()}
     scenario = mission.scenario.model_copy(update=clear)
     rig, rng = mission.true_cameras.rendered_rig, np.random.default_rng(0)
-    objects = Objects(mission.objects, np.array(scenario.current.velocity_mps)) if mission.objects else None
-    light = ImageFormation(scenario, illumination_of(scenario), mission.terrain, rng, rig, objects)
+    floor, objects = mission.rendered_terrain, mission.rendered_objects()
+    light = ImageFormation(scenario, illumination_of(scenario), floor, rng, rig, objects)
     return StereoCamera(world.renderer, light, scenario, rng, rng, Stopwatch(), mission.true_cameras)
 
 
@@ -182,13 +186,13 @@ def optical_flow(
     """Returns the displacement (H, W, 2), columns and rows [px], of the points of a static scene in the next image.
 
     Args:
-        depth_m, next_depth_m: (H, W) depths in both images; inf where there is nothing.
+        depth_m, next_depth_m: (H, W) depths in this and in the next image; inf where there is nothing.
         next_from_camera: (4, 4) pose of this camera in the axes of the next one.
         rig: calibration of both images.
 
     Returns:
-        Displacements; NaN where a point is outside the next image or there is nothing, and where the point is hidden:
-            more than 2 % deeper than all pixels of the next image in the 3 x 3 pixels around it.
+        Displacements; NaN where there is nothing, where the point is outside the next image, and where it is hidden
+        there: more than 2 % deeper than each of the 3 x 3 pixels around it.
     """
     shape = depth_m.shape
     known = np.isfinite(depth_m).ravel()

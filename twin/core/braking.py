@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-#: If no motion has been measured for BLIND_S, the vehicle stops: its speed decays with the time constant BRAKING_S [s].
+#: If no motion has been measured for more than BLIND_S, the vehicle stops: its speed decays with the time constant
+#: BRAKING_S [s].
 BLIND_S, BRAKING_S = 0.5, 1.0
 
 

@@ -19,7 +19,7 @@ class HeightField(NamedTuple):
     floor in cells with a NaN corner and outside the grid.
 
     Args:
-        height_m: (ny, nx) heights of the nodes, row 0 = SOUTH, column 0 = west.
+        height_m: (ny, nx) heights of the nodes, row 0 = south, column 0 = west.
         spacing_m: distance between neighbouring nodes.
         west_m, south_m: position of node (0, 0).
         lowest_m, highest_m: height of the lowest and of the highest node.
@@ -34,7 +34,7 @@ class HeightField(NamedTuple):
 
 
 def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float, south_m: float) -> HeightField:
-    """Returns the height field with the node heights (ny, nx): at least 2 x 2 nodes, one of them or more finite."""
+    """Returns the height field with node heights (ny, nx) [m]: at least 2 x 2 nodes, at least one of them finite."""
     height = np.ascontiguousarray(height_m, np.float64)
     return HeightField(
         height, float(spacing_m), float(west_m), float(south_m), float(np.nanmin(height)), float(np.nanmax(height))
@@ -92,8 +92,8 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 
     The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
     each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
-    is also inf if d does not point downwards, if this traversal starts outside the grid, or if it enters a cell without
-    floor before the ray meets the floor.
+    is 0 if o lies below the floor, and inf also if d does not point downwards, if this traversal starts outside the
+    grid, or if it enters a cell without floor before the ray meets the floor.
     """
     if not dz < 0:
         return np.inf
@@ -128,7 +128,8 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     """Returns t in [start, end] at which the ray meets the floor of a cell; inf if it does not, NaN if a corner is NaN.
 
-    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u and v from 0 to 1 over the cell.
+    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell. If it
+    is below the floor at `start` already, the result is `start`.
     """
     h00, h01, h10, h11 = height[r, c], height[r, c + 1], height[r + 1, c], height[r + 1, c + 1]
     top = max(max(h00, h01), max(h10, h11))

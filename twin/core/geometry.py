@@ -109,9 +109,9 @@ def product(a: Array, b: Array) -> Array:
 def nearest_rigid(matrices: Array) -> Array:
     """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    Removes the rounding errors that long products of motions accumulate. `inverse` transposes the rotation, which is
-    exact only for an orthogonal matrix: if R deviates from orthogonality, R^T R deviates from the identity by twice as
-    much.
+    Long products of motions accumulate rounding errors, so that their rotations are no longer orthogonal. `inverse`
+    transposes the rotation, which is exact only for an orthogonal matrix: if R deviates from orthogonality, R^T R
+    deviates from the identity by twice as much.
     """
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 

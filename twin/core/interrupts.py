@@ -71,7 +71,7 @@ class StageGuard:
 
     @property
     def reason(self) -> str:
-        """Returns why a survey was aborted, with the skipped stages: "interrupted; map skipped"; "" if it was not."""
+        """Returns why a survey was aborted and the skipped stages ("interrupted; map skipped"); "" if it was not."""
         return f"{self.cause or 'interrupted'}; {', '.join(self.skipped)} skipped" if self.skipped else self.cause
 
     def _receive(self, number: int, frame: FrameType | None) -> None:

@@ -11,7 +11,7 @@ from twin.core.geometry import Array
 def nearest_index(sorted_s: Array, times_s: Array) -> NDArray[np.int64]:
     """Returns the index (n,) of the element of the sorted times (m,) that is nearest to each of the times (n,) [s].
 
-    The sorted times are not empty. Of two elements at the same distance, the earlier one is the nearest.
+    The sorted times must not be empty. Of two elements at the same distance, the earlier one is chosen.
     """
     after = np.clip(np.searchsorted(sorted_s, times_s), 1, max(len(sorted_s) - 1, 1))
     last = len(sorted_s) - 1

@@ -17,7 +17,7 @@ def optional(module: str, extra: str, purpose: str) -> Any:
         purpose: command or option that needs the package, for the message.
 
     Raises:
-        TwinError: the package is not installed.
+        TwinError: the package, or this module of it, is not installed.
         ModuleNotFoundError: another package, which the module imports, is not installed.
     """
     try:

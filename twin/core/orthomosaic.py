@@ -40,7 +40,11 @@ def finer_grid(grid: MapGrid, pixel_m: float) -> MapGrid:
 
 
 def tile_side_px(n: int) -> int:
-    """Returns the side of a tile [px]: the largest multiple of n up to `TILE_PX`, but at least n (one map cell)."""
+    """Returns the side of a tile [px]: the largest multiple of n up to `TILE_PX`, but at least n.
+
+    Args:
+        n: number of pixels along the side of a map cell.
+    """
     return max(TILE_PX - TILE_PX % n, n)
 
 

@@ -25,7 +25,10 @@ def resolved(path: Path) -> Path:
 
 
 def path_problem(path: Path) -> str | None:
-    """Returns why a path can neither exist nor be created, or None."""
+    """Returns why the file system rejects a path (null byte, too long, loop of links, no permission), or None.
+
+    The path need not exist.
+    """
     text = str(path)
     if "\0" in text:
         return "contains a null byte"

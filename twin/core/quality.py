@@ -18,8 +18,8 @@ class EpipolarError(NamedTuple):
             row offset [focal lengths].
         sigma: (4,) standard deviations of `estimate`.
         removed: (4,) errors corrected in the right images, in the same units; yaw is never corrected.
-        pattern: RMS over the regions of the image of the mean row difference that `estimate` does not explain, without
-            the part due to matching noise [focal lengths].
+        pattern: weighted RMS over the regions of the image of the mean row difference that `estimate` does not
+            explain, without the part due to matching noise [focal lengths].
     """
 
     estimate: Array
@@ -49,11 +49,12 @@ class EstimationQuality(NamedTuple):
         links_tried, links_failed: number of attempted and of failed measurements of links between nodes.
         link_residual: median over the links of the residual of the matched points (robust standard deviation),
             divided by its expected value; None without a measured link.
-        link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected.
+        link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected;
+            None without an alignment.
         epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
         frame_sigma_m: standard deviation (3-D) of the position of a frame relative to the last keyframe, by
-            frame-to-frame motion alone, just before the next keyframe; 90th percentile over the keyframes [m]; None
-            without a second keyframe.
+            frame-to-frame motion alone, just before the next keyframe; 90th percentile over the keyframes [m]; None if
+            it is not known at any keyframe.
         disparity_offset: offset of all disparities that the links imply; None without images, or if the offset is
             not observable.
     """

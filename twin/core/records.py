@@ -201,7 +201,7 @@ class Frame:
         time_s: time of the exposure [s].
         left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
         readings: readings of the navigation sensors.
-        keyframe: whether the frame becomes a keyframe; None leaves the choice to the estimator.
+        keyframe: whether the frame is to become a keyframe; None leaves the choice to the estimator.
         exposure: linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)], 1 at full scale,
             from the exposure time, gain and white balance that the cameras report; None if they report none.
     """
@@ -221,7 +221,7 @@ class Estimate(NamedTuple):
     Args:
         time_s: time of the frame.
         world_from_camera: (4, 4) online pose of the left camera.
-        f2f_from_start: (4, 4) pose of the left camera from frame-to-frame motion alone.
+        f2f_from_start: (4, 4) world_from_camera from the start pose and frame-to-frame motion alone.
         camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
         sigma_m: standard deviation of the online position: root of the sum of the variances of x, y and z [m].
         status: "ok", or the reason why vision failed at this frame.
@@ -264,7 +264,7 @@ class Trajectory:
 
     @staticmethod
     def load(path: Path) -> Trajectory:
-        """Reads a TUM file."""
+        """Returns the trajectory in a TUM file, as written by `save`."""
         rows = np.loadtxt(path, ndmin=2)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
@@ -299,11 +299,10 @@ class StereoObservation(NamedTuple):
         n_points: number of matched points; with the surrogate, the number predicted by its error model.
         contrast: local RMS contrast of the left image (`matching.contrast`); None without an image.
         saturated: fraction of the pixel values of the left image at full scale; None without an image.
-        row_offset_px: median row difference of the matched points, right minus left [px]; None without points of an
-            image.
-        row_spread_px: robust standard deviation of the row differences [px]; None without points of an image.
-        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None without points of
-            an image.
+        row_offset_px: median row difference of the matched points, right minus left [px]; None if not measured.
+        row_spread_px: robust standard deviation of the row differences [px]; None if not measured.
+        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None if they are not
+            measured.
         repetition: largest autocorrelation of the left image away from its main peak; None without an image.
     """
 
@@ -318,7 +317,7 @@ class StereoObservation(NamedTuple):
 
     @property
     def row_spread_ratio(self) -> float | None:
-        """Returns the spread of the row differences / their expected standard deviation; None if one is not known."""
+        """Returns row_spread_px / row_sigma_px (1 for the expected matching noise); None if one is not known."""
         return self.row_spread_px / self.row_sigma_px if self.row_spread_px is not None and self.row_sigma_px else None
 
 
@@ -329,16 +328,17 @@ class SurveyResult:
     Args:
         f2f: trajectory from frame-to-frame motion alone.
         online: trajectory of the online estimates.
-        final: trajectory after the last global alignment.
+        final: trajectory after the last global alignment; `online` if `EstimatorSettings.use_ga` is false.
         keyframe_rows: (n_keyframes,) row of each keyframe in the trajectories.
         track_of_keyframe: (n_keyframes,) track number of each keyframe, from 1.
-        node_cov: (n_keyframes, 6, 6) marginal covariance of each final keyframe pose, [rotation, translation] (rad, m)
-            in camera axes.
+        node_cov: (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the final pose of the latest node up
+            to it (its own pose if every keyframe is a node), [rotation, translation] (rad, m) in the camera axes of
+            that node; without a final alignment, the covariance of the last online pose for every keyframe.
         keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
         links: measured motions of the network.
         alignments: size and wall time of each global alignment.
-        before_ga, after_ga: per track, positions (n, 3) of the keyframes so far, just before and just after the global
-            alignment at the end of the track [m].
+        before_ga, after_ga: for each global alignment at the end of a track, positions (n, 3) of the keyframes so far,
+            just before and just after it [m].
         stereo_observations: image quality of all stereo pairs, including those with too few points for a keyframe.
         quality: consistency of the estimates, measured by the estimators.
     """
@@ -359,7 +359,7 @@ class SurveyResult:
 
     @property
     def step_cov(self) -> Array:
-        """Returns the covariance (n_keyframes, 6, 6) of the link from the previous keyframe to each one, else zeros."""
+        """Returns the covariance (n_keyframes, 6, 6) of the link from the previous keyframe; zeros without a link."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))
         chain = self.links.j == self.links.i + 1
         cov[self.links.j[chain]] = self.links.own_cov[chain]
@@ -416,7 +416,7 @@ class ElevationMap:
 
 @dataclass
 class Truth:
-    """Ground truth of a survey; only `judge` compares it with the estimates.
+    """Ground truth of a survey, which no estimator receives.
 
     Args:
         trajectory: true poses of the left camera, one per frame.
@@ -431,9 +431,10 @@ class Truth:
         albedo: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from
             above, 255 = white; NaN where there is no floor or an object lies on it. None: not known.
         in_area: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
-        objects: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None without
-            objects. `height_m` is that of the highest surface, floor or object.
-        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object; None without objects.
+        objects: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a
+            height grid without objects. `height_m` is that of the highest surface, floor or object.
+        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor.
+            Both arrays are given for a mesh floor, also without objects.
     """
 
     trajectory: Trajectory

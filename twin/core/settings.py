@@ -29,8 +29,8 @@ class EstimatorSettings:
         points: largest number of matched points of a keyframe.
         patch_px: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an
             even value, it is one pixel larger.
-        keyframe_overlap: a frame becomes a keyframe if its overlap with the last keyframe is below this fraction; used
-            only if the caller does not choose the keyframes.
+        keyframe_overlap: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is
+            expected to be below this fraction; used only if the caller does not choose the keyframes.
         wide_search: whether a link that cannot be measured from the predicted poses is searched for in the whole
             images, for large or unpredictable motions between keyframes; costs time only where links fail.
 

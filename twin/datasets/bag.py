@@ -112,7 +112,7 @@ class Bag:
         """Returns the message at a position, decoded.
 
         Raises:
-            ValueError: the message is damaged.
+            ValueError: the message is damaged or missing.
         """
         try:
             connections = self._connections([position.topic])
@@ -153,7 +153,11 @@ class Bag:
 
 
 def _files(path: Path) -> list[Path]:
-    """Returns the files of a bag, which lie in its folder; raises TwinError if its metadata are damaged."""
+    """Returns the files of a bag: the path itself, or the files that metadata.yaml lists in the folder of the bag.
+
+    Raises:
+        TwinError: metadata.yaml is damaged, the bag is compressed, or a file is missing.
+    """
     if not path.is_dir():
         return [path]
     source = path / "metadata.yaml"
@@ -212,7 +216,7 @@ def _bound_decompression() -> None:
     lz4 = optional("lz4.frame", "exchange", _PURPOSE)
 
     def limited(size: int) -> int:
-        """Returns the size that a decompressor may return: one byte more than the chunk states.
+        """Returns the largest number of bytes that a decompressor may return: one more than the chunk states.
 
         Raises:
             ValueError: the chunk states more than `_MOST_CHUNK_BYTES`.

@@ -51,7 +51,7 @@ def stereo_calibration(
 
 
 def add_transforms(found: Transforms, message: Any, file: Path) -> None:
-    """Adds the transforms of a message tf2_msgs/TFMessage: frame -> (parent, (4, 4) pose of the frame in its parent).
+    """Adds the transforms of a message tf2_msgs/TFMessage to `found`: frame -> (parent, pose of the frame in it).
 
     Raises:
         TwinError: a transform is not a pose.
@@ -103,7 +103,8 @@ def _camera(info: Any, rectified: bool, file: Path) -> RecordedCamera:
     """Returns the camera of a message CameraInfo.
 
     Raises:
-        TwinError: the images are not rectified, and the lens model or a part of the images is not supported.
+        TwinError: the images are not rectified, and their lens model is not supported, or they are binned or show only
+            a region of interest.
     """
     size = (int(info.width), int(info.height)) if info.width and info.height else None
     if rectified:

@@ -17,6 +17,7 @@ from twin.datasets.bag_calibration import (
     stereo_calibration,
 )
 from twin.datasets.bag_images import BagImage
+from twin.datasets.bag_readings import read_bag
 from twin.datasets.bag_topics import StereoTopics, image_topics, stereo_topics
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
@@ -67,7 +68,8 @@ class BagReader:
         """Returns the data set in a bag; images are decoded only when they are used.
 
         Raises:
-            TwinError: the bag, its transforms or its true poses are damaged, or its image topics are ambiguous.
+            TwinError: the bag, its transforms or its true poses are damaged, its image topics are ambiguous, or it
+                lacks a topic that the user names.
         """
         bag = Bag(folder)
         topics = self._stereo_topics(bag)
@@ -84,7 +86,9 @@ class BagReader:
         if self._topics.truth is not None:
             truth, note = _truth(bag, self._topics.truth, _frame(bag, topics.left), transforms)
             notes += [note] if note else []
-        return Dataset(folder, frames, calibration, truth, n_right_only, tuple(notes))
+        camera = _frame(bag, topics.left)
+        readings = value_or_error(lambda: read_bag(bag, camera, transforms))
+        return Dataset(folder, frames, calibration, truth, n_right_only, tuple(notes), readings=readings)
 
     def _stereo_topics(self, bag: Bag) -> StereoTopics:
         """Returns the image topics of both cameras: those that the user names, or the only pair in the bag.

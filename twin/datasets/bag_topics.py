@@ -52,8 +52,8 @@ def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any],
     """Returns the only stereo pair among image topics.
 
     A topic of uncompressed images takes precedence over the topic of the same images in compressed form. Left and
-    right are recognised by words in the topics, such as "left" or "cam0"; without such words, the right camera is the
-    one whose projection matrix has a baseline.
+    right are recognised by words in the topics, such as "left" or "cam0"; if these do not decide and two topics have a
+    calibration, the right camera is the one whose projection matrix has a baseline.
 
     Args:
         images: image topics, each with the topic of its calibration (None: not recorded).

@@ -66,7 +66,7 @@ def camera_from_kalibr(table: Any, file: Path) -> RecordedCamera:
     """Returns a camera of a Kalibr camchain or of an ASL sensor.yaml (keys `intrinsics`, `distortion_coefficients`).
 
     Raises:
-        TwinError: a key is missing, or the camera model is not supported.
+        TwinError: a key is missing or not valid, or the camera or lens model is not supported.
     """
     table = _table(table, file)
     if (model := table.get("camera_model", "pinhole")) != "pinhole":
@@ -193,7 +193,11 @@ def _table(value: Any, file: Path) -> Mapping[str, Any]:
 
 
 def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Returns a list of numbers as an array; raises TwinError, naming the key, if the value is not such a list."""
+    """Returns a list of finite numbers as an array, of a shape if it is given.
+
+    Raises:
+        TwinError: the value is not such a list, or has another number of numbers; the message names the key.
+    """
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -14,6 +14,7 @@ from twin.core.nearest import nearest_index
 from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.image_files import ImageSource
+from twin.datasets.readings import RecordedReadings
 from twin.errors import TwinError
 
 #: Largest time between the two images of a stereo pair: as a fraction of the median interval between left images, and
@@ -59,6 +60,8 @@ class Dataset:
         frame_times_s: (n,) times of all frames, with or without a left image [s], in the clock of the data set; None:
             the times of `images`.
         body_from_left: (4, 4) pose of the left camera in the body that recorded poses refer to; None if unknown.
+        readings: recorded readings of navigation sensors; None if the data set has none; a TwinError if they cannot be
+            read, which is raised unless the user replays without them.
     """
 
     folder: Path
@@ -69,6 +72,7 @@ class Dataset:
     notes: tuple[str, ...] = ()
     frame_times_s: Array | None = None
     body_from_left: Array | None = None
+    readings: RecordedReadings | TwinError | None = None
 
 
 class Reader(Protocol):

@@ -1,4 +1,4 @@
-"""Reader of EuRoC/ASL folders (Burri et al. 2016): mav0/cam0, mav0/cam1, true poses of the body."""
+"""Reader of EuRoC/ASL folders (Burri et al. 2016): mav0/cam0, mav0/cam1, true poses and readings of the body."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration, checked, is_rigid
 from twin.datasets.calibration_files import camera_from_kalibr, pose_of
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
+from twin.datasets.readings import read_folder
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
@@ -30,7 +31,7 @@ class EurocReader:
     layout = "mav0/cam0 and mav0/cam1, each with data.csv, data/ and sensor.yaml"
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder, or its subfolder mav0, has the images of two cameras."""
+        """Returns whether a folder, or its subfolder mav0, has the image lists (data.csv) of two cameras."""
         return all((_root(folder) / camera / "data.csv").is_file() for camera in ("cam0", "cam1"))
 
     def read(self, folder: Path) -> Dataset:
@@ -50,7 +51,8 @@ class EurocReader:
         elif (root / _POSITIONS / "data.csv").is_file():
             notes = (f"The true positions ({_POSITIONS}) are not used: they have no attitude.",)
         times_s = np.array([image.time_s for image in left])
-        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left)
+        readings = None if body_from_left is None else value_or_error(lambda: read_folder(root, body_from_left))
+        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left, readings)
 
 
 def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.records import Frame, Image
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset
@@ -14,6 +17,7 @@ from twin.datasets.image_files import Bayer, ImageSource, UnreadableImage, image
 from twin.datasets.rectification import Rectification, rectification
 from twin.errors import TwinError
 
+_OUT_OF_ORDER = "time out of order"
 _NOMINAL_HZ = 1.0  # frame rate of a data set without two frames at different times
 
 
@@ -28,6 +32,7 @@ class RecordedFrames:
     Attributes:
         rectification: conversion of the recorded images to a rectified pair.
         start_s: time of the first frame in the clock of the data set [s]; the times of frames are relative to it.
+            Frames out of the order of time are left out (`increasing`).
         skipped: number of frames or right images that could not be used, by reason, filled while the frames are read.
 
     Raises:
@@ -40,8 +45,10 @@ class RecordedFrames:
         self.rectification: Rectification = rectification(
             calibration.for_images(*self.size_px), _frame_rate_hz(dataset)
         )
-        self._format = image_format([frame.left for frame in dataset.images], self.size_px, bayer)
-        self.start_s = dataset.images[0].time_s
+        sources = [*(frame.left for frame in dataset.images), *(f.right for f in dataset.images if f.right is not None)]
+        self._format = image_format(sources, self.size_px, bayer)
+        self._in_order = increasing(np.array([frame.time_s for frame in dataset.images]))
+        self.start_s = dataset.images[int(np.argmax(self._in_order))].time_s
         self.skipped = Counter[str]()
 
     def __len__(self) -> int:
@@ -53,16 +60,15 @@ class RecordedFrames:
         self.skipped = Counter[str]()
         if self.dataset.n_right_only:
             self.skipped["right image without left image"] = self.dataset.n_right_only
-        index, last_s = 0, -np.inf
-        for images in self.dataset.images:
-            if images.time_s <= last_s:
-                self.skipped["time not after that of the frame before"] += 1
+        index = 0
+        for images, in_order in zip(self.dataset.images, self._in_order, strict=True):
+            if not in_order:
+                self.skipped[_OUT_OF_ORDER] += 1
                 continue
             left = self._read(images.left, "left")
             if left is None:
                 continue
             right = self._read(images.right, "right")
-            last_s = images.time_s
             yield Frame(
                 index,
                 images.time_s - self.start_s,
@@ -70,6 +76,13 @@ class RecordedFrames:
                 None if right is None else self.rectification.right(right),
             )
             index += 1
+
+    @property
+    def unused(self) -> int:
+        """Returns the number of frames that could not be used, so far; frames without a right image are used."""
+        return sum(
+            count for reason, count in self.skipped.items() if reason == _OUT_OF_ORDER or reason.startswith("left")
+        )
 
     def _read(self, image: ImageSource | None, side: str) -> Image | None:
         """Returns an image; if it cannot be used, counts the reason in `skipped` and returns None."""
@@ -92,6 +105,30 @@ class RecordedFrames:
                 return frame
         reasons = "; ".join(f"{reason}: {count}" for reason, count in self.skipped.items())
         raise TwinError(str(self.dataset.folder), f"has no usable stereo pair ({reasons})", "at least one stereo pair")
+
+
+def increasing(times_s: Array) -> NDArray[np.bool_]:
+    """Returns a mask (n,) of a largest set of frames whose times increase in the order of the data set.
+
+    It is a longest increasing subsequence (Schensted 1961): one wrong time loses one frame, wherever it is.
+
+    Args:
+        times_s: (n,) times of the frames [s].
+    """
+    ends: list[float] = []  # for each length, the smallest last time of a sequence
+    rows: list[int] = []  # and its row
+    before = np.full(len(times_s), -1)
+    for k, time_s in enumerate(times_s.tolist()):
+        length = bisect_left(ends, time_s)
+        if length < len(ends) and ends[length] == time_s:
+            continue  # of frames at the same time, the first one is kept
+        before[k] = rows[length - 1] if length else -1
+        ends[length : length + 1], rows[length : length + 1] = [time_s], [k]
+    kept = np.zeros(len(times_s), np.bool_)
+    k = rows[-1] if rows else -1
+    while k >= 0:
+        kept[k], k = True, int(before[k])
+    return kept
 
 
 def _first_size(dataset: Dataset) -> tuple[int, int]:

@@ -25,7 +25,10 @@ _N_SAMPLES = 8  # number of images from which the number of used bits is determi
 
 
 class UnreadableImage(Exception):  # noqa: N818 (the frame is skipped)
-    """An image cannot be used; the message is a short reason without the file name, by which images are counted."""
+    """An image cannot be used.
+
+    The message is a short reason without the file name, so that unusable images can be counted by reason.
+    """
 
 
 class ImageFormat(NamedTuple):
@@ -76,7 +79,7 @@ def image_size(image: ImageSource) -> tuple[int, int]:
     """Returns (width, height) of an image [px], from its header.
 
     Raises:
-        UnreadableImage: the file is missing, too large or no image.
+        UnreadableImage: the image is missing, damaged, too large or of an unknown encoding.
     """
     return encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
 
@@ -115,7 +118,7 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
 
     Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
     is the smallest one, at least 8, that holds the largest value in the sample. It is the same for all images of a
-    data set, so that grey levels stay comparable.
+    data set, of both cameras, so that grey levels stay comparable.
     """
     largest = 0
     for k in np.unique(np.linspace(0, len(images) - 1, _N_SAMPLES).astype(int)):

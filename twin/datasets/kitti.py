@@ -30,7 +30,7 @@ class KittiReader:
         """Returns the data set in a folder.
 
         Raises:
-            TwinError: the list of times is damaged, or an image has no time in it.
+            TwinError: the list of times is damaged, an image has no time in it, or an image lies elsewhere.
         """
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))

@@ -29,7 +29,7 @@ class PlainFolderReader:
         return (folder / "left").is_dir() and (folder / "right").is_dir()
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if its times are damaged."""
+        """Returns the data set in a folder; raises TwinError if its times are damaged or an image lies elsewhere."""
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
         times_s, notes = _times(folder / "times.txt", names)
@@ -57,12 +57,17 @@ def image_files(folder: Path) -> dict[str, Path]:
     """Returns the image files of a folder, by file name without suffix.
 
     Raises:
-        TwinError: an image is a symbolic link that leads out of the folder.
+        TwinError: an image is a symbolic link that leads out of the folder, or two images have the same name without
+            suffix.
     """
     if not folder.is_dir():
         return {}
-    files = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES]
-    return {file.stem: inside(folder, file.name, folder) for file in sorted(files)}
+    found: dict[str, Path] = {}
+    for file in sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES):
+        if file.stem in found:
+            raise TwinError(str(folder), f"has several images called {file.stem[:100]!r}", "one suffix per name")
+        found[file.stem] = inside(folder, file.name, folder)
+    return found
 
 
 def _natural_order(name: str) -> list[tuple[int, int | str]]:

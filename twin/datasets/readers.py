@@ -22,7 +22,7 @@ def all_readers(topics: BagTopics | None = None) -> list[Reader]:
         topics: topics of a ROS 2 bag that the user names.
 
     Raises:
-        TwinError: a registered reader cannot be imported.
+        TwinError: a registered reader cannot be imported or created, or lacks a member of `Reader`.
     """
     return [*_registered(), BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
 

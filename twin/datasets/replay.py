@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,9 +15,10 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
 from twin.core.paths import is_file
-from twin.core.records import ElevationMap, SurveyResult, Trajectory
+from twin.core.records import ElevationMap, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import Stopwatch, timing_summary
+from twin.datasets.aiding import Aiding, Opening, Start
 from twin.datasets.bag import is_bag
 from twin.datasets.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration
@@ -30,13 +32,22 @@ from twin.estimate import Navigator
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
 from twin.estimate.pipeline import finish_in_stage
 from twin.estimate.self_check import check_survey
+from twin.estimate.stereo_vision import StereoVision
 from twin.judge import recorded
 from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay, unevaluated_replay
+from twin.plugin.guard import check_loadable
+from twin.plugin.loading import ESTIMATORS
+from twin.plugin.navigator import NOTE, PluginNavigator
+from twin.plugin.protocols import EstimatorSetup
 from twin.report.replay_description import describe_replay
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder, SurveyRecord
 
-#: A segment of the path ends, and the network is aligned, after this fraction of the keyframes so far, within limits.
+#: A segment of the path ends, and the network is aligned, when the number of keyframes since the last alignment is this
+#: fraction of all keyframes so far, within limits.
 _SEGMENT_SHARE, _SEGMENT_KEYFRAMES = 0.3, (10, 100)
+ESTIMATOR_OPTION = "--estimator"  # option of `twin replay` that names a plug-in
+_MOST_RESIDUAL = 2.0  # largest RMS of the residuals of readings [standard deviations] without a warning
+_MOST_UNUSED = 0.1  # largest fraction of unusable frames of a complete replay
 _ALL_TRACKS = 1000  # every earlier node may be linked to a new one: there is no plan that says where loops close
 
 Progress = Callable[[str, float], None]
@@ -51,11 +62,15 @@ class ReplayOptions:
         truth: file of true poses, or for a ROS 2 bag the topic of true poses; None: that of the data set.
         alignment: how the estimates are moved to the truth before the comparison.
         bayer: pattern of raw images; None: grey or colour images.
-        settings: settings of the estimators; None: the defaults.
+        settings: settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the
+            defaults.
         start: (4, 4) pose world_from_camera of the left camera at the first frame; None: the plane z = 0 of the world
             is fitted to the floor in the first pair.
         outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
         topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
+        aiding: whether recorded readings of pressure, attitude and DVL are used.
+        estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
+            whose poses the map is built; None: the estimators of `twin.estimate`.
     """
 
     calibration: Path | None = None
@@ -66,6 +81,8 @@ class ReplayOptions:
     start: Array | None = None
     outputs: Collection[str] = OPTIONAL_OUTPUTS
     topics: tuple[str, str] | None = None
+    estimator: str | None = None
+    aiding: bool = True
 
 
 class ReplayResult(NamedTuple):
@@ -90,13 +107,14 @@ class OpenedDataset(NamedTuple):
     """A data set that is ready to be replayed.
 
     Args:
-        name: name of the data set: that of its folder.
+        name: name of the data set: that of its folder or file.
         reader: name of the reader of its layout.
         dataset: the data set.
         frames: its rectified frames.
         truth: true poses of the rectified left camera, at times relative to the first frame; None without a truth.
         pair: the first stereo pair.
         plane: plane of the floor in the axes of the left camera at the first pair.
+        aiding: readings of the navigation sensors; None if none were recorded or they are not wanted.
     """
 
     name: str
@@ -106,10 +124,13 @@ class OpenedDataset(NamedTuple):
     truth: Trajectory | None
     pair: PairInspection
     plane: FloorPlane
+    aiding: Aiding | None
 
     @property
     def plane_text(self) -> str:
         """Returns a phrase that states how the plane of the map was chosen."""
+        if self.aiding is not None and "attitude" in self.aiding.used:
+            return "plane of the map horizontal by the recorded attitude"
         return f"plane of the map {'fitted to the floor' if self.plane.fitted else 'perpendicular to the first view'}"
 
 
@@ -131,20 +152,21 @@ def replay(
             written.
     """
     chosen = options or ReplayOptions()
+    check_loadable(ESTIMATOR_OPTION, ESTIMATORS, chosen.estimator)
     opened = open_dataset(folder, chosen)
     settings = replace(chosen.settings or EstimatorSettings(), window_tracks=_ALL_TRACKS, wide_search=True)
-    start = opened.plane.world_from_camera if chosen.start is None else chosen.start
-    rig, stopwatch, guard = opened.frames.rectification.rig, Stopwatch(), StageGuard()
-    description = describe_replay(opened.name, _source(opened), rig, settings)
+    flight = _prepared(opened, chosen, settings)
+    stopwatch, guard = Stopwatch(), StageGuard()
+    description = describe_replay(opened.name, _source(opened), flight.rig, settings, chosen.estimator)
     start_s = time.perf_counter()
     with (
         guard,
         RunFolder(out, description, chosen.outputs) as written,
-        Navigator(rig, settings, start, folder=out / "keyframes", stopwatch=stopwatch) as navigator,
+        _navigator(chosen.estimator, flight, settings, out / "keyframes", stopwatch) as navigator,
     ):
         try:
             with guard.stage():
-                _estimate(opened.frames, navigator, progress)
+                _estimate(opened, navigator, progress)
         except (SurveyAborted, OSError, KeyboardInterrupt) as error:
             guard.cause = str(error) or "interrupted"
         result = finish_in_stage(navigator, guard)
@@ -161,6 +183,59 @@ def replay(
         )
         metrics = written.finish(record, guard)
     return ReplayResult(metrics["status"], metrics, out, result, elevation)
+
+
+class _Prepared(NamedTuple):
+    """Input of the estimators of a replay besides the frames.
+
+    Args:
+        rig: rectified rig, with the pose of the left camera in the body if readings are used.
+        start: pose at the first frame.
+        noise: noise of the readings.
+    """
+
+    rig: StereoRig
+    start: Start
+    noise: SensorNoise
+
+
+def _prepared(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> _Prepared:
+    """Returns rig, start and sensor noise; the start is found from the readings where they have an attitude."""
+    rig, over_plane, aiding = opened.frames.rectification.rig, opened.plane.world_from_camera, opened.aiding
+    start = Start(over_plane if options.start is None else options.start)
+    if aiding is None:
+        return _Prepared(rig, start, SensorNoise())
+    rig = replace(rig, body_from_camera=aiding.body_from_camera)
+    opening = Opening(opened.frames, rig, settings, over_plane)
+    return _Prepared(rig, aiding.start(opening, options.start) or start, aiding.noise)
+
+
+@contextmanager
+def _navigator(
+    estimator: str | None, prepared: _Prepared, settings: EstimatorSettings, folder: Path, timer: Stopwatch
+) -> Iterator[Navigator]:
+    """Yields the estimators of `twin.estimate`, or those of a plug-in if `estimator` names one.
+
+    Args:
+        estimator: name of the plug-in, or None.
+        prepared: rig, start and sensor noise.
+        settings: settings of the estimators.
+        folder: folder of the keyframe images.
+        timer: timer of the stages.
+    """
+    rig, start, noise = prepared
+    if estimator is None:
+        with Navigator(rig, settings, start.world_from_camera, noise, folder=folder, stopwatch=timer) as navigator:
+            if start.cov is not None and start.prior_cov is not None:
+                navigator.set_start_cov(start.cov, start.prior_cov)
+            yield navigator
+        return
+    setup = EstimatorSetup(rig, start.world_from_camera, noise)
+    with (
+        StereoVision(rig, settings, folder, stopwatch=timer) as vision,
+        PluginNavigator(estimator, setup, settings, vision, timer, ESTIMATOR_OPTION) as navigator,
+    ):
+        yield navigator
 
 
 def alignment_name(name: str) -> AlignmentName:
@@ -223,14 +298,29 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     if plane is None:
         problem = f"only {len(pair.points.xyz)} points of the first pair are matched"
         raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
-    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane)
+    aiding = _aiding(dataset, frames) if options.aiding else None
+    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding)
+
+
+def _aiding(dataset: Dataset, frames: RecordedFrames) -> Aiding | None:
+    """Returns the readings of a data set for its rectified frames; None without any.
+
+    Raises:
+        TwinError: the readings are damaged.
+    """
+    if isinstance(dataset.readings, TwinError):
+        raise dataset.readings
+    if dataset.readings is None:
+        return None
+    rectified = frames.rectification
+    return Aiding(dataset.readings, rectified.left_from_rectified, frames.start_s, rectified.rig.frame_rate_hz)
 
 
 def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
     """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
 
     Raises:
-        TwinError: the file of the truth is damaged or its times do not fit those of the frames.
+        TwinError: the file of the truth is damaged, or none of its poses belongs to a frame (`associate`).
     """
     truth = dataset.truth if file is None else read_truth(file, dataset)
     if isinstance(truth, TwinError):
@@ -249,10 +339,12 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
     return moved
 
 
-def _estimate(frames: RecordedFrames, navigator: Navigator, progress: Progress) -> None:
-    """Passes all frames to the estimators; the network is aligned after each segment of keyframes."""
-    track, aligned = 1, 0
+def _estimate(opened: OpenedDataset, navigator: Navigator, progress: Progress) -> None:
+    """Passes all frames, with their readings, to the estimators; aligns the network after each segment of keyframes."""
+    track, aligned, frames = 1, 0, opened.frames
     for k, frame in enumerate(frames):
+        if opened.aiding is not None:
+            frame = replace(frame, readings=opened.aiding.at(frame.time_s))
         navigator.update(frame, track)
         n = len(navigator.network.keyframes)
         if n - aligned >= np.clip(_SEGMENT_SHARE * n, *_SEGMENT_KEYFRAMES):
@@ -270,13 +362,14 @@ def _evaluation(
 ) -> ReplayEvaluation:
     """Returns the input of the evaluation, without timing."""
     findings = check_survey(result, opened.frames.rectification.rig) if len(result.keyframe_rows) else []
-    reasons = [guard.reason] if guard.reason else [finding.sentence for finding in findings]
+    sentences = [*_unused(opened.frames), *(finding.sentence for finding in findings)]
+    reasons = [guard.reason] if guard.reason else sentences
     identity = {
         "name": opened.name,
         "seed": None,
         "version": version("seabed-twin"),
         "scenario_hash": None,
-        "status": "aborted" if guard.reason else "degraded" if findings else "complete",
+        "status": "aborted" if guard.reason else "degraded" if sentences else "complete",
         "reason": "; ".join(reasons),
     }
     skipped = dict(opened.frames.skipped)
@@ -289,8 +382,31 @@ def _evaluation(
         {},
         identity,
         source,
-        opened.dataset.notes,
+        _notes(opened, options, result),
     )
+
+
+def _unused(frames: RecordedFrames) -> list[str]:
+    """Returns a sentence if more than a tenth of the frames of the data set could not be used."""
+    if frames.unused <= _MOST_UNUSED * len(frames):
+        return []
+    return [f"{frames.unused} of {len(frames)} frames of the data set could not be used, see replay.skipped"]
+
+
+def _notes(opened: OpenedDataset, options: ReplayOptions, result: SurveyResult) -> tuple[str, ...]:
+    """Returns sentences on the assumptions of the reader, a plug-in, and readings that are not used or do not fit."""
+    notes = list(opened.dataset.notes)
+    if options.estimator is not None:
+        notes.append(NOTE.format(options.estimator))
+    if opened.aiding is not None:
+        notes += opened.aiding.notes
+        notes += [
+            f"The readings of {name} deviate from the final path by {ratio:.1f} standard deviations (RMS), where 1 is "
+            "expected: their noise is larger than stated, or they belong to another body or clock."
+            for name, ratio in opened.aiding.residuals(result.final).items()
+            if ratio > _MOST_RESIDUAL
+        ]
+    return tuple(notes)
 
 
 def _source(opened: OpenedDataset) -> dict[str, Any]:
@@ -300,6 +416,7 @@ def _source(opened: OpenedDataset) -> dict[str, Any]:
         "reader": opened.reader,
         "images": opened.frames.rectification.sentence,
         "plane": opened.plane_text,
+        "aiding": ", ".join(opened.aiding.used if opened.aiding is not None else []) or "none",
     }
 
 

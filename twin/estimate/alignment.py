@@ -68,7 +68,7 @@ def align(
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
-        LinAlgError: the links and the sensor readings do not constrain every node.
+        LinAlgError: the links, anchors and sensor readings do not constrain every node.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     graph = _factor_graph(nodes, links, anchors, rig, noise)
@@ -114,7 +114,7 @@ class _Window(NamedTuple):
     graph: FactorGraph
 
     def optimise(self, start: GraphState, max_iterations: int) -> Solution:
-        """Returns the solution at the local minimum of the cost that the iteration reaches from `start`."""
+        """Returns the solution reached from `start`, at a local minimum of the cost or after `max_iterations` steps."""
         return adjustment.optimise(self.graph, start, max_iterations)
 
     def outliers(self, chi2: Array) -> Mask:

@@ -1,11 +1,11 @@
 """Offset that all disparities share, estimated from the motions between keyframes.
 
-An error of a principal point along the rows of the image adds the same offset to all disparities, and leaves all rows
-as they are; so, nearly, does a small yaw of one camera. Depths, and with them the lengths of all motions, are then
-wrong. Over a floor with relief the offset is visible: near points must move by more pixels than far points, in
-proportion to their disparities, which they do not if there is an offset. Over a level floor the offset is not
-observable: errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the
-scatter of the links does not show them.
+An error of a principal point along the rows of the image adds the same offset to all disparities and does not change
+the rows of points. A small yaw of one camera has nearly the same effect. Depths, and with them the lengths of all
+motions, are then wrong. Over a floor with relief the offset is observable: image motions of near and far points must be
+proportional to their disparities, and are not if there is an offset. Over a level floor the offset is not observable:
+errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the scatter of
+the links does not show them.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def combine(
 
     Args:
         offsets: offset of each link, with a standard deviation that assumes independent links.
-        n_nodes: number of nodes from which the links start.
+        n_nodes: number of nodes that can have links to earlier nodes.
         n_views: mean number of nodes that see a point of the floor (`mean_views`).
         focal_px: focal length [px].
     """
@@ -58,7 +58,7 @@ def combine(
 
 
 def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> float:
-    """Returns the mean number of nodes that see a point of the floor which a node sees, at least 1.
+    """Returns the mean number of nodes that see a floor point in the image of a node, this node included.
 
     The overlap of two images is that of their rectangles on a plane at the depth of the first one, parallel to it;
     rotations about the optical axis are neglected.

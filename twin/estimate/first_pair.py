@@ -15,7 +15,7 @@ from twin.estimate.vision.disparity import Disparity
 from twin.estimate.vision.stereo import StereoPoints
 
 _MIN_POINTS = 30  # smallest number of matched points from which anything is concluded
-_SWAPPED_SHARE = 3  # the cameras are swapped if the exchanged images have this many times the matched points
+_SWAPPED_SHARE = 3  # the cameras are swapped if the exchanged images have at least this many times the matched points
 _TRIALS, _SEED = 300, 1
 _INLIER_SIGMAS = 2.5
 _ROUGHEST = 0.15  # largest scatter of the points about a floor plane, as a fraction of their median depth
@@ -30,7 +30,7 @@ class PairInspection(NamedTuple):
         rig: calibration of these images.
         disparity: dense disparity of the left image.
         points: matched points.
-        swapped: whether the left and the right image are exchanged.
+        swapped: whether the matches show that the left and the right image are exchanged.
     """
 
     left: Image
@@ -101,7 +101,7 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
 
 
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
-    """Returns the plane of the floor through the matched points of a pair; None for too few points.
+    """Returns the plane of the floor through the matched points of a pair; None for fewer than 30 points.
 
     Of the planes through 300 random triples of points, that with the smallest median distance of all points (least
     median of squares, Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard

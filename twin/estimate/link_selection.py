@@ -50,7 +50,8 @@ def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Arr
     """Returns the overlap (n,) of a node with the left image at each of the poses (n, 4, 4), 0 to 1.
 
     The overlap is the fraction of the node's matched points that project into the other image, at least half a patch
-    from its border. It is predicted from poses and depths, without the assumption of a flat floor.
+    from its border. It is predicted from poses and depths, without the assumption of a flat floor. It is 0 for a node
+    without points, and for a camera farther away than the diagonal of the footprint at the largest depth.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -73,8 +74,8 @@ def choose_links(
 
     Up to `max_links` candidates with sufficient overlap are selected, in this order of priority: the two previous
     nodes; the oldest node of the same swath, for the greatest distance along the path; the oldest node of all other
-    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, except that those whose keyframe
-    number differs by 1 from that of an already selected one of them come last.
+    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap. Of these remaining nodes, a node
+    that is a neighbour of one selected before it (no node lies between them) comes last.
 
     Args:
         node: the new node.
@@ -112,10 +113,10 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     Suppose that the shift of a patch is the same in all links of the path while the patch is in view. With the overlap
     q of consecutive nodes, links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in
     common. The variance of the summed error is then that of independent errors times
-    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), with l < m. In fact the shifts are only partly the same, because not
-    all corners are selected again and M changes with the viewing direction. The covariance is therefore also multiplied
-    by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because one such link
-    starts at every node.
+    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), summed over 1 <= l < m. In fact the shifts are only partly the same,
+    because not all corners are selected again and M changes with the viewing direction. The covariance is therefore
+    also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because
+    one such link starts at every node.
     """
     growth = RECURRENCE * (_links_over_a_footprint(links) - 1)
     factors = [len(links) * (1 + growth * link.floor_share) for link in links]
@@ -157,16 +158,19 @@ def _unbroken(linked: list[int], newest: int) -> list[int]:
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
     """Returns up to `count` of the indices `others` in their order, except that neighbours of chosen nodes come last.
 
-    Neighbours are nodes whose keyframe numbers differ by 1.
+    Neighbours are nodes between which there is no other node: their keyframe numbers differ by `node_stride`, the
+    smallest difference between consecutive nodes.
 
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
         earlier: candidate nodes in chronological order.
         count: largest number of indices.
     """
+    numbers = np.array([node.number for node in earlier])
+    stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
     chosen: list[int] = []
     for k in others:
-        if all(abs(earlier[k].number - earlier[c].number) > 1 for c in chosen):
+        if all(abs(numbers[k] - numbers[c]) > stride for c in chosen):
             chosen.append(k)
     return (chosen + [k for k in others if k not in chosen])[:count]
 
@@ -186,7 +190,9 @@ def _overlaps(world, position, poses, reach, view):
     Args:
         world: (m, 3) matched points of the node in the world [m].
         position: (3,) position of the node's camera in the world [m].
+        poses: (n, 4, 4) poses of the other images.
         reach: distance between the cameras at which the overlap is taken as zero [m].
+        view: `_View`.
     """
     shares = np.zeros(len(poses))
     for k in range(len(poses)):

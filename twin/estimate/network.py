@@ -80,14 +80,14 @@ class AlignmentHistory:
     Attributes:
         alignments: duration and size of each alignment.
         dropped: links rejected as outliers by any alignment.
-        before_ga: per track, positions (n, 3) of the keyframes just before the alignment of the track [m].
-        after_ga: per track, positions (n, 3) of the keyframes just after the alignment of the track [m].
+        before_ga: for each alignment at the end of a track, positions (n, 3) of the keyframes just before it [m].
+        after_ga: for each alignment at the end of a track, positions (n, 3) of the keyframes just after it [m].
         link_residuals: for each attempted link measurement, the residual of the points divided by the expected one;
             NaN where the measurement failed.
         disparity_offsets: for each measured link, the offset of all disparities that its points imply; links that do
             not determine an offset are left out.
-        frame_sigmas_m: for each keyframe after the first, the standard deviation (3-D) of the translation since the
-            previous keyframe, from frame-to-frame motion alone [m].
+        frame_sigmas_m: for each keyframe at which it is known, the standard deviation (3-D) of the translation since
+            the previous keyframe, from frame-to-frame motion alone [m].
         nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
             failed), because the link could not be measured.
     """
@@ -111,6 +111,10 @@ class KeyframeNetwork:
         noise: believed noise of the navigation sensors.
         settings: settings of the estimators.
         stopwatch: returns the context manager that times the stage of a given name.
+
+    Attributes:
+        reference_cov: (6, 6) prior covariance of the first node [rotation, translation] (rad, m), by default that of an
+            exact pose, which defines the world frame.
     """
 
     def __init__(
@@ -124,6 +128,7 @@ class KeyframeNetwork:
         self._node_poses = np.empty((64, 4, 4))  # capacity grows by doubling
         self._queue = LinkQueue(vision.runs_in_background)
         self._alignable = True
+        self.reference_cov = _REFERENCE_COV
 
     def close(self) -> None:
         """Ends the background thread."""
@@ -229,7 +234,7 @@ class KeyframeNetwork:
         Returns:
             (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the pose of the latest node up to this
             keyframe. None if the global alignment is switched off, if an earlier alignment or link measurement failed,
-            or if there are fewer than two nodes.
+            if `abandon_alignment` was called, or if there are fewer than two nodes.
 
         Raises:
             SurveyAborted: the alignment failed; a second call returns None.
@@ -312,7 +317,7 @@ class KeyframeNetwork:
         links = self.links.select(self.links.j >= first)
         fixed = set(links.i[links.i < first].tolist())
         everyone = [k for k in self.nodes if k.number in fixed] + nodes
-        anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: _REFERENCE_COV}
+        anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
         try:
             aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)

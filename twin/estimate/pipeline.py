@@ -102,6 +102,7 @@ class Navigator:
         noise = readings_noise or SensorNoise()
         self.dvl = DvlIntegrator(rig, noise)
         self.f2f_pose = (_DEFAULT_START if start is None else start).copy()
+        self._f2f_at_pair = self.f2f_pose.copy()
         self.filter = PoseFilter(self.f2f_pose.copy(), rig, noise)
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))
         self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
@@ -118,18 +119,31 @@ class Navigator:
         """Ends the threads and removes the temporary folder."""
         self._resources.close()
 
+    def set_start_cov(self, cov: Array, prior_cov: Array) -> None:
+        """States how well the start is known; by default it is exact. Call it before the first frame.
+
+        Args:
+            cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
+            prior_cov: (6, 6) covariance with which the alignments hold the first node at the start. It is larger than
+                `cov` where readings at all nodes determine the pose of the network, so that they count once.
+        """
+        self.filter.cov = cov
+        self.network.reference_cov = prior_cov
+
     def update(self, frame: Frame, track: int = 1) -> Estimate:
         """Processes one frame and returns its online estimate.
 
-        Only a frame with a stereo pair can become a keyframe: always if `frame.keyframe` is True, never if it is False.
-        If it is None, the frame is made a keyframe if there is none yet, if tracking failed, or if its overlap with the
-        last keyframe is below `settings.keyframe_overlap`. A pair with too few matched points does not become one.
+        A frame with a stereo pair becomes a keyframe if `frame.keyframe` is True. If that is None, it becomes one if
+        there is no keyframe yet, if tracking failed, or if the next pair is expected to overlap with the last keyframe
+        by less than `settings.keyframe_overlap`. In both cases, a pair with too few matched points does not become a
+        keyframe.
 
         Args:
             frame: images and sensor readings of the frame; later than all previous frames.
             track: number of the track, from 1; `align_track` aligns a window of tracks.
 
         Raises:
+            ValueError: the frame is not later than the last one; it is ignored.
             OSError: images could not be read or written.
         """
         interval_s = self._interval_s(frame.time_s)
@@ -155,12 +169,14 @@ class Navigator:
             SurveyAborted: the alignment failed.
             OSError: images could not be read or written.
         """
+        keyframes = self.network.keyframes
+        before = keyframes[-1].world_from_camera if keyframes else None
         node_cov = self.network.align_window(track)
-        if node_cov is not None:
-            self._follow_last_keyframe(node_cov)
+        if node_cov is not None and before is not None:
+            self._follow_last_keyframe(before, node_cov)
 
     def finish(self) -> SurveyResult:
-        """Runs the final global alignment over all nodes.
+        """Runs the final global alignment over all nodes, unless it is switched off or abandoned.
 
         Returns:
             The trajectories, the keyframes with their covariances, the links, and the quality of the estimation.
@@ -238,7 +254,7 @@ class Navigator:
         restore: Restore | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Iterator[OrthoTile] | None:
-        """Returns the orthomosaic of the keyframe images, tile by tile; None without images.
+        """Returns the orthomosaic of the keyframe images, tile by tile; None without such images.
 
         Args:
             result: result of the survey (`finish`).
@@ -313,18 +329,34 @@ class Navigator:
     def _interval_s(self, time_s: float) -> float:
         """Returns the time since the last frame [s].
 
-        The nominal interval is returned at the first frame, and where the two differ by rounding only.
+        This is the nominal interval at the first frame, and where the time since the last frame differs from it only by
+        rounding.
+
+        Raises:
+            ValueError: the frame is not later than the last one.
         """
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
+        if not interval_s > 0:
+            raise ValueError(f"time_s: {time_s} s is not later than the last frame, at {self.log.times_s[-1]} s")
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
 
     def _is_keyframe(self, frame: Frame, status: str) -> bool:
+        """Returns whether a frame becomes a keyframe, as far as this does not depend on its matched points.
+
+        The next stereo pair is expected after the same motion as that since the last pair. If it overlapped with the
+        last keyframe by less than `settings.keyframe_overlap`, the present pair becomes a keyframe. The overlap of
+        consecutive keyframes therefore stays above this fraction, also where pairs are so rare that the motion between
+        two of them uses up most of 1 - `keyframe_overlap`.
+        """
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
+        since_pair = geometry.inverse(self._f2f_at_pair) @ self.f2f_pose
+        self._f2f_at_pair = self.f2f_pose.copy()
         if status != "ok" or not self.network.keyframes:
             return True
-        return self.network.overlap_with_last(self.filter.world_from_camera) < self.settings.keyframe_overlap
+        next_pair = self.filter.world_from_camera @ since_pair
+        return self.network.overlap_with_last(next_pair) < self.settings.keyframe_overlap
 
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
@@ -413,14 +445,15 @@ class Navigator:
         self.network.connect(node, chain, bridge, self.dvl.displacement_at_node(node.number))
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
-    def _follow_last_keyframe(self, node_cov: Array) -> None:
+    def _follow_last_keyframe(self, before: Array, node_cov: Array) -> None:
         """Applies to the online pose the correction that an alignment made to the last keyframe.
 
         Args:
+            before: (4, 4) pose of the last keyframe before the alignment.
             node_cov: (6, 6) covariance of the pose of the last keyframe's node [rotation, translation] (rad, m).
         """
         last = self.network.keyframes[-1]
-        last_from_now = geometry.inverse(self.log.online[last.row]) @ self.filter.world_from_camera
+        last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))
         self.since_node = self.since_node._replace(cov_at_node=node_cov)
 

@@ -17,13 +17,14 @@ from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
-from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
+from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
 from twin.estimate.viewing_plane import viewing_plane
 from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo, wide_search
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.light_pattern import LightPattern, light_pattern
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.repetition import repetition
@@ -31,6 +32,7 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe
+_PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern is estimated
 
 
 class _MatchedPair(NamedTuple):
@@ -50,7 +52,7 @@ class _MatchedPair(NamedTuple):
 
 
 class StereoVision:
-    """Visual measurements from images, at an image scale chosen from the texture of the first stereo pair.
+    """Visual measurements from images, at an image scale chosen from the texture of the first keyframe.
 
     Use as a context manager, or call `close`.
 
@@ -129,7 +131,7 @@ class StereoVision:
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Sets the image scale from the first stereo pair, before any image is stored."""
+        """Sets the image scale from a stereo pair, before the first keyframe is stored."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
@@ -234,7 +236,7 @@ class StereoVision:
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion between two nodes, predicted by features of the whole images and then measured.
 
-        None if the features do not give a prediction, or if the measurement fails.
+        None if the node has no points, if the features do not give a prediction, or if the measurement fails.
         """
         if node.points is None:
             return None
@@ -263,7 +265,13 @@ class StereoVision:
             self.rig,
             grid,
             progress,
+            pattern=self._light_pattern(result.keyframe_rows),
         )
+
+    def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
+        """Returns the light pattern of keyframes at these frame indices, from at most `_PATTERN_PAIRS` of them."""
+        chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
+        return light_pattern(gray_levels(self._pair(int(row))) for row in chosen)
 
     def left_image(self, row: int) -> Image | None:
         return self.spool.left(row)

@@ -14,7 +14,7 @@ from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, RunCont
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the calibration in the forms of OpenCV, Kalibr and COLMAP, and returns the folders `believed` and `true`.
+    """Writes the calibration in the forms of OpenCV, Kalibr and COLMAP; returns the folders `believed` and `true`.
 
     The believed calibration is that of the estimators, with which the images were rectified. The true calibration
     describes the same rectified images: if the believed one has errors, the rectified images still have some distortion

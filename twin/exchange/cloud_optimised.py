@@ -1,6 +1,6 @@
 """Maps as cloud-optimised GeoTIFF (COG): tiled, compressed, with overviews, in the CRS of the scene or in local metres.
 
-Cells and pixels have the same coordinates as in the files of a run (`geotiff`), so all layers overlay exactly.
+Cells and pixels have the same scene coordinates as in the files of a run (`geotiff`), so all layers overlay exactly.
 """
 
 from __future__ import annotations

@@ -18,7 +18,15 @@ MOST_POINTS = 20_000  # cells of the elevation map are subsampled to about this 
 
 
 class _View(NamedTuple):
-    """One image of the model: identifiers, name, camera_from_world (4, 4), and observations (pixels, point numbers)."""
+    """One image of the model, with its observations.
+
+    Args:
+        image, camera: identifiers of the image and of its camera, from 1.
+        name: path of the image relative to the folder `images`.
+        camera_from_world: (4, 4) pose of the world in the axes of the camera.
+        pixels: (m, 2) observed pixels; the centre of the first pixel is at (0, 0).
+        points: (m,) indices of the observed points, from 0.
+    """
 
     image: int
     camera: int
@@ -31,11 +39,12 @@ class _View(NamedTuple):
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes the stereo pairs of the keyframes as `images`, and the model as `sparse/0`.
 
-    Poses and calibration are the true ones, or, without a truth, the final poses and the believed calibration. The 3D
-    points are cells of the elevation map with the colours of the orthomosaic; without a map there are none. Their
-    observations are their projections without error: an image observes a cell unless a cell that is nearer by more than
-    2 % is projected to the same pixel. COLMAP has the corner of the first pixel at (0, 0), so pixel coordinates are
-    larger by 0.5 than in OpenCV. If no keyframe has a stereo pair, all stereo pairs are written.
+    The poses are the true ones if they are known, otherwise those of the final trajectory. The calibration is the
+    true one if it is known (it is not for recorded data), otherwise the believed one. The 3D points are cells of
+    the elevation map with the colours of the orthomosaic; without a map there are none. Their observations are
+    their projections without error: an image observes a cell unless a cell that is nearer by more than 2 % is
+    projected to the same pixel. COLMAP has the corner of the first pixel at (0, 0), so pixel coordinates are larger
+    by 0.5 than in OpenCV. If no keyframe has a stereo pair, all stereo pairs are written.
 
     Raises:
         OSError: a file cannot be read or written.
@@ -58,7 +67,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
-    """Returns points (n, 3) [m] at mapped cells, at about `MOST_POINTS` of them, and their colours (n, 3)."""
+    """Returns points (n, 3) in the world [m] at about `MOST_POINTS` mapped cells, and their colours (n, 3)."""
     if elevation is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     stride = max(1, int(np.ceil(np.sqrt(np.isfinite(elevation.height_m).sum() / MOST_POINTS))))

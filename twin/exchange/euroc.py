@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -66,7 +65,7 @@ class EurocWriter:
                     lines.write(f"{stamp},{name}\n")
 
     def add_truth(self, truth: Trajectory) -> None:
-        """Writes the true poses of the left camera as poses of the body."""
+        """Writes a true trajectory of the left camera as poses of the body."""
         folder = self.root / "state_groundtruth_estimate0"
         folder.mkdir(exist_ok=True)
         world_from_body = truth.world_from_camera @ geometry.inverse(self.rig.body_from_camera)
@@ -107,20 +106,40 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         contents.progress((k + 1) / len(contents.frames))
     if "truth" in contents.trajectories:
         writer.add_truth(contents.trajectories["truth"])
-    _write_readings(writer.root, contents.frames)
+    _write_readings(writer.root, contents)
     return [writer.root]
 
 
-def _write_readings(root: Path, frames: Sequence[RecordedFrame]) -> None:
-    """Writes the readings of each sensor that was recorded: pressure0, ahrs0, dvl0, usbl0, each with data.csv."""
+def _write_readings(root: Path, contents: RunContents) -> None:
+    """Writes the readings of each sensor that was recorded: pressure0, ahrs0, dvl0, usbl0, each with data.csv.
+
+    `sensor.yaml` has the standard deviations of the readings (`sigma`) from the section [navigation] of the scenario;
+    it is left out if the scenario states none.
+    """
+    navigation = contents.scenario.get("navigation", {})
+    level_rad, heading_rad = (
+        np.deg2rad(navigation.get(key, 0.0)) for key in ("attitude_sigma_deg", "heading_sigma_deg")
+    )
     sensors = {
-        "pressure0": ("height of the left camera above z = 0 [m]", lambda r: r.pressure_z_m),
-        "ahrs0": ("roll [rad],pitch [rad],yaw [rad]", lambda r: r.ahrs_rpy_rad),
-        "dvl0": ("forward [m s^-1],left [m s^-1],up [m s^-1]", lambda r: r.dvl_mps),
-        "usbl0": ("x [m],y [m],z [m]", lambda r: r.usbl_m),
+        "pressure0": (
+            "height of the left camera above z = 0 [m]",
+            lambda r: r.pressure_z_m,
+            [navigation.get("pressure_sigma_m", 0.0)],
+        ),
+        "ahrs0": (
+            "roll [rad],pitch [rad],yaw [rad]",
+            lambda r: r.ahrs_rpy_rad,
+            [level_rad, level_rad, heading_rad],
+        ),
+        "dvl0": (
+            "forward [m s^-1],left [m s^-1],up [m s^-1]",
+            lambda r: r.dvl_mps,
+            [navigation.get("dvl_sigma_mps", 0.0)] * 3,
+        ),
+        "usbl0": ("x [m],y [m],z [m]", lambda r: r.usbl_m, [navigation.get("usbl_sigma_m", 0.0)] * 3),
     }
-    for name, (columns, reading) in sensors.items():
-        rows = [(frame.time_s, reading(frame.readings)) for frame in frames]
+    for name, (columns, reading, sigmas) in sensors.items():
+        rows = [(frame.time_s, reading(frame.readings)) for frame in contents.frames]
         lines = [
             ",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in np.atleast_1d(values))])
             for time_s, values in rows
@@ -130,6 +149,9 @@ def _write_readings(root: Path, frames: Sequence[RecordedFrame]) -> None:
             (root / name).mkdir(exist_ok=True)
             text = "\n".join([f"#timestamp [ns],{columns}", *lines, ""])
             (root / name / "data.csv").write_text(text, encoding="utf-8")
+            if all(sigmas):
+                tree = {"sensor_type": name[:-1], "sigma": [float(sigma) for sigma in sigmas]}
+                (root / name / "sensor.yaml").write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
 
 def timestamp_ns(time_s: float) -> int:

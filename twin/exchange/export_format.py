@@ -8,8 +8,9 @@ from typing import Literal, NamedTuple
 
 from twin.exchange.run_contents import RunContents
 
-#: Contents that a format may need: images (left), pairs (images of both cameras), map, truth, world (rendered again).
-Need = Literal["images", "pairs", "map", "truth", "world"]
+#: Contents that a format may need: images (left), pairs (images of both cameras), poses (a true or a final trajectory),
+#: map, truth, world (rendered again).
+Need = Literal["images", "pairs", "poses", "map", "truth", "world"]
 
 
 class ExportFormat(NamedTuple):

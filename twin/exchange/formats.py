@@ -9,7 +9,7 @@ from twin.errors import TwinError
 from twin.exchange.export_format import ExportFormat
 from twin.exchange.image_formats import IMAGE_FORMATS
 from twin.exchange.map_formats import MAP_FORMATS
-from twin.exchange.run_contents import RunContents
+from twin.exchange.run_contents import POSES, RunContents
 
 #: All formats by name, in the order of the list.
 FORMATS: dict[str, ExportFormat] = IMAGE_FORMATS | MAP_FORMATS
@@ -17,6 +17,7 @@ FORMATS: dict[str, ExportFormat] = IMAGE_FORMATS | MAP_FORMATS
 _MISSING = {
     "images": ("has no images", 'a run of a scenario with record = "all" (every frame) or "keyframes"'),
     "pairs": ("has no stereo pairs", 'a run of a scenario with record = "all" or "keyframes"'),
+    "poses": ("has neither a true nor a final trajectory", "a run with trajectory_truth.tum or trajectory_final.tum"),
     "map": ("has no elevation map", "a run with dem.tif"),
     "truth": ("has no true trajectory", "a simulated run, or a replay with --truth"),
     "world": ("has no simulated world", "a run of `twin run` with rendered images"),
@@ -47,6 +48,7 @@ def check_needs(name: str, contents: RunContents) -> None:
     has = {
         "images": bool(contents.frames),
         "pairs": bool(contents.pairs),
+        "poses": not contents.trajectories.keys().isdisjoint(POSES),
         "map": contents.elevation is not None,
         "truth": "truth" in contents.trajectories,
         "world": contents.true_layers is not None,

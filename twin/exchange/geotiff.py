@@ -54,7 +54,7 @@ def write_elevations(
     """Writes heights (rows, cols) above the plane z = 0 of the scene.
 
     With a georeference, elevations in its vertical datum are written as float64, because float32 would round the
-    elevations of a deep site to 0.1 mm.
+    elevations of a deep site to steps of more than 0.1 mm.
     """
     if georeference is None:
         return write_layer(path, height_m, grid, description)
@@ -195,7 +195,10 @@ def crs_of(georeference: Georeference | None) -> CRS:
 
 
 def profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
-    """Returns the rasterio profile of a GeoTIFF file on `grid`."""
+    """Returns the rasterio profile of a GeoTIFF file with `bands` bands of type `dtype` on a grid.
+
+    Without a georeference, the file is in local metres.
+    """
     origin = georeference or Georeference(0.0, 0.0)
     west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))
     cell = grid.cell_m / origin.metres_per_unit

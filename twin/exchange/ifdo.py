@@ -18,7 +18,8 @@ from twin.exchange.image_copy import copy_images
 from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunContents
 
 VERSION = "v2.1.0"
-_START = datetime(1970, 1, 1, tzinfo=UTC)  # a simulated survey has no date
+_START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
+_UNKNOWN = "unknown"
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
@@ -26,8 +27,9 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     Positions and attitudes are those of the final trajectory, as in the report of a real survey; without one, they are
     the true ones. Latitude and longitude (EPSG:4326), which iFDO requires, are written if the export has a CRS;
-    otherwise, the file has only poses in local coordinates. Times count from 1970-01-01, because a simulated survey has
-    no date.
+    otherwise, the file has only poses in local coordinates. Times count from 1970-01-01, because a run has no date.
+
+    The file calls the images of a replay recorded; their platform, sensor, licence and copyright are "unknown".
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
     items: dict[str, Any] = {}
@@ -44,32 +46,56 @@ def _header(contents: RunContents) -> dict[str, Any]:
     """Returns the fields of the whole image set."""
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
     origin = contents.georeference
-    named = {"image-context": "simulated survey", "image-project": contents.name, "image-event": contents.name}
+    named = {"image-project": contents.name, "image-event": contents.name}
     header: dict[str, Any] = {
         "image-set-name": contents.name,
         "image-set-uuid": identifier,
         "image-set-handle": f"urn:uuid:{identifier}",
         "image-set-ifdo-version": VERSION,
-        "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
         "image-creators": [{"name": "twin"}],
         "image-pi": {"name": "twin"},
-        "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
-        "image-copyright": "simulated images, no copyright holder",
-        "image-platform": {"name": "BlueROV2 Heavy, simulated"},
-        "image-sensor": {"name": "stereo camera, simulated"},
         "image-acquisition": "photo",
-        "image-quality": "raw",
         "image-deployment": "survey",
         "image-navigation": "reconstructed",
-        "image-illumination": "artificial light" if contents.scenario.get("lamps") else "sunlight",
         "image-pixel-magnitude": "mm",
         "image-marine-zone": "seafloor",
         "image-spectral-resolution": "rgb",
         "image-camera-calibration-model": _calibration(contents.believed.left),
     }
     header |= {key: {"name": name} for key, name in named.items()}
+    header |= _recorded() if "replay" in contents.scenario else _simulated(bool(contents.scenario.get("lamps")))
     crs = "EPSG:4326" if origin is not None and origin.crs_wkt is not None else "local metres, x east, y north, z up"
     return header | {"image-coordinate-reference-system": crs}
+
+
+def _simulated(lamps: bool) -> dict[str, Any]:
+    """Returns the fields on the origin of simulated images, with or without lamps."""
+    return {
+        "image-context": {"name": "simulated survey"},
+        "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
+        "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
+        "image-copyright": "simulated images, no copyright holder",
+        "image-platform": {"name": "BlueROV2 Heavy, simulated"},
+        "image-sensor": {"name": "stereo camera, simulated"},
+        "image-quality": "raw",
+        "image-illumination": "artificial light" if lamps else "sunlight",
+    }
+
+
+def _recorded() -> dict[str, Any]:
+    """Returns the fields on the origin of the images of a replay, of which the run knows only that they were recorded.
+
+    They are rectified copies of the recorded images. The light is an optional field and is missing.
+    """
+    return {
+        "image-context": {"name": "replay of a recorded survey"},
+        "image-abstract": "Rectified images of a recorded stereo survey. Times count from 1970-01-01.",
+        "image-license": {"name": _UNKNOWN},
+        "image-copyright": _UNKNOWN,
+        "image-platform": {"name": _UNKNOWN},
+        "image-sensor": {"name": "stereo camera"},
+        "image-quality": "processed",
+    }
 
 
 def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:

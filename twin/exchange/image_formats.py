@@ -80,15 +80,15 @@ IMAGE_FORMATS: dict[str, ExportFormat] = {
     ),
     "tum": ExportFormat("TUM: trajectories of the left camera, lists of images", frozenset(), _tum),
     "colmap": ExportFormat(
-        "COLMAP text model: stereo rig, poses, 3D points of the map with tracks", frozenset({"pairs"}), _colmap
+        "COLMAP text model: stereo rig, poses, 3D points of the map with tracks", frozenset({"pairs", "poses"}), _colmap
     ),
-    "nerfstudio": ExportFormat("nerfstudio: transforms.json and images", frozenset({"images"}), _nerfstudio),
+    "nerfstudio": ExportFormat("nerfstudio: transforms.json and images", frozenset({"images", "poses"}), _nerfstudio),
     "calibration": ExportFormat(
         "camera calibration in OpenCV, Kalibr and COLMAP form, true and believed", frozenset(), _calibration
     ),
-    "ifdo": ExportFormat("iFDO v2.1 metadata of the images (JSON)", frozenset({"images"}), _ifdo),
+    "ifdo": ExportFormat("iFDO v2.1 metadata of the images (JSON)", frozenset({"images", "poses"}), _ifdo),
     "metashape": ExportFormat(
-        "Metashape reference CSV: position and attitude of each image", frozenset({"images"}), _metashape
+        "Metashape reference CSV: position and attitude of each image", frozenset({"images", "poses"}), _metashape
     ),
     "truth": ExportFormat(
         "exact truth of each left image: depth, flow, normals, albedo, clear water, light, veil, labels",

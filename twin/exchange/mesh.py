@@ -25,18 +25,21 @@ def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_V
 
 
 def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
-    """Returns the triangle mesh of a map in glTF axes, with the colours of the orthomosaic.
+    """Returns the triangle mesh of a map in the world, in glTF axes, with the colours of the orthomosaic.
 
     Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
-    vertices and face upwards; cells that belong to no triangle are omitted.
+    vertices and face up in the frame of the map; cells that belong to no triangle are omitted.
     """
     stride = max(1, int(np.ceil(np.sqrt(elevation_map.height_m.size / max_vertices))))
     x, y = elevation_map.grid.centres()
     height = elevation_map.height_m[::stride, ::stride]
     east, north = np.meshgrid(x[::stride], y[::stride])
-    points = np.stack([east, north, height], axis=-1).reshape(-1, 3)
+    points = np.stack([east, north, height], axis=-1).reshape(-1, 3).astype(np.float64)
     colours = elevation_map.mosaic[::stride, ::stride].reshape(-1, 3)
     used, faces = np.unique(raster_triangles(np.isfinite(height)), return_inverse=True)
     return trimesh.Trimesh(
-        points[used] @ GLB_FROM_WORLD.T, faces.reshape(-1, 3), vertex_colors=colours[used], process=False
+        elevation_map.to_world(points[used]) @ GLB_FROM_WORLD.T,
+        faces.reshape(-1, 3),
+        vertex_colors=colours[used],
+        process=False,
     )

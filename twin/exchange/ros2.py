@@ -12,6 +12,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.optional_packages import optional
+from twin.core.pressure import PASCAL_PER_METRE
 from twin.core.records import Trajectory
 from twin.errors import TwinError
 from twin.exchange.euroc import timestamp_ns
@@ -20,8 +21,7 @@ from twin.exchange.ros2_messages import BODY, LEFT, RIGHT, WORLD, MessageFactory
 from twin.exchange.run_contents import RunContents
 
 BAG = "ros2_bag"  # folder of the bag, and the name of its MCAP file
-_WATER_KG_M3, _GRAVITY_MPS2, _AIR_PA = 1025.0, 9.81, 101_325.0  # sea water, standard air pressure
-PASCAL_PER_METRE = _WATER_KG_M3 * _GRAVITY_MPS2
+_AIR_PA = 101_325.0  # standard air pressure
 
 
 class Message(NamedTuple):

@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 from twin.core.georeference import Georeference
 from twin.core.records import Array, ElevationMap, Exposure, Image, Readings, StereoRig, Trajectory
 
+#: Trajectories that give the poses of exported images, best first.
+POSES = ("truth", "final")
+
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """A frame whose images were kept while the survey was flown.
+    """A frame whose left image is kept in the run folder.
 
     Args:
         index: number of the frame, which is its row in the trajectories.
@@ -104,8 +107,8 @@ class FrameTruth(NamedTuple):
         labels: (H, W) uint16, number of the object at each pixel, from 1; 0: the floor, or nothing.
         flow_px: (H, W, 2) float32 displacement (columns, rows) of each point to the next recorded image; NaN where it
             is outside the next image, hidden in it, or belongs to a swaying object; None for the last frame.
-        difference: RMS difference between the recorded image and the image rendered again without noise, times the
-            factor of exposure that fits best [grey levels].
+        difference: RMS difference between the recorded image and the image rendered again without noise, which is
+            multiplied by the factor of exposure that fits best [grey levels].
         identical: whether the image rendered again with its noise equals the recorded image in every pixel; None if
             this was not compared.
     """
@@ -182,5 +185,9 @@ class RunContents:
 
     @property
     def poses(self) -> Trajectory:
-        """Returns the best poses of the run: the truth if it is known, otherwise the final trajectory."""
-        return self.trajectories["truth" if "truth" in self.trajectories else "final"]
+        """Returns the best poses of the run: the truth if it is known, otherwise the final trajectory.
+
+        Raises:
+            KeyError: the run has neither, as that of a killed process (`formats.check_needs`).
+        """
+        return self.trajectories[next((name for name in POSES if name in self.trajectories), POSES[-1])]

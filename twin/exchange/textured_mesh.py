@@ -31,7 +31,7 @@ _MOST_TEXTURE_PX = 8192  # largest side of a texture: what common graphics cards
 
 
 def export_glb_file(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes map.glb and returns it."""
+    """Writes map.glb and returns its path, as a list of one."""
     path, (mesh, texture) = folder / "map.glb", _mesh(contents)
     material = PBRMaterial(baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0)
     mesh.visual = TextureVisuals(_uv(mesh), material)

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 GRID, NARROW_GRID, NARROW_DEG = (16, 20), (48, 64), 25.0
 RANGES, SUBSTEPS = 48, 2  # number of steps of range in the table, and of integration steps in each of them
 FINE = 0.4  # blurs narrower than this fraction of the grid spacing are ignored
-MARGIN = 6  # rows and columns outside each side of the image, up to its size away; their light is blurred into it
+MARGIN = 6  # rows and columns of the grid outside each side of the image, whose light is blurred into the image
 
 
 def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Array) -> Array:
@@ -54,8 +54,11 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
     """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
 
-    The daylight is assumed to travel along the optical axis, away from the camera. The arguments are those of
-    `LampLight.scattered_once_per_m`, with the `points` (..., n, 3) on `ray` (..., 3).
+    The daylight is assumed to travel along the optical axis, away from the camera.
+
+    Args:
+        lamps, water, ray: see `backscatter_per_m`.
+        points: (..., n, 3) points on the rays in the axes of the camera [m].
     """
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
@@ -66,7 +69,8 @@ def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> 
 def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
     """Returns the backscatter (rows, cols, RANGES + 1, 3) between the camera and each range [cd/m2], on a coarse grid.
 
-    The table is empty, (0, 0, 0, 3), if the water does not scatter. See `table_range_m` for the ranges.
+    With multiple scattering it is that of the lamps alone. The table is empty, (0, 0, 0, 3), if the water does not
+    scatter. See `grid_of` for the grid and `table_range_m` for the ranges.
     """
     if not water.scattering_per_m.any():
         return np.zeros((0, 0, 0, 3))
@@ -149,7 +153,10 @@ def _size(rig: StereoRig) -> tuple[float, float]:
 
 
 def _grid_px(n: int, size_px: float, margin: int) -> Array:
-    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` more on each side, with growing spacing."""
+    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` more on each side, up to `size_px` away.
+
+    The spacing of the latter grows with the distance.
+    """
     outside = size_px * (np.arange(1.0, margin + 1) / max(margin, 1)) ** 2
     return np.concatenate([-outside[::-1], np.linspace(0.0, size_px, n), size_px + outside])
 

@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 AT_REST: Array = np.zeros(6)
-METERED_PX = 4  # where raw images are sampled from rendered ones, every n-th pixel along each axis is metered
 
 
 class StereoCapture(NamedTuple):
@@ -143,18 +142,17 @@ class StereoCamera:
         cameras = (0, 1) if stereo else (0,)
         views = [self._render(pose, camera) for camera in cameras]
         with self._stopwatch("optics"):
-            if stereo:
-                metered, right_floor = in_pair(lambda: self._metered(views[0]), lambda: self._floor(views[1]))
-            else:
-                metered, right_floor = self._metered(views[0]), None
-            floor, at_rest, setting = metered
+            setting = self._sensor.setting
+            metered = setting is not None
+            if setting is None:
+                setting = self._first_setting(views[0])
             expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
-            if right_floor is None:
-                left, right = expose(views[0], floor, at_rest), None
+            if stereo:
+                (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
             else:
-                left, right = in_pair(
-                    lambda: expose(views[0], floor, at_rest), lambda: expose(views[1], right_floor, None)
-                )
+                (left, light), right = expose(views[0]), None
+            if metered:
+                self._sensor.meter(light)
             depths = [self._cameras.crop(view.depth) for view in views]
         exposure = self._sensor.signal_per_cd(setting)
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
@@ -219,64 +217,39 @@ class StereoCamera:
             objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
         return _View(pose, camera, albedo, depth, objects)
 
-    def _floor(self, view: _View) -> Radiance:
-        """Returns the light (H, W, 3) of floor and water in a view [cd/m2]."""
-        pose, camera, albedo, depth, objects = view
-        return self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
+    def _first_setting(self, view: _View) -> ExposureSetting:
+        """Returns the exposure of the first frame, metered on its left view at rest."""
+        light = self._image_formation.radiance(view.albedo, view.depth, 0, view.pose, view.objects)
+        return self._meter(self._sensor, light, view.depth)
 
-    def _metered(self, view: _View) -> tuple[Radiance, Radiance, ExposureSetting]:
-        """Returns the light of floor and water in the left view, this light with marine snow, and the exposure.
+    def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
+        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels.
 
-        The light with marine snow is metered for the later frames.
+        The arguments are those of `_through_lens` and `capture`.
         """
-        floor = self._floor(view)
-        at_rest = self._with_snow(floor, view.depth, view.pose)
-        return floor, at_rest, self._meter(self._sensor, at_rest, view.depth)
-
-    def _expose(
-        self, view: _View, floor: Radiance, at_rest: Radiance | None, twist_body: Array, setting: ExposureSetting
-    ) -> Image:
-        """Returns the image of one camera; the arguments are those of `_through_lens` and `capture`."""
-        pose, camera, _, depth, _ = view
+        pose, camera, albedo, depth, objects = view
         motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
-        raw = self._through_lens(floor, depth, camera, pose, motion, at_rest)
-        return self._cameras.rectify(self._sensor.image(raw, setting, self._rngs[camera]))
-
-    def _with_snow(self, floor: Radiance, depth: Depth, pose: StampedPose) -> Radiance:
-        """Returns the light in the left camera without motion blur: `floor`, or a copy of it with marine snow."""
-        if not self._image_formation.snows:
-            return floor
-        light = floor.copy()
-        self._image_formation.add_snow(light, depth, 0, pose)
-        return light
+        floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
+        light = self._through_lens(floor, depth, camera, pose, motion)
+        return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[camera])), light
 
     def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
-        """Returns this frame's exposure, and meters the light (H, W, 3) in the left camera at rest for later frames."""
-        every_px = 1 if self._cameras.sampling is None else METERED_PX
-        return sensor.meter(self._cameras.sample(light, depth, 0, every_px), every_px)
+        """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
+        return sensor.meter(self._cameras.sample(light, depth, 0))
 
     def _through_lens(
-        self,
-        floor: Radiance,
-        depth: Depth,
-        camera: int,
-        pose: StampedPose,
-        motion: ExposureMotion | None,
-        at_rest: Radiance | None = None,
+        self, floor: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None
     ) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water.
 
         The array `floor` may be modified.
 
         Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
-        with its own blur afterwards. `at_rest` is the light with marine snow in a camera at rest, if it is known.
+        with its own blur afterwards.
         """
         light = self._psf.out_of_focus(floor, depth)
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
             light = integrate(light, depth, self._focal_px, motion)
-        if light is floor and motion is None and at_rest is not None:
-            light = at_rest
-        else:
-            self._image_formation.add_snow(light, depth, camera, pose, motion)
+        self._image_formation.add_snow(light, depth, camera, pose, motion)
         return self._cameras.sample(self._psf.transfer(light), depth, camera, motion=motion)

@@ -5,13 +5,13 @@ surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the ref
 floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
 side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
 
-- waves that the cells do not resolve: the mean over their phases is a Gaussian blur by their slopes, as they focus far
-  above the floor;
+- waves that the cells do not resolve: the mean over their phases is a Gaussian blur with the variance of their slopes,
+  as they focus far above the floor;
 - the angular size of the sun;
 - scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
   `scattering_blur`).
 
-Waves longer than the tile are left out, as they focus far below the floor: the side of the tile is `TILE_DEPTHS` times
+Waves longer than the tile are left out, as they focus far below the floor. The side of the tile is `TILE_DEPTHS` times
 the depth, so a camera below the surface rarely sees the pattern repeated.
 """
 
@@ -73,7 +73,7 @@ class Caustics:
         # the spectrum of a real surface is Hermitian, and only one half of it is stored; column 0 holds both halves
         waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
         self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
-        self._omega = angular_frequency(k)
+        self._turns_per_s = angular_frequency(k) / (2 * np.pi)
         self._cells_per_slope = np.float32((1 - 1 / SEA_WATER_INDEX) * depth_m * self.cells_per_m)
         self._blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest)).astype(np.float32)
         self._share = np.float32(daylight.focused_share)
@@ -100,8 +100,12 @@ class Caustics:
             return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS)."""
-        angle = np.remainder(self._omega * time_s, 2 * np.pi).astype(np.float32)
+        """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS).
+
+        They are defined up to their common sign, which does not affect the statistics of the pattern.
+        """
+        turns = self._turns_per_s * time_s
+        angle = (2 * np.pi * (turns - np.floor(turns))).astype(np.float32)
         phase = np.cos(angle) - 1j * np.sin(angle)
         size = CELLS, CELLS
         east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
@@ -171,7 +175,7 @@ def _trace_rays(east, north, cells_per_slope, light):
 
     Args:
         east, north: (n, n) slopes of the surface.
-        cells_per_slope: displacement of a ray on the floor per unit of slope, against the slope [cells].
+        cells_per_slope: displacement of a ray on the floor, towards west and south, per unit of slope [cells].
         light: (n, n) illuminance relative to its mean, initially 0; filled in place. n is a power of two.
     """
     n, one = light.shape[0], np.float32(1.0)

@@ -1,8 +1,8 @@
 """Daylight on floors of any slope, and its backscatter in the lines of sight of a camera, from the light field.
 
-The tables are computed once per scenario, at the depth of the cameras; `optics` uses them for every image. Light that
-the floor reflects and the water scatters back to the floor is neglected: 8 % of the light on a floor of albedo 0.5 in
-water of Jerlov type III.
+The tables are computed once per scenario, those of the backscatter at the planned depth of the cameras; `optics` uses
+them for every image. Light that the floor reflects and the water scatters back to the floor is neglected: 8 % of the
+light on a floor of albedo 0.5 in water of Jerlov type III.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class FloorDaylight(NamedTuple):
         E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0)
                   + (n, 1) rest_lx (n, 1)' exp(d rest_per_m[0] + min(max(d, low), high)^2 rest_per_m[1]),
 
-    with d = z - reference_depth_m and (low, high) the range of the fit.
+    with d = z - reference_depth_m and (low, high) the range of the fit. A negative quadratic form counts as 0.
 
     Args:
         to_sun: (3,) unit direction to the refracted sun, east, north, up.
@@ -62,8 +62,9 @@ class FloorDaylight(NamedTuple):
 def floor_daylight(daylight: Daylight) -> FloorDaylight:
     """Returns the daylight on the floor.
 
-    With single scattering or without a surface, beam and diffuse light keep their shares, and both decrease with the
-    diffuse attenuation; with multiple scattering the beam turns into diffuse light on its way.
+    Without multiple scattering, beam and diffuse light keep their shares, and both decrease with depth at the rate of
+    the diffuse attenuation; without a surface they are constant. With multiple scattering, the beam is scattered into
+    diffuse light on its way.
 
     Args:
         daylight: sun, sky, depth and properties of the water.
@@ -88,8 +89,14 @@ def floor_daylight(daylight: Daylight) -> FloorDaylight:
 def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, Array]:
     """Returns the illuminance of the floor by all light except the beam of the sun, in one band.
 
-    It is the quadratic form (4, 4) in the floor normal at the depth `deep_m`, per lux at the surface, and the
-    coefficients (2,) of its change with depth, fitted at `depths_m`; see `FloorDaylight.rest_lx` and `rest_per_m`.
+    Args:
+        field: light field of the band.
+        deep_m: depth at which the quadratic form applies.
+        depths_m: (n,) depths at which the change with depth is fitted.
+
+    Returns:
+        Quadratic form (4, 4) in (n, 1), with n the floor normal, per lux at the surface, and coefficients (2,) of its
+        change with depth; see `FloorDaylight.rest_lx` and `rest_per_m`.
     """
     light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
     square, slope, level = np.polyfit(depths_m - deep_m, light, 2)

@@ -90,7 +90,7 @@ def _stored_normals(height, spacing):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _store(rise_east, rise_north, spacing):
-    """Returns the normal of a triangle, packed in 32 bits.
+    """Returns the stored normal of a triangle: the component towards east in the upper 16 bits, north in the lower.
 
     Args:
         rise_east, rise_north: change of height over one cell towards east and north [m].

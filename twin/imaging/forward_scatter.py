@@ -1,14 +1,14 @@
 """Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
 Of the light that is not absorbed, the fraction exp(-b r) arrives unscattered; the scattered light is blurred by a
-kernel with a sharp core and a long tail (`spread.camera_mixture`). It is a mixture of Gaussians, the levels of an image
-pyramid: each level doubles the width, and its weights depend on band and range. The weights of a pixel are those of its
-own range: its ray receives light from the floor around it. The kernel is a function of angle. At the angle theta from
-the optical axis, a small angle covers more pixels by the factor k = 1 / cos(theta)^1.5, the geometric mean of 1 / cos^2
-(radially) and 1 / cos (tangentially); therefore a fraction log2(k) of the light of each level moves to the next, wider
-level, except for the widest levels (`WIDENED_TAN`). Much of the tail lies outside the image. There the floor is taken
-to be the plane that fits the depth of the image, with the mean albedo of the image; the coarse levels of the pyramid
-cover it. The fine levels are mirrored at the borders of the image.
+kernel with a sharp core and a long tail (`spread.camera_mixture`). The kernel is a mixture of Gaussians, the levels of
+an image pyramid: each level is twice as wide as the one before, and its weight depends on band and range. The weights
+of a pixel are those of its own range: its ray receives light from the floor around it. The kernel is a function of
+angle. At the angle theta from the optical axis, a small angle covers more pixels by the factor k = 1 / cos(theta)^1.5,
+the geometric mean of 1 / cos^2 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of the light of each
+level moves to the next, wider level, except for the widest levels (`WIDENED_TAN`). Much of the tail lies outside the
+image. There the floor is taken to be the plane that fits the depth of the image, with the mean albedo of the image; the
+coarse levels of the pyramid cover it. The fine levels are mirrored at the borders of the image.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
 from twin.imaging.pixel_sum import sum_of_entries
+from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.spread import NODES_M, Absorbed, camera_mixture, over_path
 from twin.imaging.water import Medium
@@ -68,9 +69,9 @@ class ForwardScatter:
     Attributes:
         range_per_depth: range divided by depth of the pixels of the surroundings.
         surroundings: grid on which `add` expects the light of the floor around the image.
-        kept: (n + 1, 4) share of the light of the floor, attenuated by absorption alone, that arrives without blur: the
-            unscattered light and the core of the kernel, narrower than a pixel; for R, G, B and a zero, at even
-            steps of r / (r + RANGE_SCALE_M).
+        kept: (SHARE_STEPS + 1, 4) share of the light of the floor, attenuated by absorption alone, that arrives without
+            blur: the unscattered light and the core of the kernel, narrower than a pixel; for R, G, B and a zero, at
+            even steps of r / (r + RANGE_SCALE_M).
     """
 
     def __init__(self, rig: StereoRig, water: Medium):
@@ -134,8 +135,9 @@ class ForwardScatter:
             if k + 1 == grid.level:
                 height, width = (n_px_at(n, grid.level) for n in floor.shape[:2])
                 images[k] = images[k][grid.pad : grid.pad + height, grid.pad : grid.pad + width]
-        height, width = floor.shape[:2]
-        cv2.add(light, cv2.pyrUp(images[0], dstsize=(width, height)), dst=light)
+        rows, cols = images[0].shape[:2]
+        finest = images[0].reshape(rows, 3 * cols), light.reshape(len(light), -1)
+        in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light))
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
         """Returns all light (H, W, 3) of the floor that was scattered between floor and camera [cd/m2].
@@ -178,20 +180,23 @@ def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) 
         levels: number of levels of the pyramid.
 
     Returns:
-        (levels + 1, 3, nodes) weights; level 0 is light that is not blurred.
+        (levels + 1, 3, nodes) weights of the levels of the kernel of scattered light; level 0 is light scattered by
+        less than a pixel.
     """
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
     return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
 
 def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, range_m: Array) -> Array:
-    """Returns the weights (levels + 1, n, 3) of the levels of the kernel; level 0 is light that is not blurred.
+    """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light.
+
+    Level 0 is light scattered by less than a pixel; unscattered light is not included.
 
     Args:
-        bands: bands of the water.
-        focal_px: focal length.
+        bands: water in the bands R, G, B.
+        focal_px: focal length [px].
         levels: number of levels of the pyramid.
-        range_m: (n,) ranges.
+        range_m: (n,) ranges [m].
     """
     nodes = level_weights_of(bands, focal_px, levels)
     rows = [
@@ -230,7 +235,8 @@ def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
 def _moved(weights: Array, focal_px: float) -> Array:
     """Returns the change (levels, n, 3) of the weights if all light of each narrow level moves to the next wider one.
 
-    Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths.
+    Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths; the last level
+    does not count as narrow.
 
     Args:
         weights: (levels, n, 3) weights of the levels from 1.
@@ -297,3 +303,45 @@ def _weigh(image, place, table, widening, wider):
             filled[3 * u] = filled[3 * u] * red + added[3 * u]
             filled[3 * u + 1] = filled[3 * u + 1] * green + added[3 * u + 1]
             filled[3 * u + 2] = filled[3 * u + 2] * blue + added[3 * u + 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_upsampled(small, light, first, end):
+    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` of `light` (H, 3 W).
+
+    Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
+    the first one are mirrored, and the last row is repeated; so are columns.
+
+    Args:
+        small: (rows, 3 cols) image with rows = ceil(H / 2) and cols = ceil(W / 2).
+        light: (H, 3 W) image to which the upsampled image is added in place.
+        first, end: range of rows.
+    """
+    last, width = small.shape[0] - 1, light.shape[1] // 3
+    cols = small.shape[1] // 3
+    wide = np.empty(3 * (cols + 2), np.float32)
+    of_side, of_middle, half = np.float32(1 / 8), np.float32(6 / 8), np.float32(0.5)
+    middle = wide[3:-3]
+    for v in range(first, end):
+        k = v // 2
+        here, below = small[k], small[min(k + 1, last)]
+        if v % 2:
+            for i in range(middle.size):
+                middle[i] = half * (here[i] + below[i])
+        else:
+            above = small[k - 1 if k else min(1, last)]
+            for i in range(middle.size):
+                middle[i] = of_side * (above[i] + below[i]) + of_middle * here[i]
+        for band in range(3):
+            wide[band], wide[3 * (cols + 1) + band] = wide[3 * min(2, cols) + band], wide[3 * cols + band]
+        filled = light[v]
+        for u in range(width // 2):
+            for band in range(3):
+                i = 3 * u + band
+                left, centre, right = wide[i], wide[i + 3], wide[i + 6]
+                filled[6 * u + band] += of_side * (left + right) + of_middle * centre
+                filled[6 * u + 3 + band] += half * (centre + right)
+        if width % 2:
+            for band in range(3):
+                i = 3 * (cols - 1) + band
+                filled[6 * (cols - 1) + band] += of_side * (wide[i] + wide[i + 6]) + of_middle * wide[i + 3]

@@ -39,8 +39,8 @@ class RadianceComponents(NamedTuple):
         floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where the water transmits too little light
             from the floor to the camera to compute it.
         direct: light from the floor that was not scattered on its path to the camera [cd/m2].
-        forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless
-            `imaging.scattering` is full.
+        forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless the water
+            scatters and `imaging.scattering` is full.
         backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
         snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than the light that
             they hide; None if marine snow is disabled.
@@ -63,7 +63,7 @@ class ImageFormation:
         illumination: optical properties of the water, and daylight.
         floor: heights of the floor, which has facets and, with `imaging.shadows`, casts shadows; None = a smooth floor
             without shadows, whose normals follow from its depth.
-        snow_rng: random stream of the particle positions.
+        snow_rng: random stream of the positions and diameters of the particles.
         rig: the rendered cameras; None = the believed rig.
         objects: objects on the floor; None = none.
 

@@ -45,11 +45,14 @@ class LampLight:
     def __init__(self, sources: LightSources, water: Medium):
         self.sources, self._water = sources, water
         self._tables = (
-            [_all_light(beam, water, "particle") for beam in sources.beam] if water.scatters_repeatedly else None
+            [_light(beam, water, "particle")[1] for beam in sources.beam] if water.scatters_repeatedly else None
         )
 
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
-        """Returns the illuminance of a plane that faces a lamp, (..., 3) [lx], and the unit directions from the lamp.
+        """Returns the light of a lamp on a particle (..., 3) [lx], and the unit directions from the lamp (..., 3).
+
+        The light is the illuminance of a plane that faces the lamp, except that scattered light counts equally from all
+        directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
 
         Args:
             lamp: number of the lamp.
@@ -84,21 +87,20 @@ class LampLight:
         return total * self._water.scattering_per_m
 
 
-def floor_tables(sources: LightSources, water: Medium, shadows: bool) -> NDArray[np.float32] | None:
-    """Returns the light of each lamp on a floor (lamps, n, m, 4), relative to `LightSources.intensity_cd`.
+def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | None:
+    """Returns the light of each lamp on a floor (lamps, 2, n, m, 4), relative to `LightSources.intensity_cd`.
 
-    Axes: lamp, even steps of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1, and R, G, B, 0.
-    None in water without multiple scattering, and without lamps.
+    Axes: lamp; scattered light S, which the floor is assumed not to block, then all light, I exp(-c d) + S; even steps
+    of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. The result is None in water
+    without multiple scattering, and without lamps.
 
     Args:
         sources: lamps in the axes of a camera.
         water: optical properties of the water.
-        shadows: whether to return only the scattered light S, which the floor is assumed not to block; else all light.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None
-    of_beam = _softened if shadows else _all_light
-    return with_a_zero(np.array([of_beam(beam, water, "floor") for beam in sources.beam]))
+    return with_a_zero(np.array([_light(beam, water, "floor") for beam in sources.beam]))
 
 
 def with_a_zero(table: Array) -> NDArray[np.float32]:
@@ -106,8 +108,8 @@ def with_a_zero(table: Array) -> NDArray[np.float32]:
     return np.concatenate([table, np.zeros((*table.shape[:-1], 1))], axis=-1).astype(np.float32)
 
 
-def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns I exp(-c d) + S, all light of a lamp, relative to `LightSources.intensity_cd`.
+def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array]:
+    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`.
 
     Args:
         beam: (m, 2) beam table of the lamp.
@@ -115,15 +117,15 @@ def _all_light(beam: Array, water: Medium, receiver: Receiver) -> Array:
         receiver: floor or particle that the light meets, which determines S.
 
     Returns:
-        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3), with the axes of `floor_tables`.
+        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3) each, with the axes of `floor_tables`.
     """
     at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
     low = np.minimum(at.astype(int), SOFT_STEPS - 1)
     coarse = _softened(beam, water, receiver)
     soft = coarse[low] + (at - low)[:, None, None] * (coarse[low + 1] - coarse[low])
-    share = beam_share(1 - np.linspace(0.0, 1.0, ANGLE_STEPS + 1) ** 2, beam)
-    soft[:, :-1] += share[:, None, None] * np.exp(-water.attenuation_per_m * _path_m()[:, None])
-    return soft
+    share, every = beam_share(1 - np.linspace(0.0, 1.0, ANGLE_STEPS + 1) ** 2, beam), soft.copy()
+    every[:, :-1] += share[:, None, None] * np.exp(-water.attenuation_per_m * _path_m()[:, None])
+    return soft, every
 
 
 def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
@@ -136,7 +138,7 @@ def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
 
 @lru_cache(maxsize=64)
 def _softened_of(beam: Beam, bands: tuple[Absorbed, ...], receiver: Receiver) -> Array:
-    """Same as `_softened`, with hashable arguments for the cache."""
+    """Returns the result of `_softened`; the arguments are hashable, for the cache."""
     rings, path_m = _on_rings(beam), _path_m()
     out = np.zeros((SOFT_STEPS + 1, PATH_STEPS + 1, 3))
     for k, band in enumerate(bands):
@@ -172,7 +174,7 @@ def _from_table(points, position, axis, strength, table, lux, from_lamp):
     Args:
         position, axis: those of the lamp.
         strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
-        table: (n, m, 3) light of the lamp, see `_all_light`.
+        table: (n, m, 3) all light of the lamp, see `_light`.
     """
     rows, cols = table.shape[0] - 1, table.shape[1] - 1
     for k in range(points.shape[0]):

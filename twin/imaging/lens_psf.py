@@ -118,7 +118,10 @@ class LensPsf:
         return out
 
     def transfer(self, light: Radiance) -> Radiance:
-        """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour."""
+        """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour, at least 0.
+
+        It is `light` itself if the lens has none of them.
+        """
         if self._taps is None and self._scales is None:
             return light
         rows, width, taps = *light.shape[:2], self._taps
@@ -137,15 +140,19 @@ class LensPsf:
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
-    """Returns the MTF of diffraction and aberrations in a band (0 red) at frequencies of any shape [cycles/px]."""
+    """Returns the MTF of a lens in a band (0 red) at frequencies of any shape [cycles/px].
+
+    It is that of the aberrations, times that of diffraction if `lens.diffraction` is set and there is a sensor.
+    """
     share = np.exp(-2 * (np.pi * lens.blur_px[band] * cycles_per_px) ** 2)
     return share * diffraction_mtf(cycles_per_px, CENTRE_NM[band], sensor) if lens.diffraction and sensor else share
 
 
 def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Returns the kernels of the MTF as separable terms: weights along columns and rows, (3, terms, REACH_PX + 1).
+    """Returns the point spread functions of the bands as sums of products of a kernel along columns and one along rows.
 
-    The first axis is that of the bands R, G, B. None if the lens does not blur.
+    The result is two arrays (3, terms, REACH_PX + 1), the kernels along columns and those along rows, of the bands R,
+    G, B; kernels are symmetric and stored from the centre outwards. The result is None if the lens does not blur.
     """
     if not lens.diffraction and not any(lens.blur_px):
         return None
@@ -192,9 +199,10 @@ class _Magnification(NamedTuple):
     """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
 
     Args:
-        runs: (k, 4) band, first and end column of each run of pixels with the same taps, and their first tap.
+        runs: (k, 4) band, first and end column of each run of pixels with the same first tap relative to the pixel, and
+            this tap.
         across: (3, TAPS, W) weights along the rows, for each band.
-        lines: (3, H) first tap of each row.
+        lines: (3, H) first tap of each row, relative to the row.
         down: (3, H, TAPS) weights along the columns.
     """
 

@@ -9,11 +9,10 @@ radiance is a cosine series in the azimuth whose terms L_m obey (Chandrasekhar 1
     h_m = 1/2 sum_l (2 l + 1) chi_l P_l^m(mu) P_l^m(mu'),
 
 with chi_l the Legendre moments of the phase function, and P_l^m the associated Legendre functions multiplied by
-sqrt((l - m)! / (l + m)!). At the nodes of a quadrature this is a system of linear
-differential equations with constant coefficients, which is solved by eigenvectors. The forward peak counts as
-unscattered (delta-M+, Lin et al. 2018, J. Quant. Spectrosc. Radiat. Transf. 208, 140), and sunlight that is scattered
-once into the line of sight is computed with the phase function itself (Nakajima & Tanaka 1988, J. Quant. Spectrosc.
-Radiat. Transf. 40, 51).
+sqrt((l - m)! / (l + m)!). At the nodes of a quadrature this is a system of linear differential equations with constant
+coefficients, which is solved by eigenvectors. The forward peak counts as unscattered (delta-M+, Lin et al. 2018, J.
+Quant. Spectrosc. Radiat. Transf. 208, 140), and sunlight that is scattered once into the line of sight is computed with
+the phase function itself (Nakajima & Tanaka 1988, J. Quant. Spectrosc. Radiat. Transf. 40, 51).
 """
 
 from __future__ import annotations
@@ -99,7 +98,7 @@ class LightField:
     Args:
         water: optical properties.
         daylight: direction of the sun and share of the sky.
-        modes: number of terms of the series in azimuth; a sun at the zenith needs one.
+        modes: number of terms of the series in azimuth; one is used for a sun at the zenith or without a beam.
     """
 
     def __init__(self, water: BandOptics, daylight: SunSky, modes: int):
@@ -171,7 +170,7 @@ class LightField:
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
     def _mode(self, m: int) -> _Mode:
-        """Returns the eigenvectors and particular solutions for term m of the cosine series in azimuth.
+        """Returns the solutions for term m of the cosine series in azimuth, m from 0.
 
         The size of the eigenvalue problem is halved by solving for sum and difference of downwelling and upwelling
         radiance.
@@ -325,7 +324,7 @@ def _cosine_moment(order: int) -> float:
 def _fitted_form(x: Array, y: Array, z: Array, light: Array) -> Array:
     """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors.
 
-    x, y, z are the components (n,) of the unit normals of these floors.
+    x, y, z are the components (n,) of the unit normals of these floors. The form is symmetric in y, as is the light.
     """
     terms = np.stack([np.ones_like(z), z, x, z * z, x * z, x * x - y * y], 1)
     weight = np.where(z == 1, LEVEL_WEIGHT, 1.0)

@@ -105,7 +105,7 @@ def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, refl
 
     Args:
         material: `Material`.
-        lamp: lamp; the first three numbers are its position in the axes of the camera [m].
+        lamp: properties of the lamp, of which the first three are its position in the axes of the camera [m].
         albedo: (W, 3) uint8, 255 = white.
         here: (W,) depth [m].
         y: tangent of the row's angle from the optical axis.

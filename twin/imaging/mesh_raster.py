@@ -1,4 +1,4 @@
-"""Rasterization of triangle meshes into depth images: visibility by depth, as OpenGL does, with normals and labels.
+"""Rasterization of triangle meshes into images of depth, normals and labels, with a depth test, as in OpenGL.
 
 One kernel serves the cameras, the shadow maps of lamps and sun, and the view from above that gives the true heights.
 A pixel shows the triangle that the ray through the pixel centre meets first, and the exact depth of this point. Within
@@ -57,13 +57,16 @@ class Target(NamedTuple):
         depth: depth along the optical axis [m]; inf where there is nothing.
         albedo: (H, W, 3) uint8; None: not drawn.
         normal: (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn.
-        label: (H, W) uint16 `label` that `draw_mesh` was given for the mesh in each pixel; None: not drawn.
+        label: (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn.
+        uv: (H, W, 3) float32 values interpolated between the `uv` of the vertices that `draw_mesh` was given; None: not
+            drawn.
     """
 
     depth: Depth
     albedo: NDArray[np.uint8] | None = None
     normal: NDArray[np.float32] | None = None
     label: NDArray[np.uint16] | None = None
+    uv: NDArray[np.float32] | None = None
 
 
 def draw_mesh(
@@ -73,23 +76,27 @@ def draw_mesh(
     target: Target,
     label: int = 0,
     closed: bool = False,
+    uv: NDArray[np.float32] | None = None,
 ) -> None:
-    """Draws a mesh.
+    """Draws a mesh into images, in the pixels where it is nearer than what they show.
 
     Args:
         mesh: the mesh.
         camera_from_object: (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera.
         projection: projection of the camera.
-        target: images to draw into.
+        target: images to draw into, modified in place.
         label: number to write into `target.label`.
         closed: whether the mesh is closed, so that the triangles that face away are not drawn.
+        uv: (n, 3) values of the vertices, drawn into `target.uv`; None: `target.uv` is not drawn.
     """
     matrix = np.ascontiguousarray(camera_from_object[:3], np.float64)
-    _draw(*mesh, matrix, projection, *target, np.uint16(label), closed)
+    if uv is None or target.uv is None:
+        uv, target = None, target._replace(uv=None)
+    _draw(*mesh, uv, matrix, projection, *target, np.uint16(label), closed)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(vertices, faces, colours, matrix, projection, depth, albedo, normal, label, number, closed):
+def _draw(vertices, faces, colours, uv, matrix, projection, depth, albedo, normal, label, places, number, closed):
     """Compiled kernel of `draw_mesh`. The compiler removes the code for images that are None."""
     focal, cx, cy, near, perspective = projection
     n = vertices.shape[0]
@@ -147,6 +154,10 @@ def _draw(vertices, faces, colours, matrix, projection, depth, albedo, normal, l
                     for band in range(3):
                         mixed = pa * colours[i, band] + pb * colours[j, band] + pc * colours[k, band]
                         albedo[v, u, band] = np.uint8(mixed + 0.5)
+                if uv is not None:
+                    pa, pb, pc = (wa * qa / q, wb * qb / q, wc * qc / q) if perspective else (wa, wb, wc)
+                    for part in range(3):
+                        places[v, u, part] = pa * uv[i, part] + pb * uv[j, part] + pc * uv[k, part]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

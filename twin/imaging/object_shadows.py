@@ -1,10 +1,10 @@
 """Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
 
 For each light, the objects are drawn into a depth image as seen from the light (shadow map, Williams 1978), which spans
-the points that the camera sees and has as many pixels as its image. A point is in the shadow where the map shows a
-nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the image.
-Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit unless
-the map is nearer to the light by more than a bias of some pixels.
+the points that the camera sees and has about as many pixels as its image. A point is in the shadow where the map shows
+a nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the
+image. Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit
+unless the map is nearer to the light by more than a bias of some pixels.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
-MARGIN_PX = 2.0  #: of the map around these points
-WIDEST_TANGENT = 5.0  #: of half the field of view of a map; points farther off its axis count as lit
-BIAS_PX = 1.5  #: least distance from an occluder to a point of an object that it shades, if the surface faces the light
+MARGIN_PX = 2.0  #: margin of a map around these points, in its pixels
+WIDEST_TANGENT = 5.0  #: largest tangent of half the field of view of a map; points outside the map count as lit
+BIAS_PX = 1.5  #: least distance of an occluder from a point of an object that faces the light, in pixels of the map
 STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias grows
 
 
 class _LightView(NamedTuple):
-    """View of a light for its shadow map.
+    """View from a light, for its shadow map.
 
     Args:
         light_from_camera: (4, 4) transform from the axes of the camera to those of the view.
@@ -111,7 +111,7 @@ class ObjectShadows:
 
 
 def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
-    """Returns the view of a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
+    """Returns the view from a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
 
     Args:
         lamp_m: (3,) position of the lamp in the axes of the camera.
@@ -138,7 +138,7 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
-    """Returns the parallel view of the sun.
+    """Returns the parallel view from the sun.
 
     Args:
         to_sun: (3,) unit direction to the sun in the axes of the camera.

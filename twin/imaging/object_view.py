@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.objects.floor_mesh import FloorTiles
 from terrains.objects.mesh import Mesh
 from terrains.objects.model import PlacedObject
 from twin.core import geometry
 from twin.core.records import Image, StereoRig
 from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
+from twin.imaging.mesh_texture import TexturedSurface, paint_textures
 from twin.imaging.sway import largest_displacement_m, swayed
 
 Array = NDArray[np.float64]
@@ -39,16 +41,26 @@ class Objects:
     Args:
         placed: the objects.
         current_mps: (3,) velocity of the current, in which plants sway.
+        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: another floor.
     """
 
-    def __init__(self, placed: Sequence[PlacedObject], current_mps: Array | None = None):
-        self.placed = tuple(placed)
+    def __init__(
+        self, placed: Sequence[PlacedObject], current_mps: Array | None = None, floor: FloorTiles | None = None
+    ):
+        tiles = () if floor is None else floor.tiles
+        self._n_objects = len(placed)
+        self.placed = placed = (*placed, *(tile.placed for tile in tiles))
+        self._uv = [tile.uv if tile.texture >= 0 else None for tile in tiles]
+        self.surface = None
+        if floor is not None and len(floor.textures.levels):
+            of_label = [-1] * (1 + self._n_objects) + [tile.texture for tile in tiles]
+            self.surface = TexturedSurface(floor.textures, np.array(of_label, np.int32))
         self._current_mps = np.zeros(3) if current_mps is None else current_mps
         self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
     def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> Iterator[DrawnMesh]:
-        """Yields the meshes of the objects in view, nearest first.
+        """Yields the meshes of the objects in view, in the order of the depth of their centres.
 
         Args:
             camera_from_world: (4, 4) transform from world axes to those of the camera.
@@ -67,6 +79,32 @@ class Objects:
             if item.model.sways:
                 mesh = swayed(mesh, item, self._current_mps, time_s)
             yield DrawnMesh(mesh, camera_from_world @ item.world_from_object, int(k), item.model.closed)
+
+    def uv_of(self, number: int) -> NDArray[np.float32] | None:
+        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes.
+
+        Args:
+            number: index of the mesh in `placed`.
+        """
+        return self._uv[number - self._n_objects] if number >= self._n_objects else None
+
+
+def draw_objects(
+    objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
+    time_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Draws the objects in view into images, with their numbers + 1 as labels; their textures need all images.
+
+    Args:
+        objects: the objects.
+        target: images to draw into; all of them are given, but `uv` only if there are textures.
+        camera_from_world, limits, projection, time_s: see `Objects.in_view`.
+    """
+    for item in objects.in_view(camera_from_world, limits, projection, time_s):
+        uv = objects.uv_of(item.number)
+        draw_mesh(item.mesh, item.camera_from_object, projection, target, item.number + 1, item.closed, uv)
+    if objects.surface is not None:
+        paint_textures(target, projection, objects.surface)
 
 
 class ObjectRenderer:
@@ -92,10 +130,9 @@ class ObjectRenderer:
             time_s: time since the start of the survey.
         """
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
-        target = Target(depth, albedo, *view)
-        camera_from_world = geometry.inverse(world_from_camera)
-        for item in self._objects.in_view(camera_from_world, self._limits, self._projection, time_s):
-            draw_mesh(item.mesh, item.camera_from_object, self._projection, target, item.number + 1, item.closed)
+        uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
+        target = Target(depth, albedo, *view, uv)
+        draw_objects(self._objects, target, geometry.inverse(world_from_camera), self._limits, self._projection, time_s)
         return view
 
 

@@ -4,15 +4,15 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera an
 (Jaffe 1990, McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
 
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_day) * exp(-c r)  +  B(r)
-    B(r) = integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds + B_day(r), summed over lamps
+    B(r) = sum_i integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds  +  B_day(r)
 
 with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
-of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`),
-psi_i the scattering angle, p the phase function, b the scattering coefficient and c = a + b the
-attenuation (`water.Medium`). The model has no free scale factors. For lamps, these equations describe single
-scattering. With multiple scattering, light that is scattered on its way arrives too: that of the lamps as a softer
-beam (`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists of softened beams
-and is blurred (`backscatter`). Shadows and caustics are computed in other modules.
+of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`), psi_i the
+scattering angle, p the phase function, b the scattering coefficient and c = a + b the attenuation (`water.Medium`). The
+model has no free scale factors. For lamps, these equations describe single scattering. With multiple scattering, light
+that is scattered on its way arrives too: that of the lamps as a softer beam (`lamp_light`), that of the floor as a blur
+(`forward_scatter`), and the backscatter consists of softened beams and is blurred (`backscatter`). Shadows and caustics
+are computed in other modules.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from twin.imaging.lamps import beam_share, light_sources_in_camera
 from twin.imaging.materials import Material
 from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.row_parallel import in_row_bands
-from twin.imaging.shading import PATH_MAX_M, PATH_STEP_M, shade
+from twin.imaging.shading import shade
 from twin.imaging.water import Medium
 from twin.scenario.model import LampConfig
 
@@ -49,11 +49,13 @@ Value = TypeVar("Value")
 LEAST_TRANSMISSION = 1e-25  # at a smaller transmission, single precision does not represent the light of the floor
 ALBEDO_STEP_PX = 16  # spacing of the pixels whose mean albedo is that of the floor around the image
 #: Arguments of `shading.shade` for effects that an image does not have.
-_NO_BACKSCATTER = _NO_SOFT_LAMPS = np.zeros((0, 0, 0, 4), np.float32)
+_NO_BACKSCATTER, _NO_SOFT_LAMPS = np.zeros((0, 0, 0, 4), np.float32), np.zeros((0, 2, 0, 0, 4), np.float32)
 _NO_FACETS = FacetView(
     np.zeros((0, 0, 2), np.int32), np.zeros(2, np.int32), np.zeros((2, 4), np.float32), np.zeros((3, 3), np.float32)
 )
 _NO_SHADOWS, _NO_CAUSTICS = np.zeros((0, 0, 0), np.uint8), np.zeros((0, 0), np.float32)
+#: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.
+_FIRST, _SECOND = np.array([[0, 1, 2, 0, 0, 1, 0, 1, 2, 3], [0, 1, 2, 1, 2, 2, 3, 3, 3, 3]])
 _NO_OBJECTS = ObjectView(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.uint16))
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
@@ -107,7 +109,7 @@ class LightParts(NamedTuple):
 
     Args:
         direct: light of the floor that was not scattered between floor and camera.
-        forward: light of the floor that was scattered between floor and camera; None with single scattering.
+        forward: light of the floor that was scattered between floor and camera; None without multiple scattering.
         backscatter: light that the water scattered into the camera without reflection by the floor.
     """
 
@@ -121,14 +123,14 @@ class WhiteFloor(NamedTuple):
 
     Args:
         floor: (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the
-            camera attenuates it by absorption alone; with single scattering, by absorption and scattering.
+            camera attenuates it by absorption alone; otherwise by absorption and scattering.
         backscatter: (H, W, 3) light that the water scatters into the camera [cd/m2].
-        unscattered: (H, W, 3) share of `floor` that is not scattered; ones (3,) with single scattering.
-        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) with single
-            scattering.
+        unscattered: (H, W, 3) share of `floor` that is not scattered; ones (3,) without multiple scattering.
+        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) without
+            multiple scattering.
         spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
             alone, and its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None
-            with single scattering.
+            without multiple scattering.
     """
 
     floor: Radiance
@@ -143,17 +145,14 @@ class _Tables(NamedTuple):
 
     Args:
         beams: (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
-        all_light, scattered: (lamps, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; None
-            without multiple scattering or without lamps.
-        transmission: (3, n) exp(-c s) at equal steps of the path length s.
+        soft: (lamps, 2, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; empty without multiple
+            scattering or without lamps.
         backscatter: (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of
             r / (r + `RANGE_SCALE_M`), with r the range; R, G, B and a zero.
     """
 
     beams: NDArray[np.float32]
-    all_light: NDArray[np.float32] | None
-    scattered: NDArray[np.float32] | None
-    transmission: NDArray[np.float32]
+    soft: NDArray[np.float32]
     backscatter: NDArray[np.float32]
 
 
@@ -195,6 +194,7 @@ class Optics:
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
         # working memory of each camera, as both images may be computed at the same time
         self._memory = cache(lambda camera: _working_memory(rig))
+        self._lamp_loss_per_m = self._medium.attenuation_per_m.astype(np.float32)
         self._floor_daylight, self._daylight_loss_per_m = floor_daylight(daylight), daylight.camera_loss_per_m
         level = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
         self._calm_surface = WaterSurface(None, level)
@@ -213,8 +213,8 @@ class Optics:
             albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
-            floor: facets, shadows and material of the floor; None = normals from the depth, no shadows,
-                Lambertian.
+            floor: facets, shadows, material and objects; None = normals from the depth, no shadows, Lambertian, no
+                objects.
             surface: the water surface; None = a calm surface, for a camera that points straight down at the planned
                 altitude, with east on its right.
         """
@@ -315,7 +315,7 @@ class Optics:
             image: albedo and depth.
             camera, floor, surface: see `radiance`.
             out: arrays to fill.
-            focal_px: given if the image is that of the surroundings, which has this focal length and no backscatter.
+            focal_px: focal length of the image of the surroundings, which has no backscatter; None: the image of `rig`.
             day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
         """
         albedo, depth = image
@@ -327,8 +327,7 @@ class Optics:
         lamps, tables = lamps.astype(np.float32), self._tables_of(camera)
         backscatter = _NO_BACKSCATTER if focal_px else self._backscatter(camera, above)
         seen = FloorView() if floor is None else floor
-        soft = tables.all_light if seen.lit is None and seen.material is None else tables.scattered
-        light = lamps, tables.beams, _or(soft, _NO_SOFT_LAMPS), tables.transmission, backscatter, sky
+        light = lamps, tables.beams, tables.soft, self._lamp_loss_per_m, backscatter, sky
         scene = np.ascontiguousarray(albedo), depth, focal, *light
         facets, objects = _or(seen.facets, _NO_FACETS), _or(seen.objects, _NO_OBJECTS)
         view = facets, _or(seen.lit, _NO_SHADOWS), seen.material, objects
@@ -373,8 +372,7 @@ def _sky(daylight: FloorDaylight, loss_per_m: Array, surface: WaterSurface) -> t
     turn = np.eye(4)
     turn[:3, :3] = axes
     q = turn @ daylight.rest_lx @ turn.T
-    pairs = [2 * q[:, i, j] for i, j in ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))]
-    form = np.stack([q[:, 0, 0], q[:, 1, 1], q[:, 2, 2], *pairs, q[:, 3, 3]], 1)
+    form = q[:, _FIRST, _SECOND] * np.where(_FIRST == _SECOND, 1, 2)
     beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1)
     fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m])
     given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, loss_per_m
@@ -387,11 +385,5 @@ def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:
     cosines, sources = 1 - np.linspace(0.0, 1.0, BEAM_STEPS + 1) ** 2, lamps.sources
     beams = np.array([beam_share(cosines, beam) for beam in sources.beam]).reshape(-1, cosines.size)
     backscatter = with_a_zero(backscatter_table(rig, water, lamps))
-    all_light, scattered = (floor_tables(sources, water, shadows) for shadows in (False, True))
-    transmission = _transmission(water.attenuation_per_m)
-    return _Tables(beams.astype(np.float32), all_light, scattered, transmission, backscatter)
-
-
-def _transmission(per_m: Array) -> NDArray[np.float32]:
-    """Returns the transmission (3, n) at steps of `PATH_STEP_M`, for attenuation coefficients `per_m` (3,) [1/m]."""
-    return np.exp(-per_m[:, None] * np.arange(0.0, PATH_MAX_M, PATH_STEP_M)).astype(np.float32)
+    soft = _or(floor_tables(sources, water), _NO_SOFT_LAMPS)
+    return _Tables(beams.astype(np.float32), soft, backscatter)

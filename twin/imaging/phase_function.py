@@ -45,9 +45,9 @@ PETZOLD_INTEGRAL = 0.997385
 class PhaseTable(NamedTuple):
     """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4).
 
-    The cells are narrow where the function is steep: with n = 4096, their width is 0.0016 deg at 0.1 deg and
-    0.017 deg at 10 deg. The Monte Carlo reference evaluates and samples this piecewise
-    constant function; `phase_at` interpolates linearly between the centres of the cells.
+    The cells are narrow where the function is steep: with n = 4096, their width is 0.0017 deg at 0.1 deg and 0.017 deg
+    at 10 deg. The Monte Carlo reference evaluates and samples this piecewise constant function; `phase_at` interpolates
+    linearly between the centres of the cells.
 
     Args:
         density_per_sr: (n,) mean of the phase function over each cell.

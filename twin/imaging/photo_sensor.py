@@ -25,7 +25,10 @@ BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so th
 class Sensor(Protocol):
     """Interface of the sensor model that both cameras share."""
 
-    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting: ...
+    @property
+    def setting(self) -> ExposureSetting | None: ...
+
+    def meter(self, light: Radiance) -> ExposureSetting: ...
 
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None: ...
 
@@ -78,23 +81,26 @@ class PhotoSensor:
         gray_level = linear_of(scenario.imaging.gray_level, sensor.tone_curve)
         self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
 
-    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
+    @property
+    def setting(self) -> ExposureSetting | None:
+        """Returns the exposure of the next frame; None before the first frame is metered."""
+        gain = self._exposure.next_gain
+        return None if gain is None else self._setting(gain, self._white.next_factors)
+
+    def meter(self, light: Radiance) -> ExposureSetting:
         """Returns this frame's exposure, and meters `light` for the later frames.
 
         The exposure is metered on the previous frames, that of the first frame on `light`.
 
         Args:
-            light: (h, w, 3) radiance of every n-th raw pixel along columns and rows.
-            every_px: the number n.
+            light: (H, W, 3) radiance at the raw pixels.
         """
-        weights = (
-            self._vignetting
-            if every_px == 1
-            else np.ascontiguousarray(self._vignetting[every_px // 2 :: every_px, every_px // 2 :: every_px])
-        )
-        mean = _weighted_mean(light, weights)
+        mean = _weighted_mean(light, self._vignetting)
         white = self._white.factors(mean, self._exposure.share)
-        gain = self._exposure.gain_for(float((mean * self._white.relative(white)).max()))
+        return self._setting(self._exposure.gain_for(float((mean * self._white.relative(white)).max())), white)
+
+    def _setting(self, gain: float, white: Array) -> ExposureSetting:
+        """Returns the exposure with the given gain [1 / (cd/m2)] and white balance (3,)."""
         product_s = gain / self._signal_per_s
         exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
         amplification = min(max(product_s / exposure_s, 1.0), self._most_gain)

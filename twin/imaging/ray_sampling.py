@@ -35,7 +35,7 @@ class RowMotion(NamedTuple):
 
     Args:
         twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        readout_s: time from the first row of the raw image to the last.
+        readout_s: time from the first sampled row of the raw image to the last.
         focal_px: focal length of the rendered image.
         principal_px: (2,) column and row of its principal point.
     """
@@ -144,12 +144,10 @@ def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
         for u in range(x.size):
             col = min(max(int(base_x[u]), 0), cols - 1)
             inverse[u] = flat[min(max(int(base_y[u]), 0), rows - 1) * cols + col]
-    longest = np.float32(np.inf)
     for _ in range(INTERSECTION_STEPS):
-        if longest < np.float32(INTERSECTION_PX):
-            break
         _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells)
-        longest = _look_up(flat, cols, cells, part_x, part_y, slope_x, slope_y, inverse)
+        if not _look_up(flat, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
+            break
     for u in range(x.size):
         x[u], y[u] = base_x[u] + slope_x[u] * inverse[u], base_y[u] + slope_y[u] * inverse[u]
 
@@ -191,9 +189,10 @@ def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_
 def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
     """Replaces `inverse` by the inverse depth at the positions of the rays.
 
-    Returns the largest change of a position that the change of the inverse depth causes [px].
+    Returns the number of rays whose position this changes by more than `INTERSECTION_PX`; a sum of integers, unlike a
+    largest value, lets the compiler vectorize the loop.
     """
-    longest = np.float32(0.0)
+    n_moved, limit = 0, np.float32(INTERSECTION_PX)
     for u in range(cells.size):
         k, s, t = np.uint32(cells[u]), part_x[u], part_y[u]
         m = k + np.uint32(cols)
@@ -201,6 +200,6 @@ def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
         below = near[m] + s * (near[m + np.uint32(1)] - near[m])
         met = above + t * (below - above)
         change = met - inverse[u]
-        longest = max(longest, abs(change * slope_x[u]) + abs(change * slope_y[u]))
+        n_moved += abs(change * slope_x[u]) + abs(change * slope_y[u]) > limit
         inverse[u] = met
-    return longest
+    return n_moved

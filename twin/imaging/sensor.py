@@ -55,6 +55,11 @@ class AutoExposure:
         self._limits = limits
         self._log_gain: float | None = None
 
+    @property
+    def next_gain(self) -> float | None:
+        """Returns the gain of the next frame [1 / (cd/m2)]; None before the first frame is metered."""
+        return None if self._log_gain is None else float(np.exp(self._log_gain))
+
     def gain(self, radiance: Radiance) -> float:
         """Returns the gain of this frame [1 / (cd/m2)], and meters `radiance` (H, W, 3) as in `gain_for`."""
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
@@ -79,9 +84,9 @@ class ExposureSetting(NamedTuple):
     Args:
         gain: linear image signal per unit of radiance on the optical axis, with the white balance for white light
             [1 / (cd/m2)]; a signal of 1 saturates.
-        exposure_s: exposure time; 0 for a sensor without motion blur.
+        exposure_s: exposure time; 0 for the plain sensor.
         analogue_gain: amplification before digitization.
-        white: (3,) factors of R, G, B by the white balance of a sensor; None = those of white light.
+        white: (3,) factors that the white balance applies to R, G, B; None = those for white light.
     """
 
     gain: float
@@ -101,8 +106,14 @@ class PlainSensor:
         self._imaging = scenario.imaging
         self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
 
-    def meter(self, light: Radiance, every_px: int = 1) -> ExposureSetting:
-        """Returns this frame's exposure, and meters `light` (h, w, 3) for the later frames; `every_px` is not used.
+    @property
+    def setting(self) -> ExposureSetting | None:
+        """Returns the exposure of the next frame; None before the first frame is metered."""
+        gain = self._exposure.next_gain
+        return None if gain is None else ExposureSetting(gain)
+
+    def meter(self, light: Radiance) -> ExposureSetting:
+        """Returns this frame's exposure, and meters `light` (H, W, 3) for the later frames.
 
         The exposure is metered on the previous frames, that of the first frame on `light`.
         """

@@ -15,7 +15,6 @@ from twin.imaging.materials import add_reflected
 from twin.imaging.pixel_sum import sum_of_entries
 from twin.imaging.powers import LOG2_E, two_to
 
-PATH_STEP_M, PATH_MAX_M = 0.01, 80.0  # step and length of the paths in the transmission tables
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
 
@@ -24,7 +23,7 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depth
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def shade(
-    albedo, depth, focal, lamps, beams, soft, transmission, scatter_table, sky, facets, lit, material, objects, out,
+    albedo, depth, focal, lamps, beams, soft, lamp_loss, scatter_table, sky, facets, lit, material, objects, out,
     other, kept, place, first, end,
 ):  # fmt: skip
     """Computes the light of the floor and the backscatter in rows `first` to `end` of an image.
@@ -38,10 +37,9 @@ def shade(
         focal: focal length [px].
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) relative intensity, at even steps of sqrt(1 - cos(angle)) from 0 to 1.
-        soft: (n, k, l, 4) light of each lamp on the floor, at even steps of sqrt(1 - cos(angle)) and, for a distance d,
-            of d / (d + scale): with shadows or a material, the scattered light alone, else all light; empty with single
-            scattering.
-        transmission: (3, m) transmission at steps of PATH_STEP_M.
+        soft: (n, 2, k, l, 4) scattered light and all light of each lamp on the floor, at even steps of
+            sqrt(1 - cos(angle)) and, for a distance d, of d / (d + scale); empty with single scattering.
+        lamp_loss: (3,) attenuation of the unscattered light of lamps on its way to the floor [1/m].
         scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
         sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other daylight (3, 10)
             [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy,
@@ -71,7 +69,7 @@ def shade(
     arriving = np.empty((3, width), np.float32)
     cells, parts = np.empty((2, width), np.int32), np.empty((2, width), np.float32)
     lookup = cells[0], cells[1], parts[0], parts[1]
-    row_table = np.empty((cols, ranges, 4), np.float32)
+    row_table, shown = np.empty((cols, ranges, 4), np.float32), np.ones(width, np.uint8)
     sunny = beam[:, 0].max() > 0 or diffuse.max() > 0
     softened, shadowed, apart = soft.shape[0] > 0, lit.shape[0] > 0, other.shape[0] > 0
     for v in range(first, end):
@@ -86,17 +84,19 @@ def shade(
         reflected[:] = np.float32(0.0)
         for k in range(lamps.shape[0]):
             _illuminate(lamps[k], depth[v], y, focal, normal, lamp)
-            if softened:
-                _add_soft_lamp(lamps[k], soft[k], lamp, lookup, light)
             if shadowed:
+                shown = lit[k, v]
+            if softened:
+                _add_soft_lamp(lamps[k], soft[k], lamp, shown, material is None, lookup, light)
+            if material is not None or not softened:
                 for u in range(width):
-                    lamp[0, u] = lamp[0, u] if lit[k, v, u] else np.float32(0.0)
-            if material is not None:
+                    lamp[0, u] = lamp[0, u] if shown[u] else np.float32(0.0)
+            if material is None and not softened:
+                _add_lamp(lamps[k], beams[k], lamp_loss, lamp, lookup, light)
+            elif material is not None:
                 arriving[:] = np.float32(0.0)
-                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, arriving)
+                _add_lamp(lamps[k], beams[k], lamp_loss, lamp, lookup, arriving)
                 add_reflected(material, lamps[k], albedo[v], depth[v], y, focal, normal, arriving, reflected)
-            elif shadowed or not softened:
-                _add_lamp(lamps[k], beams[k], transmission, lamp, lookup, light)
         if lamps.shape[0]:
             _attenuate(loss[0], range_m, light)
             if material is not None:
@@ -226,44 +226,41 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _add_lamp(lamp, beam, transmission, lamplight, lookup, light):
+def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
     """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp.
 
-    `lamplight` (3, W) is the output of `_illuminate`; the light is attenuated on the path from lamp to floor.
+    `lamplight` (3, W) is the output of `_illuminate`; the light is attenuated on the path from lamp to floor with the
+    coefficients `per_m` (3,) [1/m].
     """
-    one, per_step = np.float32(1.0), np.float32(1 / PATH_STEP_M)
-    red, green, blue = lamp[7], lamp[8], lamp[9]
-    steps, last_b = np.float32(beam.size - 1), np.int32(beam.size - 2)
-    last = np.int32(transmission.shape[1] - 2)
-    at_beam, at_path, part_of_beam, part_of_path = lookup
+    steps, last = np.float32(beam.size - 1), np.int32(beam.size - 2)
+    cell, _, share, _ = lookup
     for u in range(light.shape[1]):
         at = lamplight[1, u] * steps
-        at_beam[u] = min(np.int32(at), last_b)
-        part_of_beam[u] = at - np.float32(at_beam[u])
-        at = lamplight[2, u] * per_step
-        at_path[u] = min(np.int32(at), last)
-        part_of_path[u] = min(at - np.float32(at_path[u]), one)
+        cell[u] = min(np.int32(at), last)
+        share[u] = at - np.float32(cell[u])
     for u in range(light.shape[1]):
-        i, w = np.uint32(at_beam[u]), part_of_beam[u]
-        e = lamplight[0, u] * (beam[i] + w * (beam[i + np.uint32(1)] - beam[i]))
-        i, w = np.uint32(at_path[u]), part_of_path[u]
-        j = i + np.uint32(1)
-        light[0, u] += e * red * (transmission[0, i] + w * (transmission[0, j] - transmission[0, i]))
-        light[1, u] += e * green * (transmission[1, i] + w * (transmission[1, j] - transmission[1, i]))
-        light[2, u] += e * blue * (transmission[2, i] + w * (transmission[2, j] - transmission[2, i]))
+        i = np.uint32(cell[u])
+        share[u] = lamplight[0, u] * (beam[i] + share[u] * (beam[i + np.uint32(1)] - beam[i]))
+    for c in range(3):
+        colour, by_path = lamp[7 + c], -np.float32(LOG2_E) * per_m[c]
+        for u in range(light.shape[1]):
+            light[c, u] += share[u] * colour * two_to(by_path * lamplight[2, u])
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
+def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
     """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`.
 
-    `lamplight` (3, W) is the output of `_illuminate`.
+    `lamplight` (3, W) is the output of `_illuminate`. The unscattered light is included where `lit` (W,) is not 0, if
+    `direct`.
     """
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
-    rows, cols = np.float32(soft.shape[0] - 1), np.float32(soft.shape[1] - 1)
-    last_r, last_c, stride = np.int32(soft.shape[0] - 2), np.int32(soft.shape[1] - 2), np.int32(4 * soft.shape[1])
+    _, n_rows, n_cols, _ = soft.shape
+    rows, cols = np.float32(n_rows - 1), np.float32(n_cols - 1)
+    last_r, last_c, stride = np.int32(n_rows - 2), np.int32(n_cols - 2), np.int32(4 * n_cols)
     cell, _, part_of_row, part_of_col = lookup
+    all_light = np.int32(4 * n_rows * n_cols) if direct else np.int32(0)
     for u in range(light.shape[1]):
         at = lamplight[1, u] * rows
         row = min(np.int32(at), last_r)
@@ -271,7 +268,7 @@ def _add_soft_lamp(lamp, soft, lamplight, lookup, light):
         at = lamplight[2, u] * cols / (lamplight[2, u] + scale)
         col = min(np.int32(at), last_c)
         part_of_col[u] = min(at - np.float32(col), one)
-        cell[u] = row * stride + np.int32(4) * col
+        cell[u] = row * stride + np.int32(4) * col + (all_light if lit[u] else np.int32(0))
     flat = soft.reshape(-1)
     for u in range(light.shape[1]):
         i, w, s, e = np.uint32(cell[u]), part_of_row[u], part_of_col[u], lamplight[0, u]

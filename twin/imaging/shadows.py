@@ -1,8 +1,9 @@
 """Shadows cast by the floor in the light of lamps and sun; they are visible because the lamps are not at the cameras.
 
 A point of the floor is in the shadow of a lamp if the straight ray to the lamp passes below the floor. The floor is the
-rendered surface: triangles over a grid of heights. Along a ray, a triangle is highest where the ray crosses one of its
-edges, so only edge crossings are tested, and only in blocks and in cells that are high enough to reach the ray.
+rendered surface: triangles over a grid of heights. The height of a triangle above a ray is greatest where the ray
+crosses one of its edges, so only edge crossings are tested, and only in blocks and in cells that are high enough to
+reach the ray.
 
 Not every pixel needs a ray. A shadow is cast by a crest, and the facets behind a crest face away from the lamp: a
 shadow therefore begins at such facets and is connected to them. Their pixels are marked dark without a ray. From them,

@@ -1,4 +1,4 @@
-"""Marine snow: small particles that drift with the current through the light of the lamps.
+"""Marine snow: small particles that drift with the current through the light of lamps and sun.
 
 The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
 side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
@@ -200,7 +200,7 @@ class MarineSnow:
 
         Points and drift are in the axes of the camera.
         """
-        velocity = drift - twist[3:] - np.cross(twist[:3], points)
+        velocity = drift - twist[3:] + points @ geometry.skew(twist[:3])  # row vectors: -(w x p) = p @ skew(w)
         along = points[:, :2] / points[:, 2:]
         return self._rig.focal_px * (velocity[:, :2] - along * velocity[:, 2:]) / points[:, 2:]
 
@@ -244,7 +244,8 @@ def _delay_s(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
     """Returns the times (n,) after mid-exposure at which a rolling shutter records particles [s].
 
     The row v is read t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row v_0 at mid-exposure
-    and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t.
+    and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the divisor
+    1 - v' readout / (n_rows - 1) limited to 0.1 or more.
     """
     row_s = readout_s / (n_rows - 1)
     return (pixel[:, 1] * row_s - readout_s / 2) / np.maximum(1 - flow[:, 1] * row_s, 0.1)
@@ -254,9 +255,9 @@ def _delay_s(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
 def _in_view(start, shift, low, camera_from_world, focal, middle, size, margin_px, reach_px_m, farthest_m):
     """Returns the indices (n,) of the particles in view and their positions (n, 3) in the axes of the camera.
 
-    A particle is in view if its depth is between NEAREST_M and `farthest_m`, and its image is at most margin_px +
-    reach_px_m / depth outside the image. `start` are the
-    positions in the box at time 0, to which `shift` is added before they are wrapped into the box at `low`.
+    A particle is in view if its depth is between NEAREST_M and `farthest_m`, and its projection is less than
+    `margin_px` + `reach_px_m` / depth outside the image. `start` (m, 3) are the positions in the box at time 0, to
+    which `shift` (3,) is added before they are wrapped into the box whose lower corner is `low` (3,) [m].
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
     xs, ys, zs, seen = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.uint8)
@@ -309,6 +310,12 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
     A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
     from the start to the end of each path, `centre` (n, 2) [px] its middle.
+
+    Args:
+        z: (n,) depths [m].
+        radiance: (n, 3) radiance of the particles [cd/m2].
+        width: (n,) diameters of the discs, including blur [px].
+        cover: (n,) areas that the particles cover without blur [px^2].
     """
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):

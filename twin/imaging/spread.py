@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Receiver = Literal["floor", "particle"]
 
 ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
-LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; edge of the rings of a camera, as a tangent
+LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; of the outermost ring of a camera, as a tangent
 STEPS = 24  # number of positions of a scattering along a ray of the camera
 MAX_GROWTH = 1.0  # upper limit of b d (K - 1), the logarithm of the transform relative to exp(-a d)
 WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture

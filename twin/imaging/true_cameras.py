@@ -43,7 +43,8 @@ class CameraModel(NamedTuple):
     """Model of one camera, true or believed, in the axes of the believed camera.
 
     Args:
-        focal_px: focal length of the lens, in air; in water if there is no port.
+        focal_px: focal length of the lens, that of the equivalent pinhole camera divided by `pinhole.focal_ratio`: in
+            air behind a port, in water without a port.
         principal_px: (2,) column and row of the principal point.
         lens: distortion coefficients.
         port: geometry and refractive indices of the port.
@@ -126,50 +127,35 @@ class TrueCameras:
     believed: CameraModel
     rectified_depth_m: float
 
-    def sample(
-        self, light: Radiance, depth: Depth, camera: int, every_px: int = 1, motion: ExposureMotion | None = None
-    ) -> Radiance:
+    def sample(self, light: Radiance, depth: Depth, camera: int, motion: ExposureMotion | None = None) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
 
         Args:
             light: (H, W, 3) radiance in the rendered image.
             depth: (H, W) depth in the rendered image [m].
             camera: 0 left, 1 right.
-            every_px: number n; only every n-th raw pixel along columns and rows is sampled. The mean row number of
-                the samples is assigned the exposure time of the middle row of the raw image, at most n / 2 rows away.
             motion: motion of the camera during the exposure; its rolling-shutter effect is applied if the rendered
                 images are resampled (`sampling` is not None). None: no motion.
         """
         if self.sampling is None:
-            return (
-                light
-                if every_px == 1
-                else np.ascontiguousarray(light[every_px // 2 :: every_px, every_px // 2 :: every_px])
-            )
+            return light
         positions, parallax = self.sampling[camera]
-        if every_px > 1:
-            positions = np.ascontiguousarray(positions[every_px // 2 :: every_px, every_px // 2 :: every_px])
-            parallax = (
-                None
-                if parallax is None
-                else np.ascontiguousarray(parallax[every_px // 2 :: every_px, every_px // 2 :: every_px])
-            )
-        rows = self._row_motion(motion, len(light), every_px * (len(positions) - 1))
+        rows = self._row_motion(motion, len(light), len(positions))
         if parallax is None and rows is None:
             return resample.sample(light, positions)
         return sample_rays(light, depth, positions, parallax, rows)
 
-    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, span_px: int) -> RowMotion | None:
-        """Returns the motion during the read-out of the sampled raw rows; None without rolling shutter.
+    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
+        """Returns the motion during the read-out of the raw rows; None without rolling shutter.
 
         Args:
             motion: motion of the camera during the exposure.
             n_rendered: rows of the rendered image.
-            span_px: distance from the first sampled raw row to the last.
+            n_raw: rows of the raw image.
         """
         if motion is None or not motion.readout_s:
             return None
-        rig, readout_s = self.rendered_rig, motion.readout_s * span_px / (n_rendered - 1)
+        rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
         return RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
 
     def rectify(self, raw: Image) -> Image:

@@ -69,7 +69,7 @@ def medium(
     Args:
         water: the water of a scenario.
         scattering: `imaging.scattering`; with "none", the water does not scatter.
-        path_m: length of the path of the light over which the absorption of a band is effective [m]; 0: mean
+        path_m: path length of the light for which the effective absorption of each band is computed [m]; 0: mean
             absorption of the band.
         light: light whose spectrum weights absorption and scattering in a band.
 
@@ -83,14 +83,14 @@ def medium(
 
 
 def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, ...]:
-    """Returns phase function of the particles and molecular share of each band.
+    """Returns the phase function of the particles and the molecular share of each band.
+
+    With the phase function "sea", the molecular scattering coefficient is that of pure sea water (Morel 1974), at most
+    b, and the rest of b is due to particles; otherwise all scattering is due to particles.
 
     Args:
         water: the water of a scenario.
         scattering_per_m: (3,) scattering coefficient b of molecules and particles [1/m].
-
-    With the phase function "sea", the molecular scattering coefficient is that of pure sea water (Morel 1974), at most
-    b, and the rest of b is due to particles; otherwise all scattering is due to particles.
     """
     if water.phase_function == "sea":
         molecules = molecular_scattering_per_m(np.array(CENTRE_NM))

@@ -63,6 +63,11 @@ class WhiteBalance:
         self._log_grey = log_grey + share * (measured - log_grey)
         return np.exp(log_grey)
 
+    @property
+    def next_factors(self) -> Array:
+        """Returns the factors (3,) of the next frame; with grey world, a frame must have been measured."""
+        return self._fixed if self._log_grey is None else np.exp(self._log_grey)
+
     def relative(self, factors: Array) -> Array | float:
         """Returns the factors (3,) relative to those for white light; 1 if they are equal."""
         return 1.0 if self.is_of_white_light else factors / self.of_white_light

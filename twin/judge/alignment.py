@@ -1,4 +1,4 @@
-"""Keyframe errors before and after each global alignment, and the final error at the far end of each track."""
+"""Keyframe errors before and after each global alignment, and the error of the final poses at the far end of tracks."""
 
 from __future__ import annotations
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-#: Stages of the estimators that run at each keyframe. Their mean time per keyframe is compared with its budget.
+#: Stages of the estimators that run at each keyframe. Their total time, divided by the number of keyframes, is compared
+#: with the budget of a keyframe.
 KEYFRAME_STAGES = ("stereo", "f2m", "network", "flow")
 #: Key of the row with the total time of `KEYFRAME_STAGES`.
 KEYFRAME_WORK = "keyframe"
@@ -21,7 +22,8 @@ class StageTime(NamedTuple):
     Args:
         stage: key of the stage in metrics.json, or `KEYFRAME_WORK`.
         n_calls: number of calls; for `KEYFRAME_WORK` the number of keyframes.
-        mean_ms, p95_ms: mean and 95th percentile of the duration of a call [ms].
+        mean_ms: mean duration of a call, for `KEYFRAME_WORK` of the work on a keyframe [ms]; None without calls.
+        p95_ms: 95th percentile of the duration of a call [ms]; None without calls and for `KEYFRAME_WORK`.
         total_s: total duration of all calls [s].
         budget_ms: largest allowed mean duration [ms]; None if the stage has no budget.
     """

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array
 
-#: X, Y, Z of the primaries of ITU-R BT.709 with the white point D65, relative to Y of white (IEC 61966-2-1).
+#: X, Y, Z (rows) of the primaries R, G, B (columns) of ITU-R BT.709 with the white point D65, relative to Y of white
+#: (IEC 61966-2-1).
 XYZ_FROM_RGB = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
 _25_TO_7 = 25.0**7
 

@@ -15,7 +15,7 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 
     For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
     within two sigma is 0.954. `within_2sigma_position` is the fraction over the three camera axes of the keyframes that
-    `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that have a height error.
+    `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that `normalised_error` returns.
     """
     error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))

@@ -1,4 +1,4 @@
-"""Control errors of the vehicle: differences between its true positions and the reference path."""
+"""Control errors: differences between the true positions of the left camera and the reference path."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from twin.judge.warnings import metric_warnings
 SCHEMA = "twin.metrics/2"
 _IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason")
 
-_VERDICTS = ("warnings", "warning", "idealisations")  # None until `_judged` fills them in
+_VERDICTS = ("warnings", "warning", "idealisations")  # keys whose values `_judged` sets; None before
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class EvaluationInput:
         require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
         warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
         idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
-        actions: times for which the mission slowed and stopped the vehicle because visual measurements failed.
+        actions: durations for which the mission slowed and stopped the vehicle because visual measurements failed.
         orthomosaic: errors of the orthomosaic (`OrthomosaicJudge.metrics`); None if none was made.
     """
 
@@ -105,8 +105,8 @@ def _judged(metrics: dict[str, Any], survey: EvaluationInput) -> dict[str, Any]:
 def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
     """Returns the metrics of a survey that was not compared with the truth.
 
-    They hold identity, timing, warnings, idealisations and requirements; all other metrics are None or 0. A requirement
-    on a metric that is None fails.
+    They hold identity, timing, warnings, idealisations and requirements; all other metrics are None, 0 or empty. A
+    requirement on a metric that is None fails.
 
     Raises:
         TwinError: `require` names a metric that does not exist.
@@ -146,7 +146,7 @@ def check_require(names: Mapping[str, float]) -> None:
 
 
 def empty_metrics() -> dict[str, Any]:
-    """Returns the metrics of a survey without frames: all keys, with values None or 0."""
+    """Returns the metrics of a survey without frames: all keys, with values None, 0 or empty, except the schema."""
     none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
     no_keyframes = np.zeros(0, dtype=np.int64)
     result = SurveyResult(none, none, none, no_keyframes, no_keyframes, np.zeros((0, 6, 6)))
@@ -158,7 +158,12 @@ def empty_metrics() -> dict[str, Any]:
 
 
 def timing_metrics(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
-    """Returns `timing` of metrics.json: wall and simulated time, real-time factor, memory, and time by stage."""
+    """Returns `timing` of metrics.json: times, real-time factor, numbers of frames and keyframes, memory, and stages.
+
+    Args:
+        timing: `EvaluationInput.timing`.
+        n_frames, n_keyframes: number of frames and of keyframes.
+    """
     wall, simulated = timing.get("wall_s"), timing.get("simulated_s")
     return {
         "wall_s": finite_float(wall),

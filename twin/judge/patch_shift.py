@@ -31,7 +31,8 @@ def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchS
 
     The peak of the correlation is interpolated by a parabola through three values along each axis. Returns None if one
     of the two has no texture, if the correlation is below `least_correlation`, if the peak lies at the border of the
-    search range of m pixels, or if a second peak, apart from the first, is nearly as high.
+    search range of m pixels, or if the correlation exceeds 90 % of the peak at a distance of more than three pixels
+    along a row or a column.
     """
     if min(patch.std(), around.std()) < 1e-3:
         return None

@@ -73,8 +73,8 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
     """Returns the contents of metrics.json of a replayed survey, with the keys of `metrics.evaluate`.
 
     Only the trajectories are compared with the truth; without one, their errors are None. The other metrics that need a
-    truth (map, links, etc.) are None or 0. The key `replay` holds the description of the data set, the alignment, the
-    number of frames with a true pose, and the consistency of the network (`network_residuals`).
+    truth (map, links, etc.) are None, 0 or empty. The key `replay` holds the description of the data set, the
+    alignment, the number of frames with a true pose, and the consistency of the network (`network_residuals`).
     """
     result, truth = survey.result, survey.truth
     trajectories, warnings, n_associated = dict[str, Any](), list(survey.warnings), 0
@@ -105,7 +105,7 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
 
 
 def unevaluated_replay(survey: ReplayEvaluation) -> dict[str, Any]:
-    """Returns the metrics of a replay without its evaluation: identity, data set and timing; all others None or 0."""
+    """Returns the metrics of a replay without its evaluation: identity, data set, timing; others None, 0 or empty."""
     result = survey.result
     unknown = {"alignment": None, "frames_with_truth": 0, "network": dict.fromkeys(NETWORK_KEYS)}
     metrics = empty_metrics() | survey.identity | {

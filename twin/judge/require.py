@@ -20,6 +20,19 @@ MORE_IS_BETTER = (
     "orthomosaic.matched",
 )
 
+#: Metrics that can be negative: the ratio of two values has no meaning.
+SIGNED = (
+    "map.bias_m",
+    "orthomosaic.bias_east_m",
+    "orthomosaic.bias_north_m",
+    "self_check.disparity_offset",
+    "self_check.pitch_deg",
+    "self_check.roll_deg",
+    "self_check.row_offset_px",
+    "self_check.row_shift",
+    "self_check.yaw_deg",
+)
+
 
 def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Returns `require` of metrics.json: value, limit and verdict of each required metric.

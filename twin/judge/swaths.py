@@ -34,7 +34,12 @@ def travel_direction(reference: Array) -> Array:
 
 
 def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
-    """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs and during turns."""
+    """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs and during turns.
+
+    Args:
+        truth: source of the reference path, its heading and the track numbers.
+        pattern: "loops", where each frame belongs to the loop of its track; otherwise the path consists of legs.
+    """
     if pattern == "loops":
         return truth.track - 1
     numbers = leg_numbers(truth.reference)

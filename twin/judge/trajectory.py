@@ -1,4 +1,4 @@
-"""Absolute trajectory errors: estimates are anchored at the first true pose, without a fitted transform."""
+"""Absolute trajectory errors of estimates that are anchored at the first true pose, without a fitted transform."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class PathErrors(NamedTuple):
     """Errors of an estimated trajectory at n frames, estimate minus truth.
 
     Args:
-        travelled_m: (n,) length of the true path since the first frame [m].
+        travelled_m: (n,) length of the true path since the first of these frames [m].
         position_m: (n, 3) position error in the world [m].
         heading_rad: (n,) heading error, wrapped to [-pi, pi) [rad].
     """
@@ -51,7 +51,7 @@ def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
 
 
 def cumulative_length(positions: Array) -> Array:
-    """Returns the length of the path up to each of the positions (n, 3), starting at 0 [m]."""
+    """Returns the length (n,) of the path from the first position to each of the positions (n, 3) [m]."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(positions)]
 

@@ -76,7 +76,9 @@ class Estimator(Protocol):
     """
 
     def update(self, frame: Frame) -> Array | None:
-        """Returns the online pose (4, 4) at a frame; None if it could not be measured, and the vehicle slows down.
+        """Returns the online pose (4, 4) at a frame, or None if it could not be measured.
+
+        The vehicle slows down if many frames have no pose, and stops if half a second has none (`MissionActions`).
 
         Args:
             frame: time, left image, right image (None between keyframes), and readings of the navigation sensors.

@@ -45,7 +45,7 @@ def plugin_kind(text: str) -> Kind:
 
 
 def package_name(folder: Path) -> str:
-    """Returns the name of the package in a folder: that of the folder in lower case, with underscores.
+    """Returns the name of the package in a folder: that of the folder in lower case, with "_" for ".", "-" and spaces.
 
     Raises:
         TwinError: the name is not valid for a Python package, or a package of this name can already be imported.
@@ -72,6 +72,9 @@ def write(kind: Kind, folder: Path) -> list[Path]:
     """
     package = package_name(folder)
     flown = _FLOWN.get(kind)
+    use = f"    twin run quickstart --set {flown.section}.plugin={package}" if flown else "    twin replay DATASET"
+    if kind == "estimator":
+        use += f"\n    twin replay DATASET --estimator {package}"
     values = {
         "NAME": package.replace("_", "-"),
         "KIND": kind,
@@ -80,9 +83,7 @@ def write(kind: Kind, folder: Path) -> list[Path]:
         "SECTION": flown.section if flown else "",
         "FIDELITY": flown.fidelity if flown else "",
         "ERROR_M": f"{flown.error_m:g}" if flown else "",
-        "USE": f"    twin run quickstart --set {flown.section}.plugin={package}"
-        if flown
-        else "    twin replay DATASET",
+        "USE": use,
     }
     templates = {
         "pyproject.toml": "pyproject.toml",

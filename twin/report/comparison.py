@@ -24,7 +24,7 @@ class ComparedQuantity(NamedTuple):
     Args:
         name: dotted name in metrics.json.
         label: name on the page.
-        text: function that returns a value as text with its unit.
+        text: function that returns a value as text, with its unit unless the label has it.
         better: "less" or "more" if smaller or larger values are better; "" if neither.
     """
 
@@ -101,7 +101,7 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def names_of(runs: Sequence[Run]) -> list[str]:
-    """Returns distinct names of runs: those of their folders, all with as many parent folders as make them distinct."""
+    """Returns distinct names of runs: those of their folders, all with as few parent folders as make them distinct."""
     paths = [run.folder.resolve() for run in runs]
     for n in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-n:]) for path in paths]

@@ -118,7 +118,7 @@ def path_error_curves(run: Run) -> Figure | None:
 
 
 def log_scale(axes: Axes) -> None:
-    """Sets a logarithmic y axis that starts just below the 1st percentile of the positive values of all curves.
+    """Sets a logarithmic y axis that starts at 0.7 times the 1st percentile of the positive values of all curves.
 
     Axes without a positive value stay linear.
     """
@@ -144,7 +144,7 @@ def log_axis(axis: Any, set_scale: Callable[[str], None], steps: tuple[float, ..
 
 
 def stage_bars(run: Run) -> Figure | None:
-    """Returns bars of the keyframe error after each positioning stage, with the gain over the preceding stage."""
+    """Returns bars of the keyframe error after each positioning stage, with the change from the preceding stage."""
     rows = stage_rows(run.metrics or {}, run.scenario)
     errors_m = [row.rmse_m for row in rows if row.rmse_m]
     if not errors_m:

@@ -30,12 +30,13 @@ _PNG = [
 
 
 class FrameRecorder:
-    """Writes frames to the folder `frames` of a run while it is flown. Use as a context manager.
+    """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
     `frames.csv` has index, time, exposure and sensor readings of every frame, and whether it has a stereo pair.
     `truth.npz` has the true poses and velocities in double precision; the text files of trajectories are rounded. With
-    "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images at planned
-    keyframes only. With "keyframes", the images are those that the estimators store in the folder `keyframes`.
+    "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images only at frames
+    that are to become keyframes. With "keyframes", the images are those that the estimators store in the folder
+    `keyframes`.
 
     Args:
         folder: run folder.

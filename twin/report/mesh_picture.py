@@ -6,6 +6,7 @@ Closing pyrender's OpenGL display also closes MuJoCo's, and a faulty driver can 
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from twin.core import geometry
 from twin.core.records import Array, Image
 from twin.report.images import read_rgb
 
@@ -32,14 +34,21 @@ LIGHT = np.array([-0.5, 0.7, -0.5])
 WHITE = (1.0, 1.0, 1.0, 0.0)
 
 
-def surface_picture(mesh_file: Path) -> Image | None:
-    """Returns an oblique view of the mesh from the south, (h, w, 3) RGB; None without a mesh or if rendering fails."""
+def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
+    """Returns an oblique view of the mesh from the south, (h, w, 3) RGB; None without a mesh or if rendering fails.
+
+    Args:
+        mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
+        map_from_world: (4, 4) pose of the world in the frame of the map, whose x, y and z are east, north and up of the
+            picture; None: the identity.
+    """
     if not mesh_file.is_file():
         return None
     try:
         with tempfile.TemporaryDirectory() as folder:
             picture = Path(folder) / "surface.png"
-            command = [sys.executable, "-m", __name__, str(mesh_file), str(picture)]
+            pose = json.dumps(np.eye(4).tolist() if map_from_world is None else map_from_world.tolist())
+            command = [sys.executable, "-m", __name__, str(mesh_file), str(picture), pose]
             subprocess.run(command, capture_output=True, timeout=LIMIT_S, check=True)
             return read_rgb(picture)
     except (OSError, subprocess.SubprocessError):
@@ -69,6 +78,18 @@ def render_mesh(mesh: Any) -> Image:
     picture, depth = rendered
     rows, cols = np.nonzero(depth)
     return picture[rows.min() : rows.max() + 1, cols.min() : cols.max() + 1]
+
+
+def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
+    """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m].
+
+    Args:
+        vertices: (n, 3) [m].
+        map_from_world: (4, 4) pose of the world in the frame of the map, both with z up.
+    """
+    from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh, which only this process needs
+
+    return geometry.transform(map_from_world, vertices @ GLB_FROM_WORLD) @ GLB_FROM_WORLD.T
 
 
 def shaded_colours(colours: Image, normals: Array) -> Image:
@@ -110,12 +131,14 @@ def _axis_rotation(axis: int, angle_deg: float) -> Array:
     return np.asarray(cv2.Rodrigues(np.deg2rad(angle_deg) * np.eye(3)[axis])[0])
 
 
-def _main(mesh_file: str, picture_file: str) -> None:
-    """Renders a GLB file to an image file."""
+def _main(mesh_file: str, picture_file: str, map_from_world: str) -> None:
+    """Renders a GLB file to an image file; `map_from_world` is a (4, 4) matrix as JSON (`surface_picture`)."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # must be set before pyrender is imported
     import trimesh
 
-    picture = render_mesh(trimesh.load_scene(mesh_file).to_mesh())
+    mesh = trimesh.load_scene(mesh_file).to_mesh()
+    mesh.vertices = in_map_frame(mesh.vertices, np.array(json.loads(map_from_world)))
+    picture = render_mesh(mesh)
     cv2.imwrite(picture_file, np.ascontiguousarray(picture[..., ::-1]))
 
 

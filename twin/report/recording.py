@@ -24,7 +24,7 @@ from twin.report.verdict import badge, first_lines
 from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
-N_IMAGED, IMAGE_WIDTH_PX, MOSAIC_PX = 500, 320, 1600
+N_IMAGED, IMAGE_SIDE_PX, MOSAIC_PX = 500, 320, 1600
 
 #: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
@@ -148,6 +148,7 @@ def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
     if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
         return
     surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters.get("mosaic"))
+    surface = recording_surfaces.in_world(surface, run.keyframes.map_from_world)
     steps = list(snapshots(run))
     poses = run.trajectories["final"].world_from_camera[run.keyframes.frames]
     groups = np.split(poses, [last + 1 for last, _ in steps])[:-1]
@@ -183,7 +184,7 @@ def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: Fram
     images = [read_rgb(run.image_file(int(f), side)) for f in times.frames]
     exists = np.array([image is not None for image in images], dtype=bool)
     if exists.any():
-        data = [jpeg_bytes(image, IMAGE_WIDTH_PX) for image in images if image is not None]
+        data = [jpeg_bytes(image, IMAGE_SIDE_PX) for image in images if image is not None]
         columns = rr.EncodedImage.columns(blob=data, media_type=["image/jpeg"] * len(data))
         shown = FrameTimes(times.frames[exists], times.times_s[exists])
         recording.send_columns(f"world/rig/{side}", time_columns(shown), columns)
@@ -191,7 +192,7 @@ def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: Fram
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
     """Logs the two cameras in the axes of the left one; the calibration is scaled to the size of the logged images."""
-    scale = min(1.0, IMAGE_WIDTH_PX / rig.width_px)
+    scale = min(1.0, IMAGE_SIDE_PX / max(rig.width_px, rig.height_px))
     camera = rr.Pinhole(
         image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,
         resolution=[round(rig.width_px * scale), round(rig.height_px * scale)],
@@ -266,8 +267,8 @@ class LiveViewer:
         if frame.right is not None:
             self.path.append(pose[:3, 3].copy())
             self.recording.log("world/path/online", line(np.array(self.path), "online"))
-            self.recording.log("world/rig/left", jpeg(frame.left, IMAGE_WIDTH_PX))
-            self.recording.log("world/rig/right", jpeg(frame.right, IMAGE_WIDTH_PX))
+            self.recording.log("world/rig/left", jpeg(frame.left, IMAGE_SIDE_PX))
+            self.recording.log("world/rig/right", jpeg(frame.right, IMAGE_SIDE_PX))
 
 
 def colour(role: str) -> tuple[int, int, int]:

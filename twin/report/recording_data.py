@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from twin.core.records import Array
 from twin.report.run_folder import Run
 
-#: Number of snapshots of growing entities (paths, network, map), and largest number of samples of a time series.
+#: Largest number of snapshots of growing entities (paths, network, map), and of samples of a time series.
 N_SNAPSHOTS, N_SAMPLES = 24, 5000
 
 
@@ -34,7 +34,8 @@ def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
 def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
     """Returns the times and durations [ms] of all calls, by stage.
 
-    The stages are global alignment and those called once per frame or once per keyframe; long series are subsampled.
+    The stages are global alignment and, of the stages in `Keyframes.timing_ms`, those called once per frame or once per
+    keyframe; long series are subsampled.
     """
     path = run.trajectories.get("online")
     if path is None:

@@ -21,10 +21,10 @@ NOT_OBSERVED = np.iinfo(np.int64).max
 
 
 class Surface(NamedTuple):
-    """A coloured triangle mesh in the world.
+    """A coloured triangle mesh, in the axes of the map or of the world.
 
     Args:
-        points: (n, 3) vertices [m].
+        points: (n, 3) vertices [m]; not finite where the map has no height.
         normals: (n, 3) unit normals.
         colours: (n, 3) uint8 RGB.
         triangles: (m, 3) vertex numbers.
@@ -45,12 +45,26 @@ def floor_surface(raster: Raster) -> Surface:
 
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
-    """Returns the estimated map as a surface in the colours of the orthomosaic, or coloured by height without one."""
+    """Returns the estimated map as a surface in the colours of the orthomosaic.
+
+    Without an orthomosaic of the same area, it is coloured by height.
+    """
     if mosaic is not None and _covers_same_area(dem.grid, mosaic.grid):
         return _surface(dem, _colours_of_cells(mosaic, dem.grid))
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
     level = np.nan_to_num(255 * (dem.values - low) / max(high - low, 1e-6)).astype(np.uint8)
     return _surface(dem, cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[..., ::-1])
+
+
+def in_world(surface: Surface, map_from_world: Array) -> Surface:
+    """Returns a surface of the map frame in the axes of the world.
+
+    Args:
+        surface: the surface in the axes of the map.
+        map_from_world: (4, 4) pose of the world in the map frame (`ElevationMap.map_from_world`).
+    """
+    points = geometry.transform(geometry.inverse(map_from_world), surface.points)
+    return surface._replace(points=points, normals=surface.normals @ map_from_world[:3, :3])
 
 
 def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
@@ -97,6 +111,7 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
     Args:
         points: (n, 3) in the world [m].
         groups: poses world_from_camera (n_k, 4, 4) of the left camera in each group.
+        rig: calibration of the camera.
     """
     group = np.full(len(points), NOT_OBSERVED)
     remaining = np.flatnonzero(np.isfinite(points).all(axis=1))

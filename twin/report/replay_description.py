@@ -31,7 +31,11 @@ class RunDescription(NamedTuple):
 
 
 def describe_replay(
-    name: str, source: Mapping[str, Any], rig: StereoRig, settings: EstimatorSettings
+    name: str,
+    source: Mapping[str, Any],
+    rig: StereoRig,
+    settings: EstimatorSettings,
+    estimator: str | None = None,
 ) -> RunDescription:
     """Returns the description of a replayed run.
 
@@ -40,6 +44,7 @@ def describe_replay(
         source: texts and numbers that describe the data set, for the table `replay`.
         rig: rectified rig.
         settings: settings of the estimators.
+        estimator: name of the estimator of another package; None: those of `twin.estimate`.
     """
     tree = {
         "name": name,
@@ -54,7 +59,7 @@ def describe_replay(
             "focal_y_px": rig.fy_px,
             "principal_point_px": [rig.cx_px, rig.cy_px],
         },
-        "estimate": asdict(settings),
+        "estimate": asdict(settings) | ({} if estimator is None else {"plugin": estimator}),
     }
     return RunDescription(name, None, tomlkit.dumps(tree))
 

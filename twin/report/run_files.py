@@ -29,10 +29,11 @@ _INDEX = {
 
 
 def checked_metrics(metrics: Any) -> dict[str, Any]:
-    """Returns the contents of metrics.json, validated, with None for each missing number.
+    """Returns the contents of metrics.json, validated, with None for each missing number and [] for each missing list.
 
     Raises:
-        ValueError: a value does not have the type that `twin` writes; the message names its key.
+        ValueError: a value does not have the type that `twin` writes, or `name` or `status` is missing; the message
+            names the key.
     """
     template = empty_metrics()
     texts = dict.fromkeys(("name", "status"), "")
@@ -83,8 +84,8 @@ def conform(given: Any, template: Any, key: str = "", complete: bool = False) ->
             its type, `_OptionalText` for a string or None, None for a finite number or None, and NaN for a number, NaN
             or None.
         key: dotted key of the value, for the message.
-        complete: add the missing keys of tables, with None for numbers and optional strings, and [] for lists; another
-            missing string is an error.
+        complete: add the missing keys of tables, with None for numbers, Booleans and optional strings, and [] for
+            lists; another missing string is an error.
 
     Raises:
         ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.
@@ -115,7 +116,7 @@ def _item(given: Any, template: Any, key: str) -> Any:
 
 
 def _nothing(template: Any) -> Any:
-    """Returns the value for missing contents: None for a number or string, [] for a list; a table has one per key."""
+    """Returns the value for missing contents: [] for a list, a table of such values for a table, otherwise None."""
     if isinstance(template, dict):
         return {name: _nothing(value) for name, value in template.items() if name != _ANY}
     return [] if isinstance(template, list) else None

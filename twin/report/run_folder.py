@@ -44,7 +44,7 @@ class Network(NamedTuple):
     """The keyframe network.
 
     Args:
-        positions: (n, 3) positions of the nodes [m].
+        positions: (n, 3) positions of the nodes in the world [m].
         edges: (m, 2) indices into `positions` of the two nodes of each link.
     """
 
@@ -75,7 +75,7 @@ class Keyframes(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """Contents of a run folder. A missing file is represented by a missing key, an empty array or None."""
+    """Contents of a run folder. A missing file is represented by a missing key, an empty table or array, or None."""
 
     folder: Path
     scenario: dict[str, Any]
@@ -171,7 +171,7 @@ def _empty_network() -> Network:
 
 
 def _read_keyframes(file: Path) -> Keyframes:
-    """Reads keyframes/index.json; returns no keyframes if the file is missing."""
+    """Reads keyframes/index.json; if the file is missing, the arrays are empty."""
     index = _read_json(file, checked_index) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}

@@ -89,7 +89,7 @@ class SurveyRecord:
 
 
 class RunFolder:
-    """Folder of one run with its log (log.jsonl, one JSON object per line). Use as a context manager.
+    """Writer of a run folder and its log (log.jsonl, one JSON object per line). Use as a context manager.
 
     Args:
         folder: path of the run folder, which is created if it does not exist.
@@ -137,7 +137,8 @@ class RunFolder:
         The metrics are written first under a temporary name and renamed to metrics.json last, because a folder without
         metrics.json counts as unfinished. If another result cannot be written, e.g. because the disk is full, the
         status becomes "aborted". An interrupt while the maps, the report or the recording are written ends this stage
-        only: its files are deleted, and the status becomes "aborted" with a reason that names the stage.
+        only: its files are deleted, except a finished orthomosaic, and the status becomes "aborted" with a reason that
+        names the stage.
 
         Args:
             record: the results.
@@ -153,7 +154,8 @@ class RunFolder:
         try:
             if self._outputs is not None:
                 self._write_trajectories(record)
-                self._attempt(guard, "maps", lambda: self._write_maps(record))
+                kept = ("mosaic.tif",) if record.has_orthomosaic else ()
+                self._attempt(guard, "maps", lambda: self._write_maps(record), kept)
                 for name in OPTIONAL_OUTPUTS:
                     if name in self._outputs:
                         self._attempt(guard, name, lambda name=name: self._write_optional_output(name, metrics))
@@ -184,13 +186,21 @@ class RunFolder:
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
 
-    def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None]) -> None:
-        """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete."""
+    def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None], kept: Collection[str] = ()) -> None:
+        """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete.
+
+        Args:
+            guard: records the interrupt.
+            stage: name of the stage, a key of `_FILES`.
+            write: writes the files.
+            kept: names of files that match the patterns of the stage, but were complete before it.
+        """
         n_skipped = len(guard.skipped)
         guard.attempt(stage, write)
         if len(guard.skipped) > n_skipped:
             for file in (file for pattern in _FILES[stage] for file in self.path.glob(pattern)):
-                file.unlink()
+                if file.name not in kept:
+                    file.unlink()
 
     def _write(self, name: str, text: str) -> None:
         """Writes a text file of this folder."""
@@ -220,7 +230,7 @@ class RunFolder:
         self._write("keyframes/index.json", json.dumps(index))
 
     def _write_maps(self, record: SurveyRecord) -> None:
-        """Writes the true, estimated and error rasters, the orthomosaic and the mesh."""
+        """Writes the rasters of the truth, the map and its error, the mesh, and mosaic.tif if it does not exist yet."""
         from twin.exchange import geotiff, mesh
 
         elevation, origin = record.elevation, record.georeference

@@ -74,7 +74,7 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def _closed_form_comparison(metrics: Mapping[str, Any]) -> str:
-    """Returns the comparison of the links with the closed form; "" for a replay, which has no link errors."""
+    """Returns the comparison of the links with the closed form; "" without metrics or for a replay (no link errors)."""
     return "" if "links" not in metrics or metrics.get("replay") else wording.closed_form_comparison(metrics["links"])
 
 
@@ -88,7 +88,7 @@ def mosaic_image(run: Run) -> str | None:
 
 def surface_image(run: Run) -> str | None:
     """Returns an oblique view of the mesh as a JPEG data URI; None if there is no mesh or rendering fails."""
-    picture = surface_picture(run.folder / "mesh.glb")
+    picture = surface_picture(run.folder / "mesh.glb", run.keyframes.map_from_world)
     return None if picture is None else jpeg_uri(picture)
 
 

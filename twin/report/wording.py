@@ -106,7 +106,7 @@ def angle(value_deg: float | None) -> str:
 
 
 def milliradians(value_deg: float | None) -> str:
-    """Returns an angle [deg] as text in milliradians; 1 mrad subtends 1 mm at a distance of 1 m."""
+    """Returns an angle [deg] as text in milliradians; a dash for None. 1 mrad subtends 1 mm at a distance of 1 m."""
     return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
 
 
@@ -154,7 +154,7 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
 
 
 def replay_summary(metrics: Mapping[str, Any]) -> str:
-    """Returns a summary of a replay as text: frames, errors against a recorded truth, consistency of the network."""
+    """Returns a summary of a replay as text: frames, position error, consistency of the network, skipped inputs."""
     replay, timing = metrics["replay"], metrics["timing"]
     network, final = replay.get("network") or {}, metrics["trajectory"]["final"]
     sentences = [
@@ -320,5 +320,5 @@ def _survey_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
 
 
 def _drift(path: Mapping[str, Any]) -> str:
-    """Returns the end error of a trajectory in percent of the path length."""
+    """Returns the end error of a trajectory in percent of the path length as text; a dash if it is unknown."""
     return DASH if path["drift_percent"] is None else f"{path['drift_percent']:.2f} % of the path length"

@@ -97,7 +97,10 @@ def _text(flown: Flown) -> str:
 
 
 def per_unit_ms(stages: Mapping[str, Any], stage: str, count: int) -> float | None:
-    """Returns the total time of a stage divided by `count` frames or keyframes [ms]; None if the stage never ran."""
+    """Returns the total time of a stage divided by `count` frames or keyframes [ms].
+
+    None if the stage never ran or `count` is 0.
+    """
     row = stages.get(stage) or {}
     return 1e3 * row["total_s"] / count if row.get("count") and count else None
 
@@ -110,7 +113,7 @@ def keyframe_load_ms(stages: Mapping[str, Any], n_frames: int, n_keyframes: int)
 
 
 def budget_table(stages: Mapping[str, Any], n_frames: int, n_keyframes: int) -> Table:
-    """Returns a table with the time of each module, the paper's figures and the budget at 30 Hz.
+    """Returns a table with the time of each module and of all together, the paper's figures and the budget at 30 Hz.
 
     Args:
         stages: durations of the stages, as `Stopwatch.summary` returns them.

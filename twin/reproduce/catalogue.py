@@ -89,7 +89,7 @@ def run_all(
         folder: folder to write, created if missing.
         quick: whether to run smaller, quick versions of the experiments.
         names: the experiments to run.
-        report: called with a sentence after each experiment.
+        report: called after each experiment with a line of text: its name and computing time.
 
     Raises:
         TwinError: a name is not that of an experiment.

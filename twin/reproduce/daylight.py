@@ -44,9 +44,9 @@ LIFT_M = 1e-3  # height of the slopes above the floor
 SLOPE_DEG = 45.0  # angle of the slopes that face the sun and face away from it
 SUN_RADIUS_RAD = 0.0047 / SEA_WATER_INDEX  # angular radius of the sun's disc, under water
 SKY_STEPS = 4000  # number of steps of the table of the sky's radiance
-ROUND, MOST_WALKS = 8_000, 400_000  # walks (pairs of walks for a pixel) of a round, and the most of each value
-LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # relative standard errors at which upwelling light and illuminance are accurate
-RIG = StereoRig(64, 48, 100.0, 0.1)  # the pixel next to its principal point is compared
+ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (pairs of walks for a pixel) of a round, and the most of each value
+LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # largest relative standard errors accepted: upwelling light, illuminance
+RIG = StereoRig(64, 48, 100.0, 0.1)  # the model's pixel next to the principal point is compared with the ray through it
 
 
 class DaylightSelection(NamedTuple):
@@ -166,7 +166,7 @@ def _normals() -> tuple[Array, Array, Array]:
 
 
 def plane_lx(daylight: Daylight, normal: Array, depth_m: float) -> float:
-    """Returns the green illuminance [lx] of a floor at a depth with a unit normal, by the model."""
+    """Returns the green illuminance [lx] of a floor at a depth with a unit normal (3,), by the model."""
     floor = floor_daylight(daylight._replace(reference_depth_m=depth_m))
     four = np.append(normal, 1.0)
     beam = floor.beam_lx[GREEN] * np.exp(-floor.beam_per_m[GREEN] * depth_m)
@@ -174,7 +174,13 @@ def plane_lx(daylight: Daylight, normal: Array, depth_m: float) -> float:
 
 
 def reference_scene(daylight: Daylight, water: Medium, surface_m: float) -> ReferenceScene:
-    """Returns the scene of the reference: daylight of 1 lx in green, over a black level floor at z = 0."""
+    """Returns the scene of the reference: daylight of 1 lx in green, over a black level floor at z = 0.
+
+    Args:
+        daylight: direction and shares of sun and sky.
+        water: optical properties of the water.
+        surface_m: height of the water surface above the floor.
+    """
     source = daylight.source
     sky = source.sky_share * sky_radiance(np.linspace(0.0, 1.0, SKY_STEPS + 1))
     sun = Sunlight(source.to_sun, source.beam_lx, surface_m, SUN_RADIUS_RAD, sky)

@@ -1,4 +1,4 @@
-"""Results of one experiment as tables and figures, which the index page and the README chapter are made from."""
+"""Results of one experiment as tables and figures, the contents of the index page and of the README chapter."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Exhibit(NamedTuple):
     figures: tuple[Figure, ...] = ()
 
     def table(self, key: str) -> Table:
-        """Returns the table with a key."""
+        """Returns the table with a given key, which must exist."""
         return next(table for table in self.tables if table.key == key)
 
     def as_dict(self) -> dict[str, Any]:
@@ -94,7 +94,7 @@ def exhibit_of(contents: Any, file: Path) -> Exhibit:
 
 
 def millimetres(value_m: float | None) -> str:
-    """Returns a length as text in millimetres with about two significant digits; "-" if it is unknown."""
+    """Returns a length as text in millimetres, with two decimals below 10 mm, one below 100 mm; "-" if unknown."""
     if value_m is None or value_m != value_m:
         return DASH
     value = 1e3 * value_m

@@ -53,7 +53,7 @@ LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {
     ),
 }
 NEAR_PX, FAR_PX = 2.0, 40.0
-ROUND, MOST_WALKS = 8_000, 400_000  # pairs of walks of a round, and the most of a cell
+ROUND, MOST_WALKS = 8_000, 1_500_000  # pairs of walks of a round, and the most of a cell
 #: Standard errors at which the reference of a cell is accurate enough: of all light and of the veil (relative), of the
 #: sharp share (absolute), of the blur shares (relative).
 LIGHT_ERROR, SHARP_ERROR, BLUR_ERROR = 0.019, 0.01, 0.1
@@ -106,7 +106,7 @@ def _cell(scenario: Scenario, key: tuple[str, str, float, tuple[float, float]], 
 
 
 def _is_accurate(light: PixelLight) -> bool:
-    """Returns whether the standard errors are at most `LIGHT_ERROR`, `SHARP_ERROR` and `BLUR_ERROR`."""
+    """Returns whether the standard errors are within `LIGHT_ERROR`, `SHARP_ERROR` and `BLUR_ERROR`."""
     means = [(light.total, LIGHT_ERROR), (light.veil, LIGHT_ERROR), *((s, BLUR_ERROR) for s in _blur_shares(light))]
     within = all(mean.standard_error <= limit * mean.value for mean, limit in means)
     return within and light.sharp_share.standard_error <= SHARP_ERROR
@@ -158,7 +158,7 @@ def model_light(scenario: Scenario, height_m: float, pixel: tuple[int, int]) -> 
     return ModelLight(float(direct[at]), float(forward[at]), float(veil[at]), near, 1 - within)
 
 
-#: Columns of the table and of light.csv.
+#: Columns of light.csv, which are also the keys of each cell in light.json.
 COLUMNS: tuple[tuple[str, Callable[[LightCell], Any]], ...] = (
     ("water", lambda cell: cell.water),
     ("height_m", lambda cell: cell.height_m),
@@ -187,7 +187,7 @@ COLUMNS: tuple[tuple[str, Callable[[LightCell], Any]], ...] = (
 
 
 def table(found: Sequence[LightCell]) -> list[tuple[str, ...]]:
-    """Returns the comparison as table rows, a header and one row per `LightCell`; standard errors follow +-."""
+    """Returns the comparison as table rows, a header and one row per `LightCell`; standard errors follow "+-"."""
     header = (
         "water, height", "lamps, pixel", "total, model / truth", "sharp, truth", "model", "veil, truth / model",
         f"blur < {NEAR_PX:g} px, truth", "model", f"> {FAR_PX:g} px, truth", "model",

@@ -22,7 +22,7 @@ class ModelLight(NamedTuple):
         blurred: forward-scattered light of the floor [cd/m2]; 0 if the scenario disables it.
         veil: backscatter [cd/m2].
         blur_near, blur_far: shares of the forward-scattered light that come from points of the floor within 2 px of the
-            pixel and beyond 40 px.
+            pixel and beyond 40 px; NaN without forward scatter.
     """
 
     direct: float
@@ -47,7 +47,7 @@ class LightCell(NamedTuple):
 
     Args:
         water: Jerlov type.
-        height_m: height of the camera above the floor.
+        height_m: height of the camera above the floor [m].
         lamps: name of the lamp arrangement.
         pixel: (column, row) [px].
         model: light by the model.

@@ -141,8 +141,8 @@ CLAIMS = (
 def claims_table(flights: Flights, quick: bool) -> Table:
     """Returns a table of the paper's results and of those of the flights over both textures.
 
-    Its last column states whether the results are better than the paper's. A quick plan has no such column: its legs
-    are sixty times shorter than the paper's, so that its errors are not comparable.
+    Its last column states whether the results are better than the paper's. It has no such column for a quick plan,
+    whose legs are sixty times shorter than the paper's, so that its errors are not comparable.
     """
     rows: list[Row] = [("", "paper", "coarse texture", "full resolution", "better than the paper")]
     for claim in CLAIMS:
@@ -217,7 +217,7 @@ def holes(flown: Flown) -> float:
 
 
 def _off_course_m(flown: Flown) -> float:
-    """Returns the largest distance of the true path from the planned one [m]."""
+    """Returns the largest distance between the true and the planned position of a frame [m]."""
     truth = flown.truth
     return _largest(np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1))
 

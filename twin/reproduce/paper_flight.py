@@ -54,7 +54,11 @@ class F2fNavigator(Navigator):
 
 
 def fly_aligned(scenario: Scenario) -> Flown:
-    """Flies a mission with all corrections; after each track, the window of tracks is aligned globally."""
+    """Flies a mission with all corrections; after each track, the window of tracks is aligned globally.
+
+    Raises:
+        TwinError: the mission cannot be prepared, or no stereo pair became a keyframe.
+    """
     return _fly(prepare(scenario), make_navigator)
 
 
@@ -63,6 +67,9 @@ def fly_without_alignment(scenario: Scenario) -> Flown:
 
     This is the case of Negahdaripour & Madjidi (2003, Fig. 7c): the vehicle follows a path with drift, so its images
     do not cover the whole area, and the map has holes.
+
+    Raises:
+        TwinError: the mission cannot be prepared, or no stereo pair became a keyframe.
     """
     estimate = scenario.estimate.model_copy(update={"use_f2m": False, "use_ga": False, "max_links": 1})
     return _fly(prepare(scenario.model_copy(update={"estimate": estimate})), _f2f_navigator)

@@ -19,7 +19,7 @@ SHOWN = (
 
 
 def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
-    """Returns the chapter as Markdown, between its markers."""
+    """Returns the chapter as Markdown, including its markers."""
     by_name = {exhibit.name: exhibit for exhibit in exhibits}
     plans = " (quick plans: `--quick`)" if quick else ""
     lines = [
@@ -51,7 +51,12 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def with_chapter(readme: str, text: str, name: str = "README") -> str:
-    """Returns a README in which the text between the markers is replaced by the chapter.
+    """Returns a README in which the markers and the text between them are replaced by the chapter.
+
+    Args:
+        readme: contents of the README.
+        text: the chapter, including its markers.
+        name: name of the README in the error.
 
     Raises:
         TwinError: the README does not contain each marker exactly once, the begin marker first.
@@ -66,7 +71,8 @@ def update(readme: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
     """Replaces the chapter in a README file.
 
     Raises:
-        TwinError: the file cannot be read or lacks the markers.
+        TwinError: the file cannot be read, or does not contain each marker exactly once.
+        OSError: the file cannot be written.
     """
     try:
         text = readme.read_text(encoding="utf-8")

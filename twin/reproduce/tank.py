@@ -19,14 +19,21 @@ from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_error
 
 Array = NDArray[np.floating]
 
-BAD_M, WORST_SHARE = 0.02, 0.2  # a bad cell is off by more; predicted if among this share with the largest sigma
-TITLES = {"tank1": "Tank test 1: 130 pairs on parallel legs", "tank2": "Tank test 2: two loops that cross at the start"}
+BAD_M = 0.02  # a cell is bad if its height error is larger
+WORST_SHARE = 0.2  # a bad cell is predicted if it is among this share of the cells, those with the largest sigma
+TITLES = {"tank1": "Tank test 1: 130 pairs on parallel legs", "tank2": "Tank test 2: two loops that touch at the start"}
 #: Keys of the tables of each experiment.
 TABLES = {"tank1": ("rows", "sizes", "map"), "tank2": ("rows", "closure", "sizes", "map")}
 
 
 def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
-    """Returns the results of "tank1" or "tank2"; writes NAME.json and NAME.png to a folder, created if missing."""
+    """Surveys the tank and returns the results; writes NAME.json and NAME.png to a folder, created if missing.
+
+    Args:
+        name: "tank1" or "tank2".
+        folder: folder to write.
+        quick: whether to take smaller images, of 320 x 240 pixels.
+    """
     with tempfile.TemporaryDirectory(prefix="twin-") as images:
         survey = survey_tank(name, Path(images), QUICK if quick else ())
     sizes = [measure(item, survey.elevation.height_m, survey.mission.grid) for item in OBJECTS]
@@ -99,7 +106,7 @@ def _closure_table(survey: TankSurvey) -> Table:
 
 
 def sizes_table(sizes: Sequence[SizeRow]) -> Table:
-    """Returns the table of the sizes of the objects: true, measured and error [mm]."""
+    """Returns the table of the sizes of the objects: true and measured sizes, largest absolute error [mm]."""
     rows: list[Row] = [
         ("object", "along x, true / measured", "along y, true / measured", "height, true / measured", "largest error")
     ]
@@ -134,11 +141,11 @@ def _map_table(survey: TankSurvey) -> Table:
 
 
 def flagged_share(error_m: Array, sigma_m: Array) -> float | None:
-    """Returns the share of the bad cells that are among the 20 % of cells with the largest sigma; None without any.
+    """Returns the share of the bad cells that are among the 20 % of cells with the largest sigma; None if none is bad.
 
     Args:
-        error_m: (rows, cols) height error; NaN where unknown. A cell is bad if its error exceeds `BAD_M`.
-        sigma_m: (rows, cols) predicted standard deviation.
+        error_m: (rows, cols) height error [m]; NaN where unknown. A cell is bad if its absolute error exceeds `BAD_M`.
+        sigma_m: (rows, cols) predicted standard deviation [m].
     """
     known = np.isfinite(error_m) & np.isfinite(sigma_m)
     bad = np.abs(error_m[known]) > BAD_M

@@ -39,7 +39,12 @@ class RigPath(NamedTuple):
 
 
 def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
-    """Returns the path of the first test: parallel legs along x joined by half circles, 5 cm between pairs."""
+    """Returns the path of the first test: parallel legs along x joined by half circles, 5 cm between pairs.
+
+    Args:
+        n_pairs: number of stereo pairs; the path is long enough for 137.
+        seed: seed of the jitter.
+    """
     turn_m = LEG_SPACING_M / 2
     angle = np.linspace(0, np.pi, 181)[:-1]
     turn = turn_m * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
@@ -56,7 +61,7 @@ def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
 
 
 def two_loops_path(seed: int) -> RigPath:
-    """Returns the path of the second test: two loops that cross at the start; frames 30 and 60 repeat frame 0."""
+    """Returns the path of the second test: two circles that touch at the start; frames 30 and 60 repeat frame 0."""
     radius_m = N_LOOP * STEP_M / (2 * np.pi)
     angle = 2 * np.pi * np.arange(N_LOOP + 1) / N_LOOP
     loop = radius_m * np.column_stack([1 - np.cos(angle), np.sin(angle)])

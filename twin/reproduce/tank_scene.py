@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 SIZE_M, SPACING_M, TEXEL_M = (2.7, 2.7), 0.003, 0.002
 FLOOR, GRAIN, SHADE = 0.36, 0.28, 0.45  # albedo, its relative standard deviation, illuminance in the shade
 SPOT_M, SPOT_RADIUS_M = (0.28, 0.12), 0.55  # centre and radius (1/e) of the brightest light
-SHADE_EDGE_M, SHADE_WIDTH_M = -0.33, 0.06  # x of the edge of the shade, and half its width
+SHADE_EDGE_M, SHADE_WIDTH_M = -0.33, 0.06  # x of the soft edge of the shade, and half the width of this edge
 
 
 class TankObject(NamedTuple):
@@ -32,7 +32,7 @@ class TankObject(NamedTuple):
         shape: "box", "disc" (an upright cylinder), "dome" (half an ellipsoid) or "pipe" (a lying cylinder).
         centre_m: (x, y) of the centre, in the middle between nodes of the height grid.
         size_m: extent along x and y, and height; the extents are even multiples of `SPACING_M`, so that the sides lie
-            in the middle between nodes, where the surface between them has half of the height.
+            in the middle between nodes, where the interpolated surface has half of the height.
         albedo: mean albedo of its surface.
         grain: relative standard deviation of the albedo.
     """
@@ -96,7 +96,7 @@ def illuminance_at(x: Array, y: Array) -> Array:
 
 
 def _grid(step_m: float, edges: bool) -> tuple[Array, Array]:
-    """Returns x and y (rows, cols) of the nodes of a grid, or of the centres of its cells, from south to north."""
+    """Returns x and y (rows, cols) [m] of the nodes (`edges`) or of the cell centres of a grid, from south to north."""
     axes = [np.arange(round(size / step_m) + edges) * step_m - size / 2 for size in SIZE_M]
     east, north = (axis if edges else axis + step_m / 2 for axis in axes)
     x, y = np.meshgrid(east, north)

@@ -68,7 +68,7 @@ def measure(item: TankObject, height_m: Array, grid: MapGrid) -> SizeRow:
 
 def true_size(item: TankObject) -> Size:
     """Returns the true extents of an object at half of its height, and its height."""
-    share = np.sqrt(3) / 2 if item.shape == "dome" else 1.0  # ellipsoid: at z = c / 2 its axes are sqrt(1 - 1/4) long
+    share = np.sqrt(3) / 2 if item.shape == "dome" else 1.0  # an ellipsoid of height c is sqrt(1 - 1/4) wide at c / 2
     return Size(share * item.size_m[0], share * item.size_m[1], item.size_m[2])
 
 
@@ -118,9 +118,10 @@ _TOPS: dict[str, Callable[[Window], float]] = {"box": _plateau, "disc": _plateau
 
 
 def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
-    """Returns the length of the part of a profile around the place 0 that lies above a level [m]; NaN if there is none.
+    """Returns the length of the part of a profile around the place 0 that lies above a level [m].
 
-    The ends are interpolated linearly between the last point above the level and the first one below it.
+    The ends are interpolated linearly between the last point above the level and the first one at or below it. NaN if
+    the profile is not above the level near 0, or does not fall to it on both sides.
 
     Args:
         at_m: (n,) places along the profile, relative to the centre of the object, in ascending or descending order.

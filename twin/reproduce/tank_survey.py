@@ -77,7 +77,7 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
     The estimators start at the planned pose of the first frame; the rig is off it by the bend and jitter of the track.
 
     Args:
-        name: "tank1", parallel legs, or "tank2", two loops that cross at the start.
+        name: "tank1", parallel legs, or "tank2", two loops that touch at the start.
         folder: folder for the keyframe images.
         settings: overrides of the scenario `tank`, each "key=value".
         n_pairs: number of stereo pairs of tank1.
@@ -112,7 +112,8 @@ def height_errors(survey: TankSurvey) -> Array:
     """Returns estimated minus true height (rows, cols) [m], anchored at the first true pose as the trajectories are.
 
     The motion that maps the first estimated pose to the first true one is applied to the map before the comparison:
-    the estimators do not know where on the bent track the rig starts. NaN where a cell was not observed or estimated.
+    the estimators do not know the bend and jitter of the track at its start. NaN where a cell was not observed or
+    estimated.
     """
     true_from_map = anchor(survey.result.final.world_from_camera[0], survey.truth.trajectory.world_from_camera[0])
     x, y = np.meshgrid(*survey.mission.grid.centres())

@@ -68,7 +68,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     Args:
         scenario: settings of the lamps and the camera.
         illumination: water and daylight.
-        ranges_m: (n,) ranges at which the contrast is computed.
+        ranges_m: (n,) ranges at which the contrast is computed [m].
 
     Returns:
         (n, 3) relative contrast for R, G, B.

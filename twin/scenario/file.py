@@ -23,8 +23,8 @@ from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVE
 
 Model = TypeVar("Model", bound=BaseModel)
 _PATH_KEYS = (
-    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.orthophoto_file", "terrain.texture_file",
-    "water.spectrum_file",
+    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.mesh_file", "terrain.orthophoto_file",
+    "terrain.texture_file", "water.spectrum_file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {
@@ -32,11 +32,10 @@ _RENAMED_KEYS = {
     "imaging.calibration": "imaging.error_model",
     "imaging.forward_scatter": "imaging.scattering",
 }
-#: An item of `[[objects]]`, and its key `mesh_file`.
-_OBJECT = re.compile(r"objects\.\d+")
+#: Key `mesh_file` of an item of `[[objects]]`.
 _OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 _ABSENT = object()
-#: Largest number of validation errors that are listed.
+#: Largest number of errors that are listed.
 _MAX_ERRORS = 20
 
 
@@ -48,8 +47,8 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
         overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is a string.
 
     Raises:
-        ScenarioError: lists the errors, each as `FILE:LINE: key: problem (allowed: ...)`, or as `--set: ...` for an
-            override.
+        ScenarioError: there is no such scenario, or a file or an override is invalid; lists the errors of files as
+            `FILE:LINE: key: problem (allowed: ...)`, and those of overrides in lines that begin with `--set`.
     """
     tree, source, errors = _read_with_base(find_scene(path), including_files=())
     source = source.model_copy(update={"overrides": tuple(overrides)})
@@ -75,8 +74,8 @@ def read_tree(path: str | Path) -> dict[str, Any]:
         path: path of a scenario file, or name of a scenario in scenes/.
 
     Raises:
-        ScenarioError: there is no such scenario, or a file cannot be read, is not TOML, extends itself or contains the
-            old name of a renamed key.
+        ScenarioError: there is no such scenario, or a file cannot be read, is not TOML, exceeds the limits of
+            `toml_text`, extends itself or an unknown file, or contains the old name of a renamed key.
     """
     tree, _, errors = _read_with_base(find_scene(path), including_files=())
     if errors:
@@ -94,7 +93,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
         source: file that the new values come from, for error messages.
 
     Raises:
-        ScenarioError: lists the errors.
+        ScenarioError: a key is renamed or cannot be set, or the scenario is invalid; lists the errors.
     """
     changed = copy.deepcopy(dict(tree))
     for key, value in values.items():
@@ -114,7 +113,12 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 
 
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
-    """Validates a tree of keys and values and returns the model.
+    """Returns the model of a tree of keys and values.
+
+    Args:
+        tree: keys and values.
+        model: class of the model.
+        source: origin of the keys, for error messages.
 
     Raises:
         ScenarioError: lists up to `_MAX_ERRORS` errors and the number of the others.
@@ -167,7 +171,7 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     """Reads one TOML file; a file that it extends is not read.
 
     Returns:
-        Keys and values, and the line number of each dotted key.
+        Keys and values, and the line number of each dotted key, see `toml_lines.key_lines`.
 
     Raises:
         ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
@@ -184,7 +188,7 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         number = line[1] if line else min(len(text.splitlines()), text.count("\n") + 1)
         raise ScenarioError([f"{file}:{number}: not TOML: {error}"]) from None
     lines = key_lines(text)
-    if errors := [Source(path=file, lines=lines).describe(error) for error in islice(value_errors(tree), 20)]:
+    if errors := [Source(path=file, lines=lines).describe(error) for error in islice(value_errors(tree), _MAX_ERRORS)]:
         raise ScenarioError(errors)
     return tree, lines
 
@@ -201,14 +205,13 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
         numbers that they come from; and one error for each old name.
 
     Raises:
-        ScenarioError: the file extends itself, its base file does not exist, or a file cannot be read or is not TOML.
+        ScenarioError: the file extends itself, its base file does not exist, or a file is invalid, see `read_toml`.
     """
     if resolved(file) in including_files:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
     tree, lines = read_toml(file)
-    errors = [
-        f"{file}:{lines[old]}: {old}: renamed to {new}" for old, new in _RENAMED_KEYS.items() if _remove(tree, old)
-    ]
+    renamed = [TwinError(old, f"renamed to {new}") for old, new in _RENAMED_KEYS.items() if _remove(tree, old)]
+    errors = [Source(path=file, lines=lines).describe(error) for error in renamed]
     _resolve_paths(tree, file.parent)
     base = tree.pop("extends", None)
     if base is None:
@@ -255,7 +258,7 @@ def _is_path_key(key: str) -> bool:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """Returns the absolute path; ${TWIN_DATA} is expanded, and a path without it is relative to `folder`."""
+    """Returns the absolute path; ${TWIN_DATA} is expanded, and a relative path without it refers to `folder`."""
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
         return resolved(Path(value.replace("${TWIN_DATA}", data)))
@@ -272,20 +275,24 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    """Sets a key of the tree to a value, both given as `key=value`; raises ScenarioError if one is not valid."""
+    """Sets a key of the tree to the value of an override `key=value`; relative file paths refer to the current folder.
+
+    Raises:
+        ScenarioError: the override is not of this form, or its key is too long, renamed or cannot be set, or its value
+            exceeds the limits of `toml_text`.
+    """
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
         raise ScenarioError([f"--set {shown(override)}: not of the form key=value (for instance plan.tracks=2)"])
     if len(key) > MAX_KEY_CHARACTERS or key.count(".") >= MAX_LEVELS:
-        raise ScenarioError([f"--set {shown(override)}: not a key (allowed: up to {MAX_KEY_CHARACTERS} characters)"])
+        allowed = f"up to {MAX_KEY_CHARACTERS} characters and {MAX_LEVELS} levels"
+        raise ScenarioError([f"--set {shown(override)}: not a key (allowed: {allowed})"])
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     value = _override_value(key, text)
     if "." not in key:
         _resolve_paths({key: value}, Path.cwd())
-    elif _OBJECT.fullmatch(key):
-        _resolve_paths({"objects": [value]}, Path.cwd())
     is_path = _is_path_key(key) and not isinstance(value, list)
     _assign(tree, key, str(_expand(str(value), Path.cwd())) if is_path else value, f"--set {shown(override)}")
 
@@ -319,7 +326,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
         origin: text that names the source of the value, at the beginning of error messages.
 
     Raises:
-        ScenarioError: the key leads into a value that is not a section, or to no item of a list.
+        ScenarioError: the key leads into a value that is not a section, to no item of a list, or to a whole item.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -330,7 +337,10 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
         if not isinstance(node, dict | list):
             raise ScenarioError([f"{origin}: {part} is a value, not a section"])
     if isinstance(node, list):
-        raise ScenarioError([f"{origin}: an item of the list must be named, as in {'.'.join(parents)}.0.{leaf}=..."])
+        name, whole = ".".join(parents), leaf.isdecimal()
+        problem = "an item cannot be replaced" if whole else "an item of the list must be named"
+        allowed = f" (allowed: a key of an item, or {name}=[...])" if whole else f", as in {name}.0.{leaf}=..."
+        raise ScenarioError([f"{origin}: {problem}{allowed}"])
     node[leaf] = value
 
 
@@ -342,8 +352,9 @@ def _child(node: Any, part: str, origin: str) -> Any:
     """
     if not isinstance(node, list):
         return node.setdefault(part, {})
-    if not part.isdigit() or int(part) >= len(node):
-        raise ScenarioError([f"{origin}: no item {part} (allowed: 0 to {len(node) - 1})"])
+    if not part.isdecimal() or int(part) >= len(node):
+        allowed = f"0 to {len(node) - 1}" if node else "none, as the list is empty"
+        raise ScenarioError([f"{origin}: no item {part} (allowed: {allowed})"])
     return node[int(part)]
 
 
@@ -393,7 +404,7 @@ def shown(text: str, longest: int = 200) -> str:
 
 
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
-    """Returns the keys allowed in a section of the model, given the path to the section."""
+    """Returns the keys allowed in a section of the model, given the location of the section as a sequence of keys."""
     for part in location:
         if part not in model.model_fields:  # an item of a list, a key of a table
             continue

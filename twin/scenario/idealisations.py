@@ -35,9 +35,10 @@ def _water(scenario: Scenario) -> list[str]:
     """Returns the names of the effects of real water that the scenario leaves out."""
     water = scenario.water
     clear = water.jerlov == "clear" and water.absorption_per_m is None and water.spectrum_file is None
+    given_zero = [value is not None and not any(value) for value in (water.absorption_per_m, water.scattering_per_m)]
     absent = {
-        "no absorption": clear,
-        "no scattering": clear or water.turbidity == 0 or scenario.imaging.scattering == "none",
+        "no absorption": clear or given_zero[0],
+        "no scattering": clear or given_zero[1] or water.turbidity == 0 or scenario.imaging.scattering == "none",
         "no multiple scattering": not clear and scenario.imaging.scattering == "single",
         "no marine snow": scenario.snow.density_per_m3 == 0,
         "no current": not any(scenario.current.velocity_mps),

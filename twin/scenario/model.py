@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from twin.core import geometry
@@ -23,18 +32,28 @@ SEA_WATER_INDEX = 1.339  #: refractive index of sea water in visible light
 PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
-Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
+
+
+def _number(value: Any) -> Any:
+    """Returns the value unchanged. Raises PydanticCustomError for text and booleans, which pydantic would convert."""
+    if isinstance(value, str | bool):
+        raise PydanticCustomError("float_type", "a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_number)]
+Coordinate = Annotated[Number, Field(ge=-1e5, le=1e5)]
 Vector2 = tuple[Coordinate, Coordinate]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
-Metres = Annotated[float, Field(gt=0, le=1e5)]
-Efficiency = Annotated[float, Field(gt=0, le=1)]
-PerMetre = Annotated[float, Field(ge=0, le=100)]
-OffAxisDeg = Annotated[float, Field(ge=0, le=90)]
-WhiteGain = Annotated[float, Field(ge=1, le=16)]
-BlurPx = Annotated[float, Field(ge=0, le=2)]
-LateralColour = Annotated[float, Field(ge=-0.02, le=0.02)]
-Albedo = Annotated[float, Field(ge=0, le=1)]
-RelativeIntensity = Annotated[float, Field(ge=0, le=100)]
+Metres = Annotated[Number, Field(gt=0, le=1e5)]
+Efficiency = Annotated[Number, Field(gt=0, le=1)]
+PerMetre = Annotated[Number, Field(ge=0, le=100)]
+OffAxisDeg = Annotated[Number, Field(ge=0, le=90)]
+WhiteGain = Annotated[Number, Field(ge=1, le=16)]
+BlurPx = Annotated[Number, Field(ge=0, le=2)]
+LateralColour = Annotated[Number, Field(ge=-0.02, le=0.02)]
+Albedo = Annotated[Number, Field(ge=0, le=1)]
+RelativeIntensity = Annotated[Number, Field(ge=0, le=100)]
 
 
 def _path(text: str) -> str:
@@ -55,18 +74,20 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Rejects strings and booleans where a number is required; pydantic alone would convert them to numbers."""
+        """Rejects strings and booleans where a number is required; items of a list are checked by `Number`."""
         kind = cls.model_fields[info.field_name or ""].annotation
-        if kind in (float, int) and isinstance(value, str | bool):
-            raise PydanticCustomError("float_type" if kind is float else "int_type", "a number")
-        return value
+        if kind is int and isinstance(value, str | bool):
+            raise PydanticCustomError("int_type", "an integer")
+        return _number(value) if kind in (float, float | None) else value
 
 
 class TerrainConfig(Section):
     """Sea floor."""
 
-    kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file"] = Field(
-        default="reef", description="generator of the heights, or file for a measured DEM"
+    kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file", "mesh"] = Field(
+        default="reef",
+        description="generator of the heights, file for a measured DEM, or mesh for the triangles of mesh_file, which "
+        "may overhang",
     )
     plugin: str | None = Field(
         default=None, max_length=200, pattern=PLUGIN_NAME,
@@ -82,7 +103,20 @@ class TerrainConfig(Section):
     base_m: float = Field(
         default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane z = 0 [m]"
     )
-    grid_m: float = Field(default=0.05, gt=0.001, le=1, description="spacing of a generated height grid [m]")
+    grid_m: float = Field(
+        default=0.05, gt=0.001, le=1,
+        description="spacing of a generated height grid; of the height grid on which the survey of a mesh is planned, "
+        "the largest spacing: with shorter edges of the mesh it is finer, with more than 2 million nodes coarser [m]",
+    )  # fmt: skip
+    mesh_file: FilePath | None = Field(
+        default=None,
+        description="PLY, OBJ or GLB file with a texture or vertex colours that is the whole sea floor, centred at the "
+        "origin, its lowest point at z = 0; needs kind = mesh; ${TWIN_DATA} is expanded",
+    )
+    mesh_up: Literal["z", "y"] | None = Field(
+        default=None, description="axis of mesh_file that points up; default: y for GLB, z for other files"
+    )
+    mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4, description="metres per unit of mesh_file")
     height_file: FilePath | None = Field(
         default=None,
         description="DEM: GeoTIFF, 16-bit PNG or .npy; heights are in metres unless a GeoTIFF names another unit; "
@@ -122,7 +156,8 @@ class TerrainConfig(Section):
         gt=0.0005,
         le=1,
         description="size of a texture pixel, and of a pixel of the photo, on the sea floor [m]; default: 0.005, or "
-        "the ground sample distance of the images at plan.altitude_m if that is finer and there is no photo",
+        "without a photo the ground sample distance of the images at plan.altitude_m, 0.0006 to 0.005; larger on a "
+        "sea floor that would have more than 40 million texture pixels",
     )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",
@@ -150,8 +185,8 @@ class VehicleConfig(Section):
 
     dynamics: Literal["rigid", "kinematic"] = Field(
         default="rigid",
-        description="rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height and "
-        "moves exactly at the commanded velocity, without forces",
+        description="rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height, "
+        "keeps its heading and moves exactly at the commanded horizontal velocity, without forces",
     )
     buoyancy_n: float = Field(
         default=1.0, ge=-20, le=20, description="buoyancy minus weight after trimming, positive upwards [N]"
@@ -569,7 +604,7 @@ class PlanConfig(Section):
 
     pattern: Literal["lawnmower", "loops"] = Field(
         default="lawnmower",
-        description="lawnmower: parallel legs; loops: loops that cross at the start in the centre of a disc",
+        description="lawnmower: parallel legs; loops: circles through the start, which is the centre of a disc",
     )
     area_m: tuple[Metres, Metres] = Field(
         default=(4.0, 2.0),
@@ -577,9 +612,10 @@ class PlanConfig(Section):
         "disc; unused with polygon [m]",
     )
     centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of the area: x, y in the scene [m]")
-    centre_crs: tuple[float, float] | None = Field(
+    centre_crs: tuple[Number, Number] | None = Field(
         default=None,
-        description="centre of the area: easting, northing in the CRS of the DEM, in its unit; replaces centre_m",
+        description="centre of the area: easting, northing in the CRS of the DEM, in the unit of the CRS; replaces "
+        "centre_m",
     )
     heading_deg: float = Field(
         default=0.0, ge=-360, le=360,
@@ -742,7 +778,8 @@ class EstimateConfig(Section):
     )
     min_overlap: float = Field(
         default=EstimatorSettings.min_overlap, gt=0, lt=1,
-        description="smallest overlap of linked nodes, the fraction of a node's matched points that both images show",
+        description="smallest overlap of linked nodes, the fraction of a node's matched points that both images show; "
+        "consecutive nodes are linked at any overlap",
     )  # fmt: skip
     max_links: int = Field(
         default=EstimatorSettings.max_links, ge=1, le=50,
@@ -780,12 +817,12 @@ class MapConfig(Section):
 
 
 class Source(BaseModel):
-    """File, line numbers and overrides that a scenario's keys come from; error messages name them.
+    """File, line numbers and overrides from which the keys of a scenario come, for error messages.
 
     Args:
         path: file of the scenario.
         lines: line number of each dotted key of that file.
-        base: origin of the keys of the file that this file extends; None if it extends none.
+        base: source of the file that this file extends; None if it extends none.
         overrides: overrides from the command line, each `key=value`.
     """
 
@@ -795,9 +832,11 @@ class Source(BaseModel):
     overrides: tuple[str, ...] = ()
 
     def describe(self, error: TwinError) -> str:
-        """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, or `--set: ...` for an overridden key.
+        """Returns the error as `FILE:LINE: key: problem (allowed: ...)` or, for an override, as `--set: ...`.
 
-        FILE and LINE locate the key or, if no file contains the key, the innermost section around it.
+        FILE and LINE locate the key or, if no file contains the key, the innermost section around it; they are `path`
+        and 1 if no file contains that either. The second form applies if an override sets the key, a section around it
+        or, where `path` does not contain the key, a key in it.
         """
         overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
         in_overridden_section = error.field not in self.lines and any(
@@ -825,7 +864,7 @@ class Scenario(Section):
     record: Literal["none", "keyframes", "all"] = Field(
         default="keyframes",
         description="images that the run folder keeps, for `twin export` and the report. keyframes: stereo pairs of "
-        "the keyframes; all: also the left image of every other frame; none: no images",
+        "the keyframes; all: also the left images of the frames between them; none: no images",
     )
     terrain: TerrainConfig = TerrainConfig()
     vehicle: VehicleConfig = VehicleConfig()
@@ -851,7 +890,7 @@ class Scenario(Section):
         default=(), max_length=1000, description="small lights at surveyed positions"
     )
     objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000, description="objects on the sea floor")
-    require: dict[str, float] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
+    require: dict[str, Number] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
 
@@ -862,16 +901,16 @@ class Scenario(Section):
 
     @property
     def delivers_linear_images(self) -> bool:
-        """Returns whether images are proportional to the radiance: linear tone curve, white balance for white light."""
+        """Whether images are proportional to the radiance: linear tone curve, white balance for white light."""
         sensor = self.sensor
         return sensor is None or (sensor.tone_curve == "linear" and sensor.white_balance == "white_light")
 
     @property
     def texel_m(self) -> float:
-        """Returns the size of a texture pixel [m]: as given, or by default `COARSEST_TEXEL_M` for a photo.
+        """Size of a texture pixel [m]: `terrain.texture_px_m`, or by default `COARSEST_TEXEL_M` for a photo.
 
-        The default for a generated texture is the size of an image pixel on the reference plane, limited to the range
-        from `FINEST_TEXEL_M` to `COARSEST_TEXEL_M`.
+        The default without a photo is the size of an image pixel on the reference plane, limited to the range from
+        `FINEST_TEXEL_M` to `COARSEST_TEXEL_M`.
         """
         if self.terrain.texture_px_m is not None:
             return self.terrain.texture_px_m

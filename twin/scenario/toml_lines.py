@@ -92,7 +92,7 @@ def _parsed_key_lines(text: str) -> dict[str, int]:
 
 
 def _blocks(header: str, path: str, body: _Body, n_header_lines: int) -> Iterator[_Block]:
-    """Yields the block of a table, then the blocks of the tables in it.
+    """Yields the block of the top level, or of a table with a header of its own, then those of the tables in it.
 
     Args:
         header: header of the table; empty for the top level and for a table without a header of its own.

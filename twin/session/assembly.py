@@ -8,13 +8,18 @@ from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
-from twin.session.plugin_estimator import PluginNavigator
+from twin.plugin.navigator import PluginNavigator
+from twin.plugin.protocols import EstimatorSetup
 from twin.world.mission import Mission
 from twin.world.world import World
 
 
 def open_world(mission: Mission, stopwatch: StageTimer) -> World:
-    """Returns the simulated world of a mission, rendered or surrogate."""
+    """Returns the simulated world of a mission, rendered or surrogate.
+
+    Raises:
+        TwinError: OpenGL is missing, the error model cannot be read, or the surrogate cannot simulate the survey.
+    """
     # imported here: MuJoCo and OpenGL take 25 MB that a surrogate survey does not need
     if mission.scenario.imaging.fidelity == "rendered":
         from twin.world.rendered_world import RenderedWorld
@@ -36,11 +41,15 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
         world: the flown world; in a surrogate survey it makes the visual measurements.
         folder: run folder; keyframe images and mosaic tiles are stored in its subfolder "keyframes".
         stopwatch: timer of the stages.
+
+    Raises:
+        TwinError: the plug-in cannot be loaded.
     """
     if mission.scenario.imaging.fidelity == "rendered":
         vision = image_vision(mission, folder, stopwatch)
         if (plugin := mission.scenario.estimate.plugin) is not None:
-            return PluginNavigator(mission, plugin, vision, stopwatch)
+            setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
+            return PluginNavigator(plugin, setup, mission.scenario.estimator_settings(), vision, stopwatch)
         return navigator_with(mission, vision, stopwatch)
     from twin.surrogate.surrogate_world import SurrogateWorld
 

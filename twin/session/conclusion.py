@@ -13,6 +13,7 @@ from twin.core.quality import Finding
 from twin.core.timing import Stopwatch, timing_summary
 from twin.estimate.pipeline import Navigator, finish_in_stage
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
+from twin.plugin.navigator import NOTE
 from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
 from twin.scenario.idealisations import idealisations
 from twin.scenario.model import Scenario
@@ -57,6 +58,9 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
 
     An interrupt ends only the current stage; the survey then has the status "aborted" with a reason that names the
     stage.
+
+    Raises:
+        OSError: metrics.json cannot be written.
     """
     mission, world, navigator, stopwatch, guard = flight
     result = finish_in_stage(navigator, guard)
@@ -118,11 +122,7 @@ def plugin_notes(scenario: Scenario) -> list[str]:
     notes = (
         (scenario.terrain.plugin, "The heights of the floor are those of the plug-in {}."),
         (scenario.control.plugin, "The vehicle was steered by the plug-in {}."),
-        (
-            scenario.estimate.plugin,
-            "The trajectories are those of the plug-in {}: its online poses (shown as F2F and as online) and the poses "
-            "that it returned at the end (final). There are no links and no alignments.",
-        ),
+        (scenario.estimate.plugin, NOTE),
     )
     return [note.format(name) for name, note in notes if name is not None]
 

@@ -37,7 +37,7 @@ class MissionActions:
 
     Attributes:
         action: the current action.
-        n_frames: number of frames flown in each action.
+        n_frames: number of frames in each action, without those that `add_measured_frames` counts.
     """
 
     def __init__(self, mission: Mission, log: Callable[[Action, Estimate], None] | None = None):

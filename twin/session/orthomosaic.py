@@ -19,7 +19,7 @@ from twin.world.mission import Mission
 
 
 class Orthomosaic(NamedTuple):
-    """An orthomosaic that has been written and compared with the truth.
+    """An orthomosaic that has been made and compared with the truth.
 
     Args:
         elevation: the elevation map, with the mean colours of the orthomosaic in its cells.

@@ -74,6 +74,7 @@ class SteppedWorld:
 
         Raises:
             ScenarioError: the survey cannot be flown with this seed, for example over the floor that it generates.
+            TwinError: the world cannot be created (`open_world`).
         """
         self.close()
         scenario = self._mission.scenario
@@ -123,6 +124,9 @@ class SteppedWorld:
 
         Args:
             folder: folder for images of keyframes; None: a temporary folder that `close` removes.
+
+        Raises:
+            TwinError: the plug-in that the scenario names cannot be loaded.
         """
         if folder is None:
             folder = Path(self._open.enter_context(TemporaryDirectory(prefix="twin-")))

@@ -1,7 +1,7 @@
 """Pose controller, top speed and thruster loads of the BlueROV2.
 
 The controller is designed with the published vehicle parameters and ignores the drag and added-mass factors of the
-scenario, which therefore act as model errors.
+scenario, which therefore act as model errors. Top speed and loads take these factors into account.
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ Array = NDArray[np.float64]
 
 
 def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:
-    """Returns a pose controller that is designed for the published vehicle and computes one command per frame."""
+    """Returns a pose controller that is designed for the published vehicle and computes one command per frame.
+
+    Args:
+        natural_frequency_radps: natural frequency of the closed loop in position.
+        frame_rate_hz: number of frames per second.
+    """
     hull = trimmed_hull(VehicleConfig.model_validate({}))
     model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
     allocation = pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
@@ -29,10 +34,11 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
-    """Returns the greatest steady speed in still water along a direction, at which the first thruster saturates [m/s].
+    """Returns the speed in still water along a direction at which the first thruster reaches full thrust [m/s].
 
-    Drag along each axis is a v + b v |v| with the coefficients a of linear and b of quadratic drag. At the speed v,
-    each thruster therefore needs the thrust p v + q v^2; p and q follow from a, b and the thrust allocation.
+    Full thrust is the steady thrust at command 1. Drag along each axis is a v + b v |v|, with the coefficients a of
+    linear and b of quadratic drag. At the speed v, each thruster therefore needs the thrust p v + q v^2; p and q follow
+    from a, b and the thrust allocation. The Munk moment and the net buoyancy are neglected.
 
     Args:
         vehicle: vehicle settings of the scenario, with the factor on drag.
@@ -50,10 +56,10 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 
 
 def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
-    """Returns the steady thrust (n,) of the most loaded thruster at each velocity, as a fraction of full thrust.
+    """Returns the largest absolute thrust (n,) of a thruster at each steady velocity, as a fraction of full thrust.
 
-    The hull is level. The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the moments in roll and
-    pitch are assumed to be balanced by the righting moment.
+    Full thrust is the steady thrust at command 1. The hull is level. The thrusters balance drag, the Munk moment in
+    yaw, and the net buoyancy; the moments in roll and pitch are assumed to be balanced by the righting moment.
 
     Args:
         vehicle: vehicle settings of the scenario, with the factors on drag and added mass and the buoyancy.

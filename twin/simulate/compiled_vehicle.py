@@ -17,7 +17,7 @@ from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
-from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.thrusters import (
     LaggedThrusters,
@@ -89,8 +89,9 @@ class CompiledVehicle:
 
         Raises:
             SurveyAborted: the physics diverged.
+            ValueError: the duration is not a whole number of timesteps.
         """
-        advance(self.state, thruster_u, round(duration_s / self.state.timestep_s))
+        advance(self.state, thruster_u, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
@@ -113,14 +114,17 @@ def body_twist(body):
 
 @njit(cache=True, nogil=True)
 def has_diverged(body):
-    """Returns whether a component of the velocity is not finite or reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS."""
+    """Returns whether a component of the velocity is NaN or its magnitude reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS.
+
+    SPEED_LIMIT_MPS applies to the linear components, RATE_LIMIT_RADPS to the angular ones.
+    """
     speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
     return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 
 
 @njit(cache=True, nogil=True)
 def advance(body, command, n_steps):
-    """Advances the state in place by `n_steps` physics steps under thruster commands (8,)."""
+    """Advances the state in place by `n_steps` timesteps under thruster commands (8,), clipped to [-1, 1]."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     set_thruster_command(thrusters, command)
     for _ in range(n_steps):

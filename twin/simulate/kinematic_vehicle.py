@@ -1,4 +1,4 @@
-"""Vehicle without dynamics: it stays level at constant height and moves exactly at the commanded velocity."""
+"""Vehicle without dynamics: it stays level at constant height and moves at the commanded horizontal velocity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 class KinematicVehicle:
-    """Vehicle that moves horizontally at the commanded velocity, without rotation, thrust, drag or current.
+    """Vehicle that moves at the horizontal part of the commanded velocity, without rotation, thrust, drag or current.
 
     This is the vehicle simulated by Negahdaripour & Madjidi (2003, section V-A): its vertical translation t_Z and all
     rotations are zero.

@@ -12,7 +12,7 @@ from scenes.gl import MjModel, mujoco
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
-from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull
+from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.thrusters import LaggedThrusters
 
@@ -80,9 +80,7 @@ class MujocoVehicle:
             SurveyAborted: the physics diverged.
             ValueError: the duration is not a whole number of timesteps.
         """
-        n_steps = round(duration_s / self._model.opt.timestep)
-        if n_steps < 1 or abs(n_steps * self._model.opt.timestep - duration_s) > 1e-6 * duration_s:
-            raise ValueError(f"{duration_s} s is not a whole number of timesteps of {self._model.opt.timestep} s")
+        n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
         self._thrusters.command(thruster_u)
         for _ in range(n_steps):
             self._advance(self._thrusters.wrench())
@@ -98,14 +96,18 @@ class MujocoVehicle:
         acceleration, force = np.zeros(model.nv), np.zeros(model.nv)
         acceleration[self._dofs] = self._kick * target
         mujoco.mj_mulM(model, data, force, acceleration)
-        # Adding the bias force cancels MuJoCo's own gravity and gyroscopic terms: `target` contains both.
+        # `target` contains gravity and gyroscopic terms: MuJoCo's own (bias and passive forces) are cancelled.
         data.qfrc_applied[self._dofs] = (force + data.qfrc_bias - data.qfrc_passive)[self._dofs]
         mujoco.mj_step2(model, data)
         mujoco.mj_step1(model, data)
         self._acceleration, self._kick = target, 1.0
 
     def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
-        """Raises SurveyAborted, listing the last states, if the acceleration is not finite or the speed too large."""
+        """Raises SurveyAborted, listing the last states, if the physics has diverged.
+
+        It has if a component of the acceleration (6,) is not finite, or if one of the velocity (6,) is NaN or reaches
+        SPEED_LIMIT_MPS (linear) or RATE_LIMIT_RADPS (angular). Both are in the coordinates of the free joint.
+        """
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
             return
@@ -113,7 +115,7 @@ class MujocoVehicle:
         raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
 
     def _snapshot(self) -> tuple[float, Array, Array]:
-        """Returns time, position (3,) and velocity of the free joint (6,)."""
+        """Returns time [s], position (3,) [m] and velocity of the free joint (6,), ordered as `qvel` [m/s, rad/s]."""
         return self.time_s, self._data.xpos[self._body].copy(), self._velocity.copy()
 
 

@@ -48,14 +48,14 @@ class NavigationSensors:
     def read(
         self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Callable[[], Depth] | None
     ) -> Readings:
-        """Simulates the readings of one frame.
+        """Simulates the readings of one frame; acoustic fixes and beacons are read at keyframes only.
 
         Args:
             time_s: time of the frame.
             world_from_body: (4, 4) true pose.
             twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
-            depth_m: function that returns the true depth (height, width) of the left image [m]; None if the frame is
-                not a keyframe.
+            depth_m: function that returns the true depth (height, width) of the left image along the optical axis [m];
+                None if the frame is not a keyframe.
         """
         readings = read_pressure_and_attitude(
             world_from_body, self._rig.body_from_camera, self._noise, self._aiding, self._rng["navigation"]
@@ -231,13 +231,13 @@ def detect_beacons(
     noise: SensorNoise,
     rng: np.random.Generator,
 ) -> tuple[BeaconDetection, ...]:
-    """Simulates the detection of beacons in the left image, except those outside the image or occluded by the floor.
+    """Simulates the detection of the beacons that are inside the left image and not occluded by floor or objects.
 
     Noise is sampled for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
 
     Args:
         world_from_camera: (4, 4) true pose of the left camera.
-        depth_m: (height, width) true depth of the left image.
+        depth_m: (height, width) true depth of the left image along the optical axis [m].
         project: projects points (n, 3) in left camera axes to pixels (n, 2).
         noise: standard deviation of column and row of a detected beacon, and surveyed positions of the beacons.
         rng: random generator of this sensor only.
@@ -251,13 +251,12 @@ def detect_beacons(
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
-    """Returns whether a point is inside the image and not hidden by the floor.
+    """Returns whether a point is inside the image and less than `_BEACON_HEIGHT_M` behind the surface in the image.
 
     Args:
-        pixel: (2,) column and row of the point [px].
-        distance_m: depth of the point along the optical axis [m]; it may exceed that of the floor by the height of a
-            beacon.
-        depth_m: (H, W) depth of the floor along the optical axis [m].
+        pixel: (2,) column and row of the point [px]; NaN if the point is behind the camera.
+        distance_m: depth of the point along the optical axis [m].
+        depth_m: (height, width) depth of the surface, floor or object, along the optical axis [m].
     """
     rows, columns = depth_m.shape
     if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # also true for NaN

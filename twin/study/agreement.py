@@ -1,6 +1,7 @@
 """Agreement of surrogate surveys with rendered surveys of the same scenarios and seeds, compared with limits.
 
-Each rendered survey is paired with the surrogate survey that has the same seed and the same values of all other keys.
+Each rendered survey is paired with the surrogate survey that has the same seed and the same values of all varied keys
+other than `imaging.fidelity`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from twin.study.analysis import StudyAnalysis
 from twin.study.statistics import LEVEL, RESAMPLES, Array, Interval, wilson_interval
 
 FIDELITY = "imaging.fidelity"
-MEDIAN_LIMIT = 0.2  #: largest deviation of the ratio of medians, or of its inverse, from 1
+MEDIAN_LIMIT = 0.2  #: largest amount by which the ratio of medians, or its inverse, may exceed 1
 P_LIMIT = 0.01  #: smallest p-value of the Kolmogorov-Smirnov test
 PASS_LIMIT = 0.9  #: smallest fraction of pairs with the same verdict
 _FLOWN = ("complete", "degraded")  # statuses of a survey that was flown to its end
@@ -79,7 +80,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(analysis: StudyAnalysis) -> Agreement | None:
-    """Returns the agreement of a study's pairs; None if the study compares no metrics or has no complete pair."""
+    """Returns the agreement of a study's pairs; None if it compares no metrics or no pair has two results."""
     if not analysis.study.compare:
         return None
     rendered, surrogate = pairs(analysis)

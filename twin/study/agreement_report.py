@@ -60,7 +60,7 @@ def figure_uri(analysis: StudyAnalysis) -> str:
 def write_document(analysis: StudyAnalysis, folder: Path) -> None:
     """Writes agreement.md, with the command and the table, and its figure agreement.png to a folder.
 
-    Writes nothing if the study compares no metrics or has no complete pair.
+    Writes nothing if the study compares no metrics or no pair of surveys has two results.
     """
     result = agreement.agreement(analysis)
     if result is None:

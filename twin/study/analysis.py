@@ -26,8 +26,8 @@ _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, e
 class MetricSummary(NamedTuple):
     """Distribution of a metric over the surveys: median, 95th or 5th percentile, and required limit.
 
-    `surveys` is the number of surveys with a value; `bound` is the 95th percentile, or the 5th percentile if larger
-    values of the metric are better; `limit` is None if the metric has no requirement.
+    `surveys` is the number of surveys in these statistics (`StudyAnalysis.included`); `bound` is the 95th percentile,
+    or the 5th percentile if larger values of the metric are better; `limit` is None if the metric has no requirement.
     """
 
     name: str
@@ -63,7 +63,7 @@ class KeyComparison(NamedTuple):
 
 
 class FailureReason(NamedTuple):
-    """Reason why surveys did not pass, their status, and the number of these surveys."""
+    """Status of surveys that did not pass, the reason, and the number of surveys with this status and reason."""
 
     status: str
     reason: str
@@ -149,7 +149,7 @@ class StudyAnalysis:
         return limits
 
     def _passed(self) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the surveys that were completed and met every requirement."""
+        """Returns the mask (n,) of the surveys that were completed and met every requirement, without duplicates."""
         met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
         return np.logical_and.reduce([self.complete, *met])
 
@@ -228,7 +228,11 @@ class StudyAnalysis:
 
     @cached_property
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
-        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes."""
+        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
+
+        Metrics that are constant, or that some survey of the design lacks because it is not complete or has no value,
+        are left out.
+        """
         axes = axis_names(self.study)
         usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
         if not usable or len(np.unique(self.numbers("sample"))) != (self.study.sampling.samples or 0) * (len(axes) + 2):

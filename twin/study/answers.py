@@ -59,7 +59,10 @@ class PassRecord(NamedTuple):
     fail_level: float = LEVEL
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
-        """Returns the verdict on the surveys that the mask `chosen` (n,) selects, with the range of their key."""
+        """Returns the verdict on the surveys that the mask `chosen` (n,) selects.
+
+        `label`, `low` and `high` are those of the answer.
+        """
         passed, clusters = self.passed[chosen], self.clusters[chosen]
         n, k = effective_number(passed, clusters), float(passed.mean())
         verdict: Verdict = "undecided"

@@ -27,6 +27,7 @@ from twin.study.study_file import Study, TuningConfig
 from twin.study.surveys import Survey, merge_errors, refusals, scenario_of_sample, surveys_of_sample
 
 _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
+_POWER_OF_2 = ("sobol", "saltelli")  # designs that need a power of 2 as number of samples
 _CONFIRM_SEEDS = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
 _RENDER_SEEDS = 2_000_000  # added to it for the rendered surveys
 _PENALTY = 1e9  # objective of a candidate without a finite median; Optuna does not accept infinity
@@ -113,15 +114,20 @@ class CandidateSurveys:
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
         """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new seeds.
 
-        Sampled keys have new samples.
+        Sampled keys have new samples. The designs "sobol" and "saltelli" need a power of 2 as number of samples; for
+        another number, the samples are those of "lhs".
 
         Args:
             rows: rows of the surveys flown so far.
         """
         sampling = self.study.sampling
-        is_sampled = sampling.method != "grid" and len(axis_names(self.study)) > 0
-        count = "samples" if is_sampled else "seeds"
-        update = {"seed": sampling.seed + _CONFIRM_SEEDS, count: (getattr(sampling, count) or 1) * self.config.confirm}
+        n_axes = len(axis_names(self.study))
+        count = "samples" if sampling.method != "grid" and n_axes > 0 else "seeds"
+        n = (getattr(sampling, count) or 1) * self.config.confirm
+        update: dict[str, Any] = {"seed": sampling.seed + _CONFIRM_SEEDS, count: n}
+        if count == "samples" and sampling.method in _POWER_OF_2 and n & (n - 1):
+            points = n * (n_axes + 2) if sampling.method == "saltelli" else n
+            update |= {"method": "lhs", "samples": points}
         study = self.study.model_copy(update={"sampling": sampling.model_copy(update=update)})
         return CandidateSurveys(study, self.config, self.folder, rows)
 
@@ -137,7 +143,7 @@ class CandidateSurveys:
         sampling, config = self.study.sampling, self.config
         update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
         update["seeds" if sampling.samples is None else "samples"] = config.verify
-        if sampling.method in ("sobol", "saltelli"):  # they need a power of 2 as number of samples
+        if sampling.method in _POWER_OF_2:
             update["method"] = "lhs"
         changes = {
             "sampling": sampling.model_copy(update=update),
@@ -161,7 +167,10 @@ class CandidateSurveys:
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
-        """Returns whether the survey has a result with its scenario hash; a result with another hash does not count."""
+        """Returns whether the survey has a result with its scenario hash.
+
+        A result with another hash or with the status "failed" does not count.
+        """
         score = self._scores.get(survey.key)
         return score is not None and score.status != "failed" and score.scenario_hash == survey.scenario_hash
 
@@ -284,13 +293,13 @@ def median_of(scores: list[SurveyScore], name: str) -> float | None:
 
 
 def check_bounds(study: Study, config: TuningConfig) -> None:
-    """Validates the scenario at both bounds, or at all listed values, of each searched key.
+    """Validates the scenario at both bounds, or at all listed values, of each searched key, in the first valid sample.
 
     Raises:
         ScenarioError: lists the errors, each key once.
     """
     base, errors = read_tree(study.scenario_file), []
-    condition = next(samples(study))
+    condition = _first_valid_sample(study, base)
     for key, distribution in config.search.items():
         for value in distribution.values:
             try:
@@ -299,6 +308,22 @@ def check_bounds(study: Study, config: TuningConfig) -> None:
                 errors += error.lines
     if errors:
         raise ScenarioError(merge_errors(errors))
+
+
+def _first_valid_sample(study: Study, base: Mapping[str, Any]) -> Sample:
+    """Returns the first sample whose scenario is valid with the original plan; the first one of all if none is.
+
+    Args:
+        study: the study.
+        base: contents of the study's scenario file.
+    """
+    for sample in samples(study):
+        try:
+            scenario_of_sample(study, base, sample)
+        except ScenarioError:
+            continue
+        return sample
+    return next(samples(study))
 
 
 def cost_index(config: TuningConfig) -> int:

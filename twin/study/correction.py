@@ -42,7 +42,7 @@ NO_CORRECTION = PlanCorrection({}, 1.0)
 
 
 def metric_ratio(metric: str, rendered: float | None, surrogate: float | None) -> float:
-    """Returns the ratio rendered / surrogate of a metric, limited to 1/100 to 100.
+    """Returns the ratio rendered / surrogate of a metric, clipped to the range from 1/100 to 100.
 
     Without a finite rendered value, the ratio is 10, or 1/10 if larger values of the metric are better. It is 1 if the
     surrogate has no finite value, or if either value is not positive.

@@ -20,7 +20,7 @@ _CONNECT_TIMEOUT_S = 20
 _QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
 _MIN_QUEUED = 64
 _REFRESH_S = 2.0
-_MAX_LOST_WORKERS = 3  # a task fails if more Dask workers than this are lost while they run it
+_MAX_LOST_WORKERS = 3  # in SLURM jobs, a task fails if more Dask workers than this are lost while they run it
 
 
 @contextmanager

@@ -50,7 +50,10 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name."""
+    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name.
+
+    A folder that already has this name is deleted first. If no file is kept, `scratch` stays; the caller deletes it.
+    """
     shutil.rmtree(survey.folder, ignore_errors=True)
     if survey.keep == "none":
         return

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from twin.judge.require import more_is_better
 from twin.study import wording
 from twin.study.analysis import StudyAnalysis
+from twin.study.design import samples
 from twin.study.engine import Engine
 from twin.study.flight import Row, has_passed
 from twin.study.progress import StudyProgress
@@ -34,6 +35,7 @@ class RenderedCheck(NamedTuple):
         rows: result of each rendered survey.
         interrupted: whether Ctrl-C ended the check, so that some of the rendered surveys are missing.
         has_limits: whether the study has a limit, so that there are verdicts to check.
+        n_lost: number of rendered surveys that were refused or failed, and therefore have no verdict.
     """
 
     rendered: NDArray[np.bool_]
@@ -41,6 +43,7 @@ class RenderedCheck(NamedTuple):
     rows: list[Row]
     interrupted: bool = False
     has_limits: bool = True
+    n_lost: int = 0
 
     @property
     def exit_status(self) -> int:
@@ -70,12 +73,14 @@ class RenderedCheck(NamedTuple):
         return self._result() + partial
 
     def _result(self) -> str:
-        """Returns the result of the rendered surveys that were flown in one sentence."""
+        """Returns, in one sentence, the result of the rendered surveys flown so far."""
         n = len(self.rendered)
         if not self.has_limits:
             return "No survey was flown rendered: the study has no limit in [require], so there is no verdict to check."
         if n == 0 and self.interrupted:
             return "No survey was flown rendered."
+        if n == 0 and self.n_lost:
+            return f"There is no verdict to check: {self.n_lost} rendered surveys were refused or failed."
         if n == 0:
             return "No survey was flown rendered: none of the surrogate surveys has a value of every required metric."
         same = int((self.rendered == self.surrogate).sum())
@@ -102,12 +107,15 @@ def check(
         progress: display of the progress.
 
     Raises:
-        TwinError: the subfolder cannot be written, or contains the results of another study.
+        TwinError: the subfolder cannot be written, or contains the results of another study; or the engine lost its
+            connection.
         OSError: the results cannot be written.
     """
     nearest = nearest_surveys(analysis, n)
     keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
-    chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in surveys(study, folder) if survey.key in keys}
+    others = {sample.number for sample in samples(study)} - {number for number, _ in keys}  # some may be refused
+    found = (survey for survey in surveys(study, folder, without=others) if survey.key in keys)
+    chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in found}
     log = open_folder(folder / FOLDER, True, ((key, survey.scenario_hash) for key, survey in chosen.items()))
     done = log.done()
     progress.begin(progress.done + len(set(keys) - done))
@@ -115,9 +123,10 @@ def check(
     log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
-    found = [rows[keys[k]] for k in flown]
-    passed = np.array([has_passed(row) for row in found], bool)
-    return RenderedCheck(passed, analysis.passed[nearest[flown]], found, not completed, bool(analysis.limits))
+    results, n_lost = [rows[keys[k]] for k in flown], sum(key in rows for key in keys) - len(flown)
+    passed = np.array([has_passed(row) for row in results], bool)
+    surrogate = analysis.passed[nearest[np.array(flown, np.int64)]]
+    return RenderedCheck(passed, surrogate, results, not completed, bool(analysis.limits), n_lost)
 
 
 def summary(checked: RenderedCheck) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names by section: identity in a fixed order; varied keys, metrics and timing each by alphabet."""
+    """Returns the names by section: identity in a fixed order; varied keys, metrics, timing, each sorted by name."""
     identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 

@@ -167,7 +167,19 @@ def fly_surveys(
     progress: StudyProgress,
     function: Callable[[Survey], Row] = fly,
 ) -> bool:
-    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True."""
+    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True.
+
+    Args:
+        study: study with the timeout and the number of retries.
+        missing: surveys to fly.
+        add_row: called with the row of each survey that has ended.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+        function: flies one survey; must be importable by name on the workers.
+
+    Raises:
+        TwinError: the engine lost its connection.
+    """
     try:
         for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
             row = row_of_outcome(outcome)

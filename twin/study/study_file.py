@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr
 from twin.core.paths import is_file
 from twin.errors import ScenarioError, TwinError
 from twin.judge.metrics import empty_metrics
-from twin.judge.require import check_metric_names
+from twin.judge.require import SIGNED, check_metric_names
 from twin.scenario.file import find_scene, load_scenario, read_toml, shown, validated
 from twin.scenario.model import Section, Source
 from twin.study.distribution import KINDS, Distribution
@@ -129,7 +129,7 @@ class Study(Section):
     )
     compare: tuple[str, ...] = Field(
         default=(),
-        description="metrics whose values in rendered and surrogate surveys are compared; needs "
+        description="metrics, never negative, whose values in rendered and surrogate surveys are compared; needs "
         'vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }',
     )
     set: dict[str, Any] = Field(default={}, description="keys of the scenario that have a fixed value in this study")
@@ -324,6 +324,10 @@ def _metric_errors(study: Study) -> Iterable[TwinError]:
             check_metric_names([name], known)
         except TwinError as error:
             yield TwinError(study_key, f"{name}: {error.problem}", error.allowed)
+    for name in study.compare:
+        if name in SIGNED:
+            problem = f"{name} can be negative, but the ratio of its medians is compared"
+            yield TwinError("compare", problem, "metrics that are never negative, such as map.rmse_m")
     fidelity = study.vary.get("imaging.fidelity")
     if study.compare and (fidelity is None or fidelity.grid is None or set(fidelity.grid) != FIDELITIES):
         yield TwinError("compare", "needs surveys of both fidelities", "vary.imaging.fidelity with a grid of both")

@@ -153,10 +153,11 @@ class Tuning:
         self.confirmed: Candidate | None = None
 
     def run(self) -> None:
-        """Runs the rounds of the search until a plan can be recommended, none is confirmed, or the rounds are used up.
+        """Runs the rounds of the search until a plan can be recommended or all rounds are done.
 
         Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
-        After a plan has passed, cheaper plans that the surrogate rejects are verified until one does not pass.
+        The first round is the only one if no plan was verified in it. After a plan has passed, cheaper plans that the
+        surrogate rejects are verified until one does not pass.
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
@@ -240,10 +241,10 @@ class Tuning:
     def _next_cheaper(self) -> Candidate | None:
         """Returns the next plan to verify that is cheaper than the recommended one.
 
-        The costs of all plans, including the recommended one, are those of the search with the same correction. The
-        candidates are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those
-        that are not verified, the one with the smallest shortfall of the pass probability is returned; of several with
-        the same shortfall, the most expensive one. None if no plan is recommended, or if all candidates are verified.
+        The costs of all plans, including the recommended one, are the corrected results of the search. The candidates
+        are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those that are not
+        verified, the one with the smallest shortfall of the pass probability is returned; of several with the same
+        shortfall, the most expensive one. None if no plan is recommended, or if all candidates are verified.
         """
         if self.recommended is None:
             return None
@@ -255,10 +256,10 @@ class Tuning:
         return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)
 
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
-        """Flies the rendered surveys of a confirmed plan and compares them with its surrogate surveys.
+        """Flies the rendered surveys of a plan and compares them with its surrogate surveys.
 
         Args:
-            plan: the plan.
+            plan: the plan; it is one of the finalists.
             most_plans: largest number of plans still to be verified in the search, including this one.
             search_round: round of the search, from 0.
         """

@@ -80,7 +80,8 @@ def headline(study: Study, analysis: StudyAnalysis) -> str:
     """Returns the main results of a study as text.
 
     They are the answer for the key that `seek` of the study names, the pass probability, whether the requirement is
-    met, and the numbers of surveys that are not counted.
+    met, the most frequent reason if no survey passed, the numbers of surveys that are not counted, and the most
+    frequent warning.
     """
     n = int(analysis.evaluated.sum())
     left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)
@@ -210,14 +211,19 @@ def _requirement(analysis: StudyAnalysis) -> str:
     return f" The required {percent(required)} is {verdict}{where}{doubt}."
 
 
+def sample_count(n: int) -> str:
+    """Returns a number of samples with its noun."""
+    return "1 sample" if n == 1 else f"{n} samples"
+
+
 def _refused(analysis: StudyAnalysis) -> str:
     """Returns a sentence on the samples that cannot be flown and are not counted; "" if there are none."""
     if not (samples := analysis.refused_samples):
         return ""
     surveys = _count(int(analysis.refused.sum()))
-    n = "1 sample" if len(samples) == 1 else f"{len(samples)} samples"
     verb = "is" if len(samples) == 1 else "are"
-    return f" {n} ({surveys}) cannot be flown and {verb} not counted, e.g.: {analysis.refusal_reasons[0].reason}."
+    n, reason = sample_count(len(samples)), analysis.refusal_reasons[0].reason
+    return f" {n} ({surveys}) cannot be flown and {verb} not counted, e.g.: {reason}."
 
 
 def _duplicates(analysis: StudyAnalysis) -> str:

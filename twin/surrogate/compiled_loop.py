@@ -9,6 +9,7 @@ from twin.core import geometry
 from twin.estimate.navigation.dead_reckoning import dead_reckon
 from twin.estimate.pipeline import Navigator
 from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist, has_diverged
+from twin.simulate.hull import whole_timesteps
 from twin.simulate.sensors import read_per_frame_sensors
 from twin.surrogate.sampling import sample_f2f_motion
 from twin.surrogate.vision import SurrogateVision
@@ -20,16 +21,16 @@ from twin.world.world import FastForward, World
 def compiled_loop(
     world: World, vehicle: CompiledVehicle, vision: SurrogateVision, navigator: Navigator, pilot: RovPilot
 ) -> FastForward:
-    """Returns a function that runs the compiled closed loop from a given frame to the next keyframe.
+    """Returns a function that runs the compiled closed loop from a given frame up to the next keyframe.
 
     The function performs the same operations with the same random numbers as the loop in `survey.fly`, so the results
-    are equal. It returns the index of the next frame to simulate. If F2F has no points to track, it simulates no
-    frames. If the physics diverges, it keeps the frames up to the one at which this was detected, and raises
-    SurveyAborted.
+    are equal. It returns the index of the next frame to simulate: that of the next keyframe, or the number of frames if
+    the sequence has no further keyframe. If F2F has no points to track, it simulates no frames. If the physics
+    diverges, it keeps the frames up to the one after which this was detected, and raises SurveyAborted.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
-    sensors, n_steps = world.sensors.per_frame_sensors(), round(interval_s / vehicle.state.timestep_s)
+    sensors, n_steps = world.sensors.per_frame_sensors(), whole_timesteps(interval_s, vehicle.state.timestep_s)
 
     def fast_forward(sequence: FrameSequence, first: int) -> int:
         errors, ahead = vision.frame_errors, sequence.keyframe[first:]
@@ -60,9 +61,9 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     """Runs the closed loop over n frames.
 
     Returns:
-        Number of simulated frames (fewer than n if the vehicle's state diverged), dead-reckoning state after the last
-        frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated from F2F alone, and online estimates;
-        only the simulated frames are set.
+        Number of simulated frames (the last one is that after which the vehicle's state diverged, if it did),
+        dead-reckoning state after the last frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated
+        from F2F alone, and online estimates; only the simulated frames are set.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals

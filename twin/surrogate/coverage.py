@@ -70,7 +70,7 @@ class QuantityOutsideFit(NamedTuple):
     Args:
         quantity: the quantity.
         values: smallest and largest value in the survey.
-        allowed: smallest and largest allowed value.
+        allowed: smallest and largest allowed value; infinite on a side without limit.
     """
 
     quantity: Quantity

@@ -136,7 +136,8 @@ class BorderLaw(NamedTuple):
         share: fraction at the border.
         floor_px: width in noise-free images [px].
         slope: width per Cramér-Rao bound, for large bounds.
-        lamp_growth: the part that increases with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2).
+        lamp_growth: the part that increases with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2),
+            where lamp_share is the fraction of the reflected light that comes from the lamps.
     """
 
     share: float
@@ -150,12 +151,31 @@ class BorderLaw(NamedTuple):
         return np.hypot(self.floor_px, noise_px)
 
 
+class BorderErrorLaw(NamedTuple):
+    """Standard deviation of depth near the border of the images, relative to that elsewhere: 1 + share exp(-b / width).
+
+    b is the largest distance of a cell from the border over the consecutive keyframes that observed it. Matching
+    windows at the border extend beyond the image, so fewer pixels determine the disparity.
+
+    Args:
+        share: relative increase at the border.
+        width_px: width [px].
+    """
+
+    share: float
+    width_px: float
+
+    def __call__(self, border_px: Array | float) -> Array:
+        """Returns the relative standard deviation at a distance from the border [px]."""
+        return 1 + self.share * np.exp(-np.asarray(border_px) / self.width_px)
+
+
 class ErrorModel(NamedTuple):
     """Parameters of the measurement errors of the surrogate.
 
     The standard deviation (sigma) that an estimator reports may differ from that of its errors. Fields named
-    `..._sigma_px` model the reported standard deviation, and fields named `..._error_ratio` the ratio of the true to
-    the reported one.
+    `..._sigma_px` model the reported standard deviation (`lateral_sigma_px` the true one), and fields named
+    `..._error_ratio` the ratio of the true to the reported one.
 
     Args:
         bound_range_px: smallest and largest Cramér-Rao bound of the surveys to which the model was fitted; the bound of
@@ -178,11 +198,11 @@ class ErrorModel(NamedTuple):
             half of the points that could be matched between two keyframes are matched. The fraction is
             1 / (1 + (parallax / match_parallax_px)^2), because the patch then looks different from the two keyframes.
             Not fitted, because the surveys of the fit give contradictory values.
-        match_covariance_inflation: factor on the covariance of a link, because matches of overlapping patches are
-            correlated; see `matching.variance_inflation`.
+        match_covariance_inflation: factor on the reported covariance of a link, in addition to the factor for
+            overlapping patches (`vision.overlap_inflation`).
         match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
             of its standard deviation, the error is r b + sqrt(1 - r^2) e, where b and e have unit variance, b is common
-            to all links to that pair, and e is independent from link to link.
+            to all links to that pair, and e is independent from link to link; `distance_growth` increases e only.
         distance_growth: growth of the reported and of the true match variance in the earlier keyframe of a link with
             the distance between the two keyframes: the variance is multiplied by
             1 + (distance_growth * distance / depth)^2.
@@ -201,8 +221,8 @@ class ErrorModel(NamedTuple):
         f2f_anticorrelation: fraction of the independent error of a frame-to-frame motion that the next motion cancels
             (a first-order moving average), because both motions are measured relative to the same points.
         mosaic_sigma_px: reported standard deviation of a registration with the mosaic, expressed as the standard
-            deviation of one flow vector if the registration were estimated from as many flow vectors as F2F, times the
-            fraction of the field of view that the mosaic covers.
+            deviation of one flow vector if the registration were estimated from c times as many flow vectors as a
+            frame-to-frame motion, where c is the fraction of the field of view that the mosaic covers.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
         depth_error: true standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
         depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
@@ -210,8 +230,8 @@ class ErrorModel(NamedTuple):
             reported standard deviation of depth: the depth filter measures how well each pixel is matched. The errors
             of a map are therefore a scale mixture: normal with the standard deviation of their cell, but with heavy
             tails over the whole map.
-        error_scatter_share: the same standard deviation for the true standard deviation of depth, which varies with the
-            reported one, divided by that for the reported one.
+        error_scatter_share: ratio of the scatter over cells of the logarithm of the true standard deviation of depth to
+            that of the reported one (`depth_cell_scatter`); both vary together.
         depth_binned_error: factor on the true standard deviation of depth [px of the binned images] due to binning.
         depth_binned_sigma: factor on the reported standard deviation of depth [px of the binned images] due to binning.
         depth_binned_scatter: value of `depth_cell_scatter` for binned images; it hardly depends on the bound.
@@ -219,7 +239,9 @@ class ErrorModel(NamedTuple):
             deviation of depth about their laws, due to properties of floor and images that the model does not contain.
         depth_ratio_scatter: standard deviation, over surveys, of the logarithm of the ratio of the true to the reported
             standard deviation of depth about its law.
-        lateral_sigma_px: standard deviation of the lateral shift of a mapped surface, common to all its views [px].
+        border_error: increase of the true and of the reported standard deviation of depth near the image borders.
+        lateral_sigma_px: true standard deviation of the lateral shift of a mapped surface, common to all its views
+            [px].
         map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
             Kalman depth filter provides a depth.
         border_holes: fraction of the cells without a depth near the borders of the images.
@@ -228,9 +250,10 @@ class ErrorModel(NamedTuple):
             deviation of the floor from a plane within the window of dense matching. The error is common to all views of
             the cell.
         relief_error_limit_px: limit of this standard deviation for large roughness [px of disparity].
-        edge_error_gain: true standard deviation of the height error near walls, where the matching window shows two
-            surfaces, per `map_model.edge_roughness`. The errors are heavy-tailed (`map_model.heavy_tailed`).
-        edge_sigma_gain: reported standard deviation of the height near walls, per `map_model.edge_roughness`, in
+        edge_error: true standard deviation of the height error near walls, where the matching window shows two
+            surfaces, from one keyframe, per `map_model.edge_strength` [px^(1/2)]. It grows with the bound. The errors
+            are heavy-tailed (`map_model.heavy_tailed`).
+        edge_sigma_gain: reported standard deviation of the height near walls, per `map_model.edge_strength`, in
             addition to the terms that the map computes from the heights around a cell.
         edge_half_px: roughness at which half the cells have no depth [px of disparity].
     """
@@ -263,11 +286,12 @@ class ErrorModel(NamedTuple):
     depth_binned_scatter: BinningFactors = BinningFactors(0.0, 0.0)
     depth_survey_scatter: float = 0.0
     depth_ratio_scatter: float = 0.0
+    border_error: BorderErrorLaw = BorderErrorLaw(0.0, 3.0)
     lateral_sigma_px: float = 0.2
     map_completeness: FractionLaw = FractionLaw(0.999, 2.0, 4.0)
     border_holes: BorderLaw = BorderLaw(0.5, 1.0, 80.0, 1.3)
     relief_error_gain: float = 0.3
     relief_error_limit_px: float = 0.1
-    edge_error_gain: float = 0.3
+    edge_error: SigmaLaw = SigmaLaw(0.3, 10.0)
     edge_sigma_gain: float = 0.3
     edge_half_px: float = 10.0

@@ -13,6 +13,7 @@ from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
 from twin.surrogate.coverage import QUANTITIES, QuantityOutsideFit, Range, quantities_outside_fit
 from twin.surrogate.error_model import (
     BinningFactors,
+    BorderErrorLaw,
     BorderLaw,
     DepthLaw,
     ErrorModel,
@@ -22,7 +23,7 @@ from twin.surrogate.error_model import (
 )
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinningFactors, BorderLaw)
+_LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinningFactors, BorderLaw, BorderErrorLaw)
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",
@@ -129,7 +130,11 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
 
 
 def _ranges(path: Path, tree: Mapping[str, Any]) -> dict[str, Range]:
-    """Returns the table [fitted_range] of a file; empty if there is none."""
+    """Returns the table [fitted_range] of a file; empty if there is none.
+
+    Raises:
+        TwinError: the table has a name that is not in `coverage.QUANTITIES`.
+    """
     ranges: dict[str, Range] = {}
     for name, (low, high) in tree.get("fitted_range", {}).items():
         if name not in QUANTITIES:

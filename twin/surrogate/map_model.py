@@ -4,7 +4,7 @@ The heights stand for those from the Kalman depth filter, with one sample per gr
 cell. Their errors are correlated over the matching window, as those of dense matching are. A cell is visible if its
 centre projects into both images and no relief hides it from either camera (ray casting). Where the floor is not a plane
 within the matching window, heights have an additional error that grows with the RMS deviation from the plane (the
-roughness of the cell), and cells without a height are more frequent. Near walls this error is larger and heavy-tailed,
+roughness of the cell), and cells without a height are more frequent. Near walls, errors are larger and heavy-tailed,
 because the window shows two surfaces.
 """
 
@@ -33,6 +33,12 @@ WINDOW_PX = 11  #: side of the window of dense matching, over which the roughnes
 #: depth filter passes depths on from keyframe to keyframe.
 _CORRELATED_WINDOWS = 1.5
 WALL_SLOPE = 1.0  #: rise over run of the least steep wall
+#: Errors near walls decrease with the number of keyframes to the power of minus this.
+EDGE_VIEWS_EXPONENT = 0.2
+#: Errors near walls are larger at the border of the images by this share, which decreases by 1 / e over 1 / 6 of their
+#: height. Measured over the horseshoe reef and fractal floors; see `edge_border_factor`.
+EDGE_BORDER_SHARE, EDGE_BORDER_DECAY = 1.2, 6.0
+_LEAST_SLOPE = 0.1  # slope below which errors near walls do not decrease
 #: Law of a depth that more keyframes do not improve.
 ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 _NO_CELLS = np.zeros((0, 0), np.float32)
@@ -50,23 +56,29 @@ class CellErrors(NamedTuple):
             a cell; see `heavy_tailed`.
         cell_noise: (rows, cols) standard normal samples of the precision of depth, shared by all views of a cell and
             correlated over a window; see `cell_scatter`.
-        dropout: (rows, cols) uniform numbers in [0, 1); a cell whose number exceeds `completeness` has no depth.
+        dropout: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which
+            is multiplied by factors for the roughness and for the image border.
         lateral_sigma_px: standard deviation of the lateral error [px].
         depths_m: (m,) ascending depths at which the next four fields and `border_width_px` are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
         cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
-        completeness: (m,) fraction of the level cells in view for which the filter provides a depth.
+        completeness: (m,) fraction of the smooth cells away from the image border for which the filter provides a
+            depth.
         error_law: decrease of the true variance with the number of keyframes.
         sigma_law: decrease of the reported variance with the number of keyframes.
         relief_error_gain: `ErrorModel.relief_error_gain`.
         relief_error_limit_px: `ErrorModel.relief_error_limit_px`.
-        edge_error_gain: `ErrorModel.edge_error_gain`.
+        edge_error: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)].
         edge_sigma_gain: `ErrorModel.edge_sigma_gain`.
         edge_half_px: `ErrorModel.edge_half_px`.
         border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
         border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
         error_scatter_share: `ErrorModel.error_scatter_share`.
+        border_distances_px: (r,) ascending distances from the image border at which the next fields are tabulated.
+        border_error: (r,) factor on the true standard deviation of depth.
+        border_sigma: (r,) factor on the reported standard deviation of depth.
+        border_edge: (r,) factor on the error near walls; see `edge_border_factor`.
     """
 
     lateral_noise: Map
@@ -84,12 +96,16 @@ class CellErrors(NamedTuple):
     sigma_law: DepthLaw = ONE_KEYFRAME
     relief_error_gain: float = 0.0
     relief_error_limit_px: float = 1.0
-    edge_error_gain: float = 0.0
+    edge_error: Array = np.zeros(2)
     edge_sigma_gain: float = 0.0
     edge_half_px: float = np.inf
     border_share: float = 0.0
     border_width_px: Array = np.ones(2)
     error_scatter_share: float = 1.0
+    border_distances_px: Array = np.array([0.0, 1.0])
+    border_error: Array = np.ones(2)
+    border_sigma: Array = np.ones(2)
+    border_edge: Array = np.ones(2)
 
 
 class ObservedCells(NamedTuple):
@@ -124,7 +140,8 @@ class MapModel:
     Attributes:
         seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
         roughness_m: (rows, cols) RMS deviation of the floor from its best-fit plane within the matching window [m].
-        edge_m: (rows, cols) roughness that causes errors near walls [m]; see `edge_roughness`.
+        edge_m: (rows, cols) strength of the edges, which causes errors near walls; see `edge_strength`. It is converted
+            from px of disparity to metres at the typical depth [m px^(-1/2)].
         window_cells: side of the matching window [cells].
         correlated_cells: side of the square over which errors are correlated [cells].
         views: (rows, cols) number of consecutive keyframes whose depths were fused in the latest height of the cell;
@@ -132,6 +149,8 @@ class MapModel:
         step_baselines: (rows, cols) RMS distance between these keyframes, in stereo baselines; 0 for one keyframe.
         border_px: (rows, cols) largest distance of the cell from the image border over consecutive keyframes, times the
             square root of their number; the maximum over all series of keyframes [px].
+        border_distance_px: (rows, cols) largest distance of the cell from the image border over the consecutive
+            keyframes of the latest height [px].
     """
 
     def __init__(
@@ -153,9 +172,11 @@ class MapModel:
         self.window_cells = max(round(window_cells), 1)
         self.correlated_cells = max(round(_CORRELATED_WINDOWS * window_cells), 1)
         self.roughness_m = roughness(height_m, window_cells)
-        self.edge_m = edge_roughness(self.roughness_m, self.steepness, window_cells)
+        per_m = np.float32(rig.focal_px * rig.baseline_m / depth_m**2)
+        self.edge_m = edge_strength(self.roughness_m * per_m, step_slope(height_m, grid.cell_m), window_cells) / per_m
         self.views, run = (np.zeros(height_m.shape, np.int16) for _ in range(2))
-        self.step_baselines, self.border_px, *rest = (np.zeros(height_m.shape, np.float32) for _ in range(4))
+        zeros = (np.zeros(height_m.shape, np.float32) for _ in range(5))
+        self.step_baselines, self.border_px, self.border_distance_px, *rest = zeros
         self._runs = _Runs(run, *rest)
         self._geotransform = (grid.west_m, grid.north_m, grid.cell_m)
         self._camera = (
@@ -228,8 +249,8 @@ class MapModel:
         depth_m = _sample_patch(
             height, variance, systematic,
             (self.height_m, self._slope, self.roughness_m, self.edge_m, self._geotransform),
-            self._runs, (self.views, self.step_baselines, self.border_px), observed[:4], next_cells,
-            step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
+            self._runs, (self.views, self.step_baselines, self.border_px, self.border_distance_px), observed[:4],
+            next_cells, step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
             estimated @ geometry.inverse(true), estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
             window_noise(shape, self.correlated_cells, rng), errors,
         )  # fmt: skip
@@ -249,7 +270,8 @@ class MapModel:
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
         """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
 
-        They cover the footprint of the image on a plane at the lowest height of the floor.
+        They cover the footprint of the image on a plane at the lowest height of the floor, or the whole grid if the
+        image (nearly) shows the horizon.
         """
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
@@ -281,6 +303,8 @@ def _window(pose, camera, geotransform, lowest, size):
 def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Generator) -> Map:
     """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are.
 
+    Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
+
     Args:
         shape: number of rows and columns.
         window_cells: side of the window [cells].
@@ -291,11 +315,11 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
 
 
 def heavy_tailed(noise: Map) -> Map:
-    """Returns n^3 / sqrt(15) for standard normal numbers n (rows, cols): zero mean, unit variance and heavy tails.
+    """Returns n |n| / sqrt(3) for standard normal numbers n (rows, cols): zero mean, unit variance and heavy tails.
 
     Dense matching resolves most cells near a wall, and assigns others, in patches, to the wrong surface.
     """
-    return np.asarray(noise**3 / np.float32(np.sqrt(15)), np.float32)
+    return np.asarray(noise * np.abs(noise) / np.float32(np.sqrt(3)), np.float32)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -310,7 +334,7 @@ def _border_of(camera, x, y, disparity):
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
     """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
 
-    Pose errors are much smaller than a cell, so only calibration errors matter here.
+    Used only with calibration errors: pose errors alone are much smaller than a cell.
     """
     x, y, z = point
     px, py, _ = _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z)
@@ -383,21 +407,54 @@ def roughness(height_m: Map, window_cells: float) -> Map:
     return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
 
 
-def edge_roughness(roughness_m: Map, steepness: Map, window_cells: float) -> Map:
-    """Returns the roughness (rows, cols) that causes errors near walls [m]; 0 where no matching window shows a wall.
+def step_slope(height_m: Map, cell_m: float) -> Map:
+    """Returns the slope (rows, cols) of the largest steps from a cell to its neighbours in x and in y [m/m].
 
-    It is the geometric mean of the roughness of the cell and of the largest roughness of the windows that contain the
-    cell: the error of a cell is large if its own window shows two surfaces, or if it is matched as its neighbours are.
+    A central difference would halve the slope of a wall between two cells.
 
     Args:
-        roughness_m: (rows, cols) roughness [m]; see `roughness`.
-        steepness: (rows, cols) magnitude of the slope of the floor [m/m]. A cell steeper than `WALL_SLOPE` is a wall.
+        height_m: (rows, cols) heights; NaN is replaced by the lowest height.
+        cell_m: side of a cell.
+    """
+    height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
+    steps = []
+    for axis in (0, 1):
+        step = np.abs(np.diff(height, axis=axis, prepend=np.nan, append=np.nan))
+        before, after = (step[:-1], step[1:]) if axis == 0 else (step[:, :-1], step[:, 1:])
+        steps.append(np.fmax(before, after))
+    return (np.hypot(*steps) / cell_m).astype(np.float32)
+
+
+def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
+    """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
+
+    It is the square root of r s, where no matching window shows a wall 0. The slope s of the cell counts because a
+    lateral displacement of the matched edge causes a height error on the face of the wall, and hardly any on level
+    floor beside it. r is the geometric mean of the roughness of the cell and of the largest roughness of the windows
+    that contain the cell: the error is large if the window of the cell shows two surfaces, or if the cell is matched as
+    its neighbours are. Dense matching resolves large structures better, hence the square root.
+
+    Args:
+        roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
+        slope: (rows, cols) slope of the cells [m/m]; see `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
         window_cells: side of the matching window in cells; rounded to an odd number, at least 3.
     """
     side = _odd(window_cells)
-    near_wall = maximum_filter(np.nan_to_num(steepness), side) > WALL_SLOPE
-    largest_m = np.asarray(maximum_filter(roughness_m, side), np.float32)
-    return np.where(near_wall, np.sqrt(roughness_m * largest_m), np.float32(0))
+    near_wall = maximum_filter(slope, side) > WALL_SLOPE
+    mean_px = np.sqrt(roughness_px * np.asarray(maximum_filter(roughness_px, side), np.float32))
+    return np.where(near_wall, np.sqrt(mean_px * np.maximum(slope, _LEAST_SLOPE)), 0).astype(np.float32)
+
+
+def edge_border_factor(border_px: Array, height_px: int) -> Array:
+    """Returns the factor on errors near walls at distances (n,) from the border of the images [px].
+
+    Towards the border, cameras see the relief from the side, and each camera sees other parts of it.
+
+    Args:
+        border_px: (n,) distances.
+        height_px: height of the images.
+    """
+    return 1 + EDGE_BORDER_SHARE * np.exp(-EDGE_BORDER_DECAY * border_px / height_px)
 
 
 def _odd(window_cells: float) -> int:
@@ -485,10 +542,10 @@ def _sample_patch(
     """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
 
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
-    the lateral error and the roughness to `systematic`.
+    the lateral error and walls to `systematic`. The mean depth is over the cells that have a height; 0 without any.
     """
     (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px) = floor, observed
-    (next_row, next_col, next_depth_m), (views, step_baselines, best_border_px) = following, fused
+    (next_row, next_col, next_depth_m), (views, step_baselines, best_border_px, border_distance_px) = following, fused
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
         y = north - (i + 0.5) * cell
@@ -503,6 +560,8 @@ def _sample_patch(
                 runs.squared_steps[i, j] += step * step
                 continue
             n_views, border = runs.views[i, j], runs.border_px[i, j] * np.sqrt(runs.views[i, j])
+            border_distance_px[i, j] = runs.border_px[i, j]
+            ring, in_ring = _interval(errors.border_distances_px, border_distance_px[i, j])
             mean_step = np.sqrt(runs.squared_steps[i, j] / max(n_views - 1, 1))
             views[i, j], step_baselines[i, j] = n_views, mean_step
             best_border_px[i, j] = max(best_border_px[i, j], border)
@@ -529,13 +588,16 @@ def _sample_patch(
             log_scale = _interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j]
             error_px = np.exp(errors.error_scatter_share * log_scale) * np.sqrt(error_share)
             error_px *= _interpolate(errors.depth_error_px, k, fraction)
+            error_px *= _interpolate(errors.border_error, ring, in_ring)
             value += per_px * error_px * depth_noise[i - row, j - col]
             relief_px = relief_error_px(rough_px, errors.relief_error_gain, errors.relief_error_limit_px)
             value += per_px * relief_px * errors.relief_noise[i, j]
-            value += errors.edge_error_gain * edge[i, j] * errors.edge_noise[i, j]
+            edge_error = _interpolate(errors.edge_error, k, fraction) * _interpolate(errors.border_edge, ring, in_ring)
+            value += edge_error * edge[i, j] / n_views**EDGE_VIEWS_EXPONENT * errors.edge_noise[i, j]
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
             sigma_px = np.exp(log_scale) * _interpolate(errors.depth_sigma_px, k, fraction)
+            sigma_px *= _interpolate(errors.border_sigma, ring, in_ring)
             variance[i - row, j - col] = sigma_share * (per_px * sigma_px) ** 2
             systematic[i - row, j - col] = surface.pose_variance(
                 x - position[0], y - position[1], z - position[2], sx, sy, cov
@@ -572,7 +634,10 @@ def _relative_variance(law, n_views, step_baselines):
 
 @njit(cache=True, nogil=True, inline="always")
 def _interval(ascending, value):
-    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it."""
+    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it.
+
+    For a value outside the table, it is the nearest end of the table.
+    """
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1

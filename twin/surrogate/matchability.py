@@ -6,6 +6,9 @@ image noise. The standard deviation of the measured shift between two patches of
 c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of the light do not move with the floor, so
 their gradients do not count: the image of a floor with the same mean albedo, but without texture, is subtracted.
 
+Lamps light the centre of the images more than their border, so the bound depends on the position in the image. Its
+ratio to the bound of the whole image is computed from light and noise, as a function of the distance from the border.
+
 In turbid water most corners of the full image are noise. The estimators then bin the images (`image_scale`), and the
 bound is that of the binned images, in their pixels.
 
@@ -43,6 +46,8 @@ from twin.surrogate.snow_noise import snow_effect, snow_poses
 _CORNERS_BOUND_PX = 0.11
 _DEPTHS = 6  # number of tabulated depths
 _LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, relative to the median of the patches
+_RINGS = 8  # number of classes of pixels by their distance from the image border
+_GRAY = 90  # albedo of the floor for `bound_ratios`, 0 to 255
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
 _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
 
@@ -58,9 +63,12 @@ class Matchability:
 
     Attributes:
         depths_m: (m,) ascending depths of the floor along the optical axis [m].
-        binning: number of pixels that the estimators average along each side of the images.
+        binning: side of the squares of pixels that the estimators average to one pixel [px].
         bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images]; infinite where marine snow
             prevents all matches.
+        border_px: (r,) distances from the nearest border of the image at which the next field is tabulated [px of the
+            binned images].
+        bound_ratios: (r,) bound at these distances, divided by that of the whole image; see `bound_ratios`.
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
             baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
@@ -80,6 +88,7 @@ class Matchability:
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
         self._set_image_scale(scenario, illumination, terrain)
+        self.border_px, self.bound_ratios = bound_ratios(scenario, illumination, self.medium_depth_m, self.binning)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
         self.lamp_share = lamp_share(scenario, illumination)
 
@@ -99,8 +108,9 @@ class Matchability:
     def _set_image_scale(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> None:
         """Sets `binning`, `bounds_px` and `clear_share`.
 
-        As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, or else
-        the best one; 1 if all bounds are infinite. Which corners are matched depends on the bound.
+        As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, i.e.
+        whose bound at the medium depth is below `_CORNERS_BOUND_PX`, or else the one with the smallest such bound; 1 if
+        these bounds are infinite.
         """
         rig, best_px = scenario.believed_rig(), np.inf
         for binning in BINNINGS:
@@ -123,7 +133,7 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.clear_share))
 
     def unevenness_at(self, depth_m: float) -> float:
-        """Returns the unevenness at a depth [m] [px of the binned images per unit of baseline / depth]."""
+        """Returns the unevenness [px of the binned images per unit of baseline / depth] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
@@ -142,7 +152,7 @@ def precision(
         illumination: optical properties of the water, and daylight in the water.
         terrain: true floor.
         depths_m: (n,) depths of the floor along the optical axis [m].
-        binning: number of pixels that are averaged along each side of the images; the bound is in binned pixels.
+        binning: side of the squares of pixels that are averaged to one pixel [px]; the bound is in binned pixels.
     """
     scenario = _with_linear_images(scenario)
     clear = _without_unmodelled_effects(scenario)
@@ -207,6 +217,49 @@ def lamp_share(scenario: Scenario, illumination: Illumination) -> float:
     return 1 - sunlit / max(both, np.finfo(float).tiny)
 
 
+def bound_ratios(
+    scenario: Scenario, illumination: Illumination, depth_m: float, binning: int = 1
+) -> tuple[Array, Array]:
+    """Returns distances (r,) from the border of the image [px], and the ratio (r,) of the bound there to the whole.
+
+    The gradients of the texture are proportional to the light that the floor reflects, so the bound is proportional to
+    the noise divided by this light. Both are averaged (RMS) over the pixels with nearly the same distance from the
+    nearest border of the image of a level floor of constant albedo. The ratio is 1 where no light returns.
+
+    Args:
+        scenario: description of the survey.
+        illumination: optical properties of the water, and daylight in the water.
+        depth_m: depth of the floor along the optical axis.
+        binning: number of pixels that are averaged along each side of the images; distances are in binned pixels.
+    """
+    scenario = _without_unmodelled_effects(_with_linear_images(scenario))
+    rig, rng = scenario.believed_rig(), np.random.default_rng(0)
+    formation = ImageFormation(scenario, illumination, None, rng)
+    depth, camera_pose = _level_floor(scenario, depth_m)
+    gray, black = (
+        formation.radiance(np.full((*depth.shape, 3), level, np.uint8), depth, 0, camera_pose) for level in (_GRAY, 0)
+    )
+    sensor = sensor_of(scenario, rig)
+    setting = sensor.meter(gray)
+    reflected = matching.gray(((gray - black) * 255 * setting.gain).astype(np.float32), binning)
+    first, second = (matching.gray(sensor.image(gray, setting, rng).astype(np.float32), binning) for _ in range(2))
+    ring = np.minimum(_border_distances(reflected.shape) * _RINGS // (min(reflected.shape) / 2), _RINGS - 1).astype(int)
+    n_pixels = np.bincount(ring.ravel(), minlength=_RINGS)
+    noise2, signal2 = (
+        np.bincount(ring.ravel(), np.square(x, dtype=np.float64).ravel(), _RINGS) for x in (first - second, reflected)
+    )
+    of_all, tiny = noise2.sum() / max(signal2.sum(), 1e-30), 1e-12 * n_pixels
+    ratios = np.sqrt((noise2 + tiny) / np.maximum(signal2, tiny) / max(of_all, 1e-12))
+    distances_px = (np.arange(_RINGS) + 0.5) * min(reflected.shape) / 2 / _RINGS
+    return distances_px, ratios if signal2.sum() > tiny.sum() else np.ones(_RINGS)
+
+
+def _border_distances(shape: tuple[int, ...]) -> Array:
+    """Returns the distance (rows, cols) of the pixels of an image from its nearest border [px]."""
+    rows, cols = (np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5 for n in shape)
+    return np.minimum(rows[:, None], cols)
+
+
 def _reflected_radiance(scenario: Scenario, illumination: Illumination) -> float:
     """Returns the radiance due to light reflected by a white floor at the planned altitude [cd/m2].
 
@@ -234,7 +287,7 @@ def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose
 def _with_linear_images(scenario: Scenario) -> Scenario:
     """Returns the scenario with a linear tone curve and the white balance of white light.
 
-    Tone curve and white balance scale texture and noise of a pixel alike.
+    Tone curve and white balance scale texture and noise of a pixel alike, so they do not change the bound.
     """
     if scenario.sensor is None:
         return scenario
@@ -298,7 +351,7 @@ def _bound_px(
     rng: np.random.Generator,
     binning: int,
 ) -> float:
-    """Returns the Cramér-Rao bound [px] for a level floor at the given depth, with the given albedo image."""
+    """Returns the Cramér-Rao bound [px of the binned images] for a level floor at a depth, with an albedo image."""
     depth, camera_pose = _level_floor(scenario, depth_m)
     radiance, smooth = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
     sensor = sensor_of(scenario, rig)
@@ -320,7 +373,8 @@ def _untextured(albedo: Image) -> Image:
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns a floor texture and its texel size [m]: that of the photos of the floor, or else a generated one.
+    """Returns a floor texture and its texel size [m]: that of the photos or of the mesh of the floor, or else a
+    generated one.
 
     Args:
         scenario: description of the survey.
@@ -328,7 +382,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
         extent_m: side length of the generated texture, limited by the size of the terrain.
     """
     t = scenario.terrain
-    if t.texture_file is not None or t.orthophoto_file is not None:
+    if t.texture_file is not None or t.orthophoto_file is not None or t.kind == "mesh":
         return terrain.texture, terrain.texture_px_m
     if t.kind == "file":
         return _painted_centre(scenario, terrain, extent_m)

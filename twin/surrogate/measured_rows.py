@@ -1,9 +1,9 @@
 """Row differences of the stereo matches of a survey with calibration errors, and the estimates computed from them.
 
 The deterministic row differences that remain after the removal of pitch, roll and row offset (`measured_view`)
-increase the scatter of the measured row differences beyond that of the noise. The estimators measure this scatter,
-increase their covariances accordingly (`stereo.row_noise_ratio`), and estimate the yaw of the right camera from the row
-differences (`epipolar_calibration`); the self-check compares both with limits.
+increase the scatter of the measured row differences beyond that of the noise. The estimators measure this scatter and
+increase their covariances accordingly (`stereo.row_noise_ratio`). They also estimate the yaw of the right camera and
+the systematic pattern of the row differences (`epipolar_calibration`), which the self-check compares with limits.
 """
 
 from __future__ import annotations
@@ -39,7 +39,11 @@ class MeasuredRows:
         self._calibration.removed = view.removed
 
     def are_matched(self, points: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the true points (n, 3) whose measured positions satisfy the epipolar constraint."""
+        """Returns the mask (n,) of the true points whose measured positions satisfy the epipolar constraint.
+
+        Args:
+            points: (n, 3) true normalised (x, y, disparity).
+        """
         left, right = self._positions_px(points)
         return stereo.satisfies_epipolar(left, right)
 
@@ -48,11 +52,12 @@ class MeasuredRows:
     ) -> tuple[StereoObservation, float]:
         """Adds the row differences of a stereo pair; returns the observation with their statistics and the noise ratio.
 
-        The noise ratio is that of `stereo.row_noise_ratio`.
+        The noise ratio is defined as in `stereo.row_noise_ratio`, but for any number of points.
 
         Args:
             observation: stereo observation of the pair, without row differences.
-            points: (n, 3) true points that are matched; they represent `observation.n_points` points.
+            points: (n, 3) true normalised (x, y, disparity) of points that are matched; they represent
+                `observation.n_points` points.
             sigma_px: standard deviation of a match in one image [px].
         """
         rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
@@ -74,7 +79,7 @@ class MeasuredRows:
         """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3).
 
         Args:
-            points: (n, 3) true points in the axes of the left camera [m].
+            points: (n, 3) true normalised (x, y, disparity).
             rows_px: (n,) row of the right image minus row of the left image [px].
             sigma_px: standard deviation of the row differences [px].
         """
@@ -87,7 +92,11 @@ class MeasuredRows:
         self._calibration.add(pair, self._rig, self._patch_px)
 
     def _positions_px(self, points: Array) -> tuple[Array, Array]:
-        """Returns the measured positions (n, 2) of true points (n, 3) in the left and the right image [px]."""
+        """Returns the measured positions (n, 2) of points in the left and the right image [px].
+
+        Args:
+            points: (n, 3) true normalised (x, y, disparity).
+        """
         measured, rows = self._view.measure(points), self._view.row_difference(points)
         centre = [self._rig.cx_px, self._rig.cy_px]
         left = np.column_stack([measured[:, 0], measured[:, 1] - rows / 2])

@@ -60,8 +60,9 @@ def sample_link(
         common_bias: true standard deviation of the common bias.
         distance_growth: growth of the true and of the reported variance in the earlier pair with distance / depth.
         common_sigma: reported standard deviation of the common bias.
-        inflation: factor on the reported covariance, because matches are correlated.
-        noise_share: variance of the noise of a point, divided by that of a single match that it represents.
+        inflation: factor on the part of the reported covariance that is due to the points.
+        noise_share: number of points divided by the number of matches that they represent: the variance of the mean of
+            independent matches that a point represents, divided by that of a single match.
 
     Returns:
         Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6).

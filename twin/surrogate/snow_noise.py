@@ -2,8 +2,8 @@
 
 A flake changes the grey levels n of a patch with gradient g along the rows. Least-squares matching then shifts the
 patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its weight, 1 / variance, is
-smaller. A patch that flakes change too much is not matched: its correlation with the same floor without these flakes is
-too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
+smaller. A patch that flakes change too much is not matched: the correlation between its two images is too low. The
+image of a flake, its defocus and the light on it are those of `imaging.snow`.
 """
 
 from __future__ import annotations

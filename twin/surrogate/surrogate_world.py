@@ -1,4 +1,7 @@
-"""Simulated world without images; vehicle, navigation sensors and floor are modelled as in `RenderedWorld`."""
+"""Simulated world without images; vehicle, navigation sensors and floor are modelled as in `RenderedWorld`.
+
+One difference: beacons are projected with the believed calibration of the cameras.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ class SurrogateWorld(World):
 
     Raises:
         ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
-            snow prevents all matches.
+            snow prevents all matches at a medium depth.
     """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, fitted: FittedErrorModel):
@@ -61,7 +64,10 @@ class SurrogateWorld(World):
             else KinematicVehicle(mission.start_of_body)
         )  # fmt: skip
         super().__init__(
-            mission, stopwatch, vehicle, NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng)
+            mission,
+            stopwatch,
+            vehicle,
+            NavigationSensors(scenario.navigation, scenario.believed_noise(), rig, rng, mission.true_cameras.project),
         )
         # `vision` must not hold a reference to `self`: the reference cycle would keep the survey in memory
         true_pose = partial(left_camera, vehicle, rig)
@@ -69,6 +75,8 @@ class SurrogateWorld(World):
         self.warnings = _extrapolations(mission, fitted, self.vision.scene.matchability)
         if mission.objects:
             self.warnings += ("The surrogate surveys the bare sea floor: it does not simulate [[objects]].",)
+        if mission.mesh_floor is not None:
+            self.warnings += ("The surrogate surveys the highest surface of the mesh: it simulates no overhangs.",)
 
     def close(self) -> None:
         """Does nothing, as there are no resources to release."""
@@ -116,7 +124,7 @@ def _refusal(quantity: QuantityOutsideFit) -> TwinError:
 
 
 def _check_matches(mission: Mission, matchability: Matchability) -> None:
-    """Raises ScenarioError if marine snow prevents all matches at a medium depth, so that they have no error."""
+    """Raises ScenarioError if marine snow prevents all matches at a medium depth."""
     if math.isfinite(matchability.medium_bound_px):
         return
     error = TwinError(

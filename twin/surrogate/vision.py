@@ -35,12 +35,13 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import CellErrors, MapModel, heavy_tailed, window_noise
+from twin.surrogate.map_model import CellErrors, MapModel, edge_border_factor, heavy_tailed, window_noise
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
+_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])  # tabulated distances from the image border, in widths of its law
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _CORNER_AREA_PX2 = 75.0  # smallest image area per detected corner, in rendered surveys
@@ -134,7 +135,7 @@ class SurrogateVision:
 
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
-        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after each keyframe.
+        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after `restart_tracking`.
         n_corners: number of points that can be matched in a keyframe without noise.
     """
 
@@ -311,7 +312,7 @@ class SurrogateVision:
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
-        """Returns the fraction of these points of the raster whose measured positions satisfy the epipolar constraint.
+        """Returns the fraction of the given raster points whose measured positions satisfy the epipolar constraint.
 
         Args:
             indices: (n,) indices of the points in the raster.
@@ -512,6 +513,7 @@ class SurrogateVision:
         depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
         binned_scatter = np.full(len(bounds_px), model.depth_binned_scatter(self.binning))
         cell_scatter = model.depth_cell_scatter(bounds_px) if self.binning == 1 else binned_scatter
+        border_px, border_factors = self._border_factors(model)
         return CellErrors(
             lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px, depths_m,
             model.depth_error.sigma_px(bounds_px, self.lamp_share) * error_factor,
@@ -519,9 +521,26 @@ class SurrogateVision:
             cell_scatter,
             np.array([model.map_completeness(b) for b in bounds_px]),
             model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
-            model.edge_error_gain, model.edge_sigma_gain, model.edge_half_px, model.border_holes.share,
-            model.border_holes.width_px(bounds_px, self.lamp_share), model.error_scatter_share,
+            np.array([model.edge_error(b) for b in bounds_px]), model.edge_sigma_gain, model.edge_half_px,
+            model.border_holes.share, model.border_holes.width_px(bounds_px, self.lamp_share),
+            model.error_scatter_share,
+            border_px, *border_factors,
         )  # fmt: skip
+
+    def _border_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
+        """Returns distances (r,) from the border of the images [px], and the factors (r,) on standard deviations there.
+
+        The factors on the true and on the reported standard deviation of depth contain the light, which depends on the
+        position in the image (`Matchability.bound_ratios`), and the truncated matching windows at the border. The third
+        factor is that on the errors near walls.
+        """
+        scene, medium_px = self.scene.matchability, self.scene.matchability.medium_bound_px
+        border_px = np.union1d(scene.border_px, model.border_error.width_px * _BORDER_STEPS)
+        at_px = medium_px * np.interp(border_px, scene.border_px, scene.bound_ratios)
+        laws = model.depth_error, model.depth_sigma
+        light = [law.sigma_px(at_px, 0.0) / law.sigma_px(medium_px, 0.0) for law in laws]
+        factors = [factor * model.border_error(border_px) for factor in light]
+        return border_px, [*factors, edge_border_factor(border_px, self.rig.height_px)]
 
     def draw_normals(self, n: int) -> Array:
         """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""

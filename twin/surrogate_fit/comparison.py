@@ -1,7 +1,7 @@
 """Statistics that compare image measurements with surrogate measurements and with the truth, for the fit.
 
 During a rendered survey, every measurement is made in the images and is also sampled by the surrogate at the same true
-poses. The statistics are ratios of the reported standard deviations (image measurement / surrogate), and errors
+poses. Most statistics are ratios of the reported standard deviations (image measurement / surrogate), or errors
 relative to the truth, normalised by reported covariances. Image and surrogate measurements have the same geometry, so
 the ratios depend on the error model alone.
 """
@@ -24,21 +24,23 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.surrogate.error_model import BinningFactors, DepthLaw, ErrorModel, ScatterLaw
+from twin.surrogate.error_model import BinningFactors, BorderErrorLaw, DepthLaw, ErrorModel, ScatterLaw, SigmaLaw
 from twin.surrogate.map_model import WALL_SLOPE
 from twin.surrogate.vision import SurrogateVision
 
 _MIN_CELLS = 200  # a statistic of height errors needs at least this many cells, a fraction of holes a tenth
 _STEEP_SLOPE = 0.6  # rise over run that level cells do not reach
 _VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells, and the end
-_ROUGH_PX = 0.25  # roughness that level cells do not reach
+ROUGH_PX = 0.25  #: roughness that smooth and level cells do not reach [px]
 #: Classes of level cells by name, with their lowest and highest roughness.
-_RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.08, _ROUGH_PX)}
+_RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.08, ROUGH_PX)}
 _EDGE = "edge"  # first part of the names of the classes of cells near walls
-_EDGE_BINS_PX = (0.05, 0.1, 0.2, 0.4, 0.8, np.inf)  # `MapModel.edge_m` of these classes
-_ROUGHNESS_BINS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
+_EDGE_BINS = (0.15, 0.3, 0.5, 0.8, 1.2, np.inf)  # `edge_strength` of these classes
+_ROUGHNESS_BINS_PX = (0.0, ROUGH_PX, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
 _BORDER_BINS_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 20.0)  # see `MapModel.border_px`
+_DISTANCE_BINS_PX = (0.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0)  # see `MapModel.border_distance_px`
 _GROSS = 5.0  # error / sigma beyond which an error counts as a gross error
+_HEAVY_P90 = 1.562  # 90th percentile of the absolute value of `map_model.heavy_tailed`
 _NORMAL_P90 = 1.2816  # 90th percentile of a standard normal variable
 _NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
 UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
@@ -196,23 +198,24 @@ class ComparisonVision:
     ) -> ElevationMap:
         """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
 
-        There are five sampled maps: one with pose errors alone, three with pose errors and one other kind of error with
-        a unit standard deviation (depth errors, lateral errors, or errors near walls), and one with all errors, of
-        the standard deviations in the error model, without their scatter between surveys.
+        There are five sampled maps: one with pose errors alone; three with pose errors and one other kind of error of
+        known size (depth errors of `UNIT_PX`, lateral errors of 1 px, or errors near walls with the gain 1); and one
+        with all errors of the error model, without the scatter of depth errors between surveys.
         """
         elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
         none = model._replace(
-            depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0, edge_error_gain=0.0,
-            edge_sigma_gain=0.0, depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0,
-            depth_ratio_scatter=0.0, depth_binned_error=BinningFactors(1.0, 1.0),
-            depth_binned_sigma=BinningFactors(1.0, 1.0), depth_binned_scatter=BinningFactors(0.0, 0.0),
+            depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0,
+            edge_error=SigmaLaw(0.0, 0.0), edge_sigma_gain=0.0, border_error=BorderErrorLaw(0.0, 1.0),
+            depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0, depth_ratio_scatter=0.0,
+            depth_binned_error=BinningFactors(1.0, 1.0), depth_binned_sigma=BinningFactors(1.0, 1.0),
+            depth_binned_scatter=BinningFactors(0.0, 0.0),
         )  # fmt: skip
         unit = _NONE._replace(floor_px=UNIT_PX)
         models = {
             "pose": none,
             "depth": none._replace(depth_error=unit, depth_sigma=unit),
             "lateral": none._replace(lateral_sigma_px=1.0),
-            "edge": none._replace(edge_error_gain=1.0, edge_sigma_gain=1.0),
+            "edge": none._replace(edge_error=SigmaLaw(1.0, 0.0), edge_sigma_gain=1.0),
             "all": model._replace(depth_survey_scatter=0.0, depth_ratio_scatter=0.0),
         }
         maps = {"images": elevation}
@@ -223,21 +226,24 @@ class ComparisonVision:
         self.statistics["metres_per_px"] = [map_model.depth_m**2 / (rig.focal_px * rig.baseline_m)]
         for name, cells in self._cell_classes().items():
             self._compare_maps(name, cells, maps)
+        self._compare_borders(maps)
         self._count_holes(elevation)
         return elevation
 
     def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
-        """Adds four statistics of a class of cells: errors and reported variances (`MAP_STATISTICS`), and a scatter.
+        """Adds four statistics of a class of cells: variance of errors, reported variance, tail ratio and scatter.
 
-        Adds none if the class has too few cells with a height in all maps.
+        The first two have the quantities `MAP_STATISTICS`. None is added if the class has too few cells with a height
+        in all maps.
 
         The reported standard deviation varies from cell to cell, and the errors of a cell are normal with a standard
         deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
         variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The variance of
         errors is that of a cell with the median sigma. Near walls, where gross errors are the subject, it is the
-        mean squared error.
+        square of the 90th percentile of the absolute errors, which a few outliers do not change.
         The third statistic is the ratio of the 90th percentile of absolute errors to the median, in the map from images
-        and in the map sampled with all errors; its logarithm exceeds that of normal errors if errors vary over cells.
+        and in the map sampled with all errors; it exceeds that of normal errors if their standard deviation varies over
+        the cells.
         The fourth one is the scatter of ln(sigma) in the class, relative to a sampled map in which depth has the
         same precision in all cells. The upper half of its distribution determines the largest errors, so it is taken
         from the median and the 90th percentile.
@@ -258,7 +264,8 @@ class ComparisonVision:
         normalised = np.abs(errors - np.median(errors, axis=1, keepdims=True)) / np.maximum(sigmas, 1e-12)
         variances = np.mean(np.square(np.minimum(normalised, _GROSS)), axis=1) * typical**2
         if name.startswith(_EDGE):
-            variances = np.mean(np.square(errors - np.median(errors, axis=1, keepdims=True)), axis=1)
+            centred = np.abs(errors - np.median(errors, axis=1, keepdims=True))
+            variances = np.square(np.percentile(centred, 90, axis=1) / _HEAVY_P90)
         reported = np.square(typical)
         names = list(maps)
         log_ratio = np.log(sigmas[names.index("images")] / sigmas[names.index("depth")])
@@ -274,20 +281,46 @@ class ComparisonVision:
         median, p90 = np.maximum(np.percentile(centred, (50, 90), axis=1), 1e-12)
         self.statistics[f"map_tail_{name}"] = (p90 / median).tolist()
 
+    def _compare_borders(self, maps: dict[str, ElevationMap]) -> None:
+        """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map.
+
+        The cells are level ones, divided by their distance from the image border. `border_error_ratio` is the ratio of
+        the medians of the absolute errors, `border_sigma_ratio` that of the medians of the reported standard
+        deviations, `border_distance_px` the median distance of the cells.
+        """
+        map_model = self.surrogate.scene.map_model
+        images, sampled = maps["images"], maps["all"]
+        steepest = np.asarray(maximum_filter(map_model.steepness, 2 * map_model.window_cells + 1))
+        level = (
+            map_model.seen
+            & (steepest <= WALL_SLOPE)
+            & (self._in_px(map_model.roughness_m) < _RELIEF_BINS_PX["rough"][1])
+        )
+        level &= np.isfinite(images.height_m) & np.isfinite(sampled.height_m)
+        for low, high in pairwise((*_DISTANCE_BINS_PX, np.inf)):
+            cells = level & (map_model.border_distance_px >= low) & (map_model.border_distance_px < high)
+            if cells.sum() < _MIN_CELLS / 2:
+                continue
+            errors = [np.median(np.abs(x.height_m - map_model.height_m)[cells]) for x in (images, sampled)]
+            sigmas = [np.median(x.sigma_m[cells]) for x in (images, sampled)]
+            self.statistics["border_error_ratio"].append(float(errors[0] / max(errors[1], 1e-12)))
+            self.statistics["border_sigma_ratio"].append(float(sigmas[0] / max(sigmas[1], 1e-12)))
+            self.statistics["border_distance_px"].append(float(np.median(map_model.border_distance_px[cells])))
+
     def _cell_classes(self) -> dict[str, np.ndarray]:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
 
         Level cells are divided by roughness and by the number of consecutive keyframes that observed them, cells near
-        walls by `MapModel.edge_m`. Other cells within a matching window of a wall or of rough cells, and cells near the
+        walls by `edge_strength`. Other cells within a matching window of a wall or of rough cells, and cells near the
         image border, belong to no class.
         """
         map_model = self.surrogate.scene.map_model
         rough = self._in_px(map_model.roughness_m)
         steepness, views, inner = map_model.steepness, map_model.views, map_model.border_px > _BORDER_BINS_PX[-1]
-        wall, edge = (rough > _ROUGH_PX) | (steepness > WALL_SLOPE), self._in_px(map_model.edge_m)
+        wall, edge = (rough > ROUGH_PX) | (steepness > WALL_SLOPE), self._in_px(map_model.edge_m)
         plain = inner & ~np.asarray(maximum_filter(wall, 2 * map_model.window_cells + 1), np.bool_)
         classes = {"steep": plain & (steepness > _STEEP_SLOPE) & (rough < _RELIEF_BINS_PX["smooth"][1])}
-        for low, high in pairwise(_EDGE_BINS_PX):
+        for low, high in pairwise(_EDGE_BINS):
             classes[f"{_EDGE}{low:g}"] = inner & (edge >= low) & (edge < high)
         for name, (smoothest, roughest) in _RELIEF_BINS_PX.items():
             level = plain & (steepness < _STEEP_SLOPE) & (rough >= smoothest) & (rough < roughest)
@@ -303,13 +336,13 @@ class ComparisonVision:
     def _count_holes(self, elevation: ElevationMap) -> None:
         """Adds the number of observed cells and the fraction with a height, by roughness and by distance from borders.
 
-        The numbers by distance from the border of the images count smooth cells only; those by roughness count cells
-        far from the border only.
+        The median roughness or distance of each bin is added too. The numbers by distance from the border of the images
+        (`MapModel.border_px`) count smooth cells only; those by roughness count cells far from the border only.
         """
         map_model = self.surrogate.scene.map_model
         roughness = self._in_px(map_model.roughness_m)
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)
-        inner, smooth = seen & (border > _BORDER_BINS_PX[-1]), seen & (roughness < _ROUGH_PX)
+        inner, smooth = seen & (border > _BORDER_BINS_PX[-1]), seen & (roughness < ROUGH_PX)
         for name, values, cells, bins in (
             ("hole", roughness, inner, _ROUGHNESS_BINS_PX), ("border", border, smooth, _BORDER_BINS_PX),
         ):  # fmt: skip
@@ -324,7 +357,8 @@ class ComparisonVision:
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
     """Returns two error models for links: "patches" without errors due to relief, "relief" with these errors alone.
 
-    The other parameters are those of `model`.
+    In "patches", the match error ratio is 1, without growth under lamps, and the bias fraction is `BIAS_FRACTION`; in
+    "relief", the relief gain is `RELIEF_GAIN`. The parameters that are not changed are those of `model`.
     """
     return {
         "patches": model._replace(

@@ -3,7 +3,7 @@
 The functions that model reported standard deviations (`SigmaLaw`) are fitted to the ratios of the standard deviations
 reported for image measurements to those reported by the surrogate. The error ratios are fitted to squared errors
 normalised by the reported covariance. Medians and trimmed means make the fit robust against a few failed measurements.
-Every survey has the same weight, except in the fit of `match_bias_fraction`.
+Every survey has the same weight, except in the fits of `match_bias_fraction`, `edge_half_px` and the laws of depth.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from twin.surrogate.error_model import (
     BinningFactors,
+    BorderErrorLaw,
     BorderLaw,
     DepthLaw,
     ErrorModel,
@@ -25,15 +26,16 @@ from twin.surrogate.error_model import (
 )
 from twin.surrogate.map_model import relief_error_px
 from twin.surrogate.vision import match_sigma_px
-from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, UNIT_PX
+from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN, ROUGH_PX, UNIT_PX
 
 _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute value
-_PRIOR = 0.01  # weight of the departure of a parameter from the compared model's, relative to it or to a typical value
+_PRIOR = 0.01  # weight of the relative departure of a parameter from its value in the compared model
 _HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a bin of cells has less weight
 _OUTLIER = 0.3  # residual of the logarithm of a standard deviation beyond which it has less weight
 _LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # statistics of cells without edges
 _LEVEL_TAILS = ("map_tail_smooth", "map_tail_rough")
 _NORMAL_TAIL = 2.4387  # 90th percentile of the absolute value of a normal variable, divided by the median
+_FAR_PX = 20.0  # distance from the image border beyond which matching windows are complete
 _SOURCES = ("images", "patches", "relief")
 
 #: Samples of each statistic of one survey, by name; see `ComparisonVision.statistics`.
@@ -42,6 +44,8 @@ SurveyStatistics = Mapping[str, Sequence[float]]
 
 def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> ErrorModel:
     """Returns the error model that reproduces the statistics of rendered surveys.
+
+    `match_parallax_px` and `common_bias_px` are not fitted; they are those of the compared model.
 
     Args:
         surveys: statistics of each survey; all of them complete (`rendered_surveys.fit_to_surveys`).
@@ -67,7 +71,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     links = _fit_link_errors(surveys, median("match_sigma_ratio"), median("lamp_share"), compared)
     errors, reported = (_fit_map_variances(surveys, quantity, compared) for quantity in ("error", "sigma"))
     cell_scatter, binned_scatter = _fit_cell_scatter(surveys, compared.depth_cell_scatter)
-    known_fractions = np.array([s["hole_known"][0] for s in surveys])
+    completeness = _fit_completeness(surveys, compared.map_completeness)
     compared_fractions = np.array([compared.match_fraction(b) * compared.point_fraction(b) for b in bounds])
     match_fractions = _matched_without_relief(surveys) * compared_fractions / median("point_fraction")
     mosaic_chi2 = median("mosaic_difference_nees") - compared.mosaic_error_ratio**2
@@ -99,12 +103,13 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         depth_survey_scatter=_robust_scatter(reported.departures),
         depth_ratio_scatter=_robust_scatter(errors.departures - reported.departures),
         lateral_sigma_px=errors.lateral_sigma_px,
-        map_completeness=_fit_fraction_law(bounds, known_fractions, _HOLE_OUTLIER / 10),
-        border_holes=_fit_border_holes(surveys),
+        border_error=_fit_border_errors(surveys, compared.border_error),
+        map_completeness=completeness,
+        border_holes=_fit_border_holes(surveys, compared.border_holes),
         relief_error_gain=errors.relief_gain,
         relief_error_limit_px=errors.relief_limit_px,
-        edge_error_gain=errors.edge_gain,
-        edge_sigma_gain=reported.edge_gain,
+        edge_error=errors.edge,
+        edge_sigma_gain=reported.edge.floor_px,
         edge_half_px=_fit_edge_holes(surveys, compared.edge_half_px),
         mosaic_error_ratio=float(np.sqrt(np.median(np.maximum(mosaic_chi2, 0.01) / median("mosaic_sigma_ratio") ** 2))),
     )
@@ -318,14 +323,33 @@ def _matched_without_relief(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
     return np.array(ratios)
 
 
+def _known_smooth_fraction(statistics: SurveyStatistics) -> float | None:
+    """Returns the fraction of the smooth cells away from image borders with a height; None without such cells."""
+    if not len(statistics.get("hole_px", ())) or statistics["hole_px"][0] >= ROUGH_PX:
+        return None
+    return max(statistics["hole_known"][0], 1e-6)
+
+
+def _fit_completeness(surveys: Sequence[SurveyStatistics], compared: FractionLaw) -> FractionLaw:
+    """Fits `map_completeness` to the surveys with smooth cells; returns the compared law if there are none."""
+    rows = [(np.median(s["bound_px"]), known) for s in surveys if (known := _known_smooth_fraction(s)) is not None]
+    if not rows:
+        return compared
+    bounds, known = np.array(rows).T
+    return _fit_fraction_law(bounds, known, _HOLE_OUTLIER / 10)
+
+
 def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> float:
     """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey.
 
-    Returns the value of the compared model if no survey has rough cells.
+    Surveys without smooth cells do not take part. Returns the value of the compared model if no other survey has rough
+    cells.
     """
-    roughness, fractions, weights = [], [], []
+    roughness, fractions, weights = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for s in surveys:
-        known = np.array(s["hole_known"]) / max(s["hole_known"][0], 1e-6)
+        if (smooth := _known_smooth_fraction(s)) is None:
+            continue
+        known = np.array(s["hole_known"]) / smooth
         roughness.append(np.array(s["hole_px"])[1:])
         fractions.append(np.minimum(known[1:], 1.0))
         weights.append(np.sqrt(np.array(s["hole_cells"])[1:] / np.sum(s["hole_cells"])))
@@ -337,20 +361,50 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
     return float(half[np.argmin(misfit)])
 
 
-def _fit_border_holes(surveys: Sequence[SurveyStatistics]) -> BorderLaw:
+def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErrorLaw) -> BorderErrorLaw:
+    """Fits the `BorderErrorLaw` to errors and reported standard deviations of level cells near the image borders.
+
+    They are divided by those of the map sampled from the compared model, and by the median of these ratios over the
+    cells of the survey farther than `_FAR_PX` from the border. Residuals are differences of logarithms; large ones have
+    less weight. The result is the compared law if no survey has cells near the border.
+    """
+    rows = []
+    for s in surveys:
+        distance = np.array(s.get("border_distance_px", ()))
+        far = distance > _FAR_PX
+        for name in ("border_error_ratio", "border_sigma_ratio") if far.any() else ():
+            logs = np.log(s[name])
+            rows += list(zip(distance[~far], logs[~far] - np.median(logs[far]), strict=True))
+    if not rows:
+        return compared
+    distance, log_ratio = np.array(rows).T
+    target = log_ratio + np.log(compared(distance))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.log(BorderErrorLaw(*x)(distance)) - target
+
+    limits = [0.0, 0.5], [10.0, 20.0]
+    x = least_squares(residuals, [1.0, 3.0], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
+    return BorderErrorLaw(*x.tolist())
+
+
+def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) -> BorderLaw:
     """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border.
 
-    The fractions are relative to the cells of the same survey away from the border. Every survey has the same weight.
+    The fractions are relative to the smooth cells of the same survey away from the border. Every survey with such cells
+    has the same weight; without any, the result is the compared law.
     """
     rows: list[tuple[float, ...]] = []
     for s in surveys:
+        if (smooth := _known_smooth_fraction(s)) is None:
+            continue
         cells = np.array(s.get("border_cells", ()))
         for distance, known, weight in zip(s.get("border_px", ()), s.get("border_known", ()), cells, strict=True):
-            hole = 1 - min(known / max(s["hole_known"][0], 1e-6), 1.0)
+            hole = 1 - min(known / smooth, 1.0)
             conditions = float(np.median(s["bound_px"])), float(np.median(s["lamp_share"]))
             rows.append((distance, hole, float(np.sqrt(weight / cells.sum())), *conditions))
     if not rows:
-        return BorderLaw(0.0, 1.0, 0.0, 0.0)
+        return compared
     distance, hole, weight, bounds, lamps = np.array(rows).T
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -367,9 +421,9 @@ class _MapErrors(NamedTuple):
     Args:
         depth: law of the standard deviation of depth.
         lateral_sigma_px: standard deviation of the lateral shift [px].
-        relief_gain: standard deviation per roughness of a cell.
-        relief_limit_px: limit of this standard deviation for large roughness [px].
-        edge_gain: standard deviation per `map_model.edge_roughness`.
+        relief_gain, relief_limit_px: gain, and limit [px of disparity], of the error due to relief
+            (`map_model.relief_error_px`).
+        edge: law of the standard deviation per `map_model.edge_strength`.
         departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
             classes of cells, because a class may consist of a few cells at one spot of the floor.
         binned: factors due to binning, the medians of measured / modelled values over the surveys with binned images;
@@ -380,7 +434,7 @@ class _MapErrors(NamedTuple):
     lateral_sigma_px: float
     relief_gain: float
     relief_limit_px: float
-    edge_gain: float
+    edge: SigmaLaw
     departures: np.ndarray
     binned: BinningFactors
 
@@ -397,7 +451,8 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     Variances do not simply add up: the map computes part of its variance from the heights around a cell, whose errors
     count as relief. The model variance is therefore multiplied by the ratio of the variance in the map sampled from
     the compared model to the model variance with the compared parameters. Repeated fits converge, each with the
-    result of the former as compared model. Residuals are differences of logarithms; every survey has the same weight.
+    result of the former as compared model. Residuals are differences of logarithms. Surveys without binning have the
+    same weight; those with binned images have none, and only their binning factors are computed.
 
     Args:
         surveys: statistics of n surveys.
@@ -423,15 +478,16 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
         depth_px2 = law.sigma_px(bounds, lamps) ** 2 * law.relative_variance(views, step)
         relief_px2 = relief_error_px(rough, x[7], x[8]) ** 2
         common = metres_per_px**2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
-        return pose + per_px2 * depth_px2 + common + x[9] ** 2 * of_edge
+        return pose + per_px2 * depth_px2 + common + (x[9] ** 2 + (x[10] * bounds) ** 2) * of_edge
 
-    gains = (compared.relief_error_gain, compared.relief_error_limit_px, compared.edge_error_gain)
-    gains = gains if is_error else (*gains[:2], compared.edge_sigma_gain)
+    edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
+    gains = (compared.relief_error_gain, compared.relief_error_limit_px, *edge_law)
     law = compared.depth_error if is_error else compared.depth_sigma
-    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.01, 0.0])
-    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 5.0, 3.0, 1.0, 10.0])
-    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 0.2, 0.5, 0.05, 1.0])
-    start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + 1e-3, highest - 1e-3)
+    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.01, 0.0, 0.0])
+    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 5.0, 3.0, 1.0, 10.0, 200.0 if is_error else 1e-6])
+    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 0.2, 0.5, 0.05, 1.0, 10.0])
+    margin = np.minimum(1e-3, (highest - lowest) / 4)
+    start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + margin, highest - margin)
 
     binned = compared.depth_binned_error if is_error else compared.depth_binned_sigma
     by_image = binning[numbers]
@@ -450,7 +506,8 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     factors = [float(np.median(departures[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
     departures -= np.select([by == 2, by == 4], factors, 0.0)
     x = found.x.tolist()
-    return _MapErrors(DepthLaw(*x[:6]), *x[6:], departures=departures, binned=BinningFactors(*np.exp(factors).tolist()))
+    binned_factors = BinningFactors(*np.exp(factors).tolist())
+    return _MapErrors(DepthLaw(*x[:6]), x[6], x[7], x[8], SigmaLaw(*x[9:]), departures, binned_factors)
 
 
 def _robust_scatter(departures: np.ndarray) -> float:

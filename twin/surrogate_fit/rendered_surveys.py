@@ -40,8 +40,8 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     """Returns the error model fitted to rendered surveys.
 
     Args:
-        surveys: statistics of each survey. Surveys without link or map statistics, e.g. aborted ones, only show which
-            surveys are lost.
+        surveys: statistics of each survey. The model is fitted to the complete ones (`_is_complete`). Lost surveys
+            (`_is_lost`) may remove the upper limit of the range of the Cramér-Rao bound.
         compared: error model of the surrogate with which the surveys were compared.
 
     Raises:
@@ -58,7 +58,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 def comparison_model(model: ErrorModel) -> ErrorModel:
     """Returns an error model whose fractions of matched points do not decrease with the Cramér-Rao bound.
 
-    Every measurement in images then has a sampled one.
+    Measurements in images of turbid water then have sampled ones too.
     """
     points, matches = (law._replace(half_px=_NEVER_PX) for law in (model.point_fraction, model.match_fraction))
     return model._replace(point_fraction=points, match_fraction=matches)
@@ -128,7 +128,7 @@ def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) ->
     """Returns the statistics of a rendered survey's comparison with the surrogate.
 
     Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey. A
-    survey whose water is too turbid for any matches is not flown, and has no statistics.
+    survey whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown, and has no statistics.
 
     Args:
         scenario: description of the survey.
@@ -149,7 +149,10 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
 
 
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted."""
+    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted.
+
+    A survey whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown; its statistics are empty and not saved.
+    """
     mission, stopwatch = prepare(scenario), Stopwatch()
     matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
     conditions = survey_conditions(mission, matchability)

@@ -1,4 +1,4 @@
-"""Clearance of a planned path at constant height or constant altitude above the floor."""
+"""Points of a planned path, and its clearance at constant height or constant altitude above the floor."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ from scipy.ndimage import maximum_filter
 from controllers.forecast import Clearance, least_clearance
 from controllers.survey_plan import SurveyPlan
 from terrains import Terrain
+from twin.core.geometry import Array
+
+
+def path_points(plan: SurveyPlan) -> Array:
+    """Returns the planned positions (n, 3) of the left camera at all frames, without station keeping [m]."""
+    tracks = range(1, plan.n_tracks + 1)
+    return np.concatenate([plan.references(t, plan.frames_of_track(t)[0]).position for t in tracks])
 
 
 def planned_clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
@@ -23,9 +30,7 @@ def planned_clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
     footprint_m = (np.hypot(across_m, along_m),) * 2 if turned else (across_m, along_m)  # along y and x
     sides = [2 * round(side / 2 / terrain.spacing_m) + 1 for side in footprint_m]
     nearby = maximum_filter(terrain.height_m, sides, mode="nearest")
-    tracks = range(1, plan.n_tracks + 1)
-    path = np.concatenate([plan.references(t, plan.frames_of_track(t)[0]).position for t in tracks])
-    x, y, z = path.T
+    x, y, z = path_points(plan).T
     inside = bool(np.isfinite(terrain.height_at(x, y)).all())
     cols = np.clip(np.rint((x - terrain.west_m) / terrain.spacing_m), 0, terrain.height_m.shape[1] - 1).astype(int)
     rows = np.clip(np.rint((y - terrain.south_m) / terrain.spacing_m), 0, terrain.height_m.shape[0] - 1).astype(int)

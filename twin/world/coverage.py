@@ -22,8 +22,9 @@ class Coverage:
     """Observed cells of a grid.
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
-    left image, and both cameras see these points. With objects, the quad must also reach the surface seen from above:
-    floor that the cameras see below an overhang is not observed, as the map has the height of the overhang there.
+    left image, both cameras see these points, and there is no depth edge between them. With objects, the quad must also
+    reach the surface seen from above: floor that the cameras see below an overhang is not observed, as the map has the
+    height of the overhang there.
 
     Args:
         grid: grid of the map.

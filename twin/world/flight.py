@@ -55,12 +55,12 @@ class Flight:
 
         Args:
             command: (8,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
-            pace: pace along the planned path from this frame to the next.
+            pace: pace along the planned path from this frame to the next; no effect during station keeping.
             keyframe: whether the next frame is a keyframe, with both images; None: as planned.
 
         Raises:
             RuntimeError: an earlier call returned None.
-            SurveyAborted: the physics diverged.
+            SurveyAborted: the command is not finite, or the physics diverged.
         """
         if self._k == len(self._sequence):
             raise RuntimeError("all frames of the plan have been flown; reset starts another flight")

@@ -49,7 +49,8 @@ class FloorForecast:
         along_position_m, across_position_m: (k, 2) and (j, 2) horizontal midpoint of the two cameras of each pair [m].
         overlap_along: (k,) overlap of consecutive keyframes of the same swath.
         overlap_across: (j,) sidelap: overlap of a keyframe with the image abreast of it on the next swath.
-        coverage: share of the asked area that both cameras see in at least one keyframe.
+        coverage: share of the asked area that both cameras see in at least one keyframe, approximated with depth images
+            of fewer pixels.
     """
 
     keyframes: KeyframePoses
@@ -86,10 +87,10 @@ def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedO
 
 
 def forecast_over_floor(mission: Mission) -> FloorForecast:
-    """Computes the forecast of a mission by casting rays from the planned keyframes to the floor.
+    """Returns the forecast of a mission, computed by casting rays from the planned keyframes to the floor.
 
-    The cameras look straight down from the planned positions. Lens distortion, the port and calibration errors are
-    neglected.
+    The cameras look straight down from the planned positions. Objects, lens distortion, the port and calibration errors
+    are neglected.
     """
     rig, field = mission.rig, floor_of(mission.terrain)
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)

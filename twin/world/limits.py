@@ -1,4 +1,4 @@
-"""Limits on the size of a survey, checked before anything is allocated."""
+"""Limits on the size of a survey, checked before memory for it is allocated."""
 
 from __future__ import annotations
 

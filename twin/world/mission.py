@@ -20,14 +20,16 @@ from twin.errors import ScenarioError, TwinError
 from twin.imaging.illumination import Illumination, illumination_of
 from twin.imaging.lamps import light_sources_in_camera
 from twin.imaging.lens_psf import NEAREST_FOCUS_M
+from twin.imaging.object_view import Objects
 from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.judge.metrics import check_require
 from twin.plugin.guard import check_loadable, terrain_heights
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source, TerrainConfig
 from twin.simulate.autopilot import top_speed_mps
-from twin.world.clearance import planned_clearance
+from twin.world.clearance import path_points, planned_clearance
 from twin.world.limits import check_map_size
+from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import check_path, load_objects
 from twin.world.pace import SAME_TIME_S, Pace
 from twin.world.planning import plan_survey
@@ -88,13 +90,14 @@ class Mission:
 
     Args:
         scenario: description of the survey.
-        terrain: sea floor.
+        terrain: sea floor; of a mesh, its highest surface.
         plan: planned path.
         rig: calibration that the estimators use.
         grid: cells of the map.
         true_cameras: true parameters of the cameras.
         illumination: optical properties of the water, and daylight.
         objects: objects on the sea floor.
+        mesh_floor: the sea floor if it is a mesh, else None.
     """
 
     scenario: Scenario
@@ -105,6 +108,19 @@ class Mission:
     true_cameras: TrueCameras
     illumination: Illumination
     objects: tuple[PlacedObject, ...] = ()
+    mesh_floor: MeshFloor | None = None
+
+    @property
+    def rendered_terrain(self) -> terrains.Terrain:
+        """Returns the height grid that is rendered: the sea floor, or what lies below a mesh floor."""
+        return self.terrain if self.mesh_floor is None else self.mesh_floor.under
+
+    def rendered_objects(self) -> Objects | None:
+        """Returns the objects and the tiles of a mesh floor that are rendered; None if there are none."""
+        if not self.objects and self.mesh_floor is None:
+            return None
+        tiles = None if self.mesh_floor is None else self.mesh_floor.tiles
+        return Objects(self.objects, np.array(self.scenario.current.velocity_mps), tiles)
 
     @property
     def start(self) -> Array:
@@ -169,14 +185,19 @@ class Mission:
 
 
 def prepare(scenario: Scenario) -> Mission:
-    """Loads the floor of a scenario, plans the survey, and checks the scenario and the plan.
+    """Returns the mission of a scenario: loads its floor and objects, plans the survey, and checks all of them.
 
     Raises:
         ScenarioError: the survey cannot be flown; the error lists every reason with file and line.
     """
     errors: list[str] = []
     source = scenario.source
-    terrain = _attempt(lambda: load_terrain(scenario), source, errors)
+    mesh_floor = None
+    if scenario.terrain.kind == "mesh":
+        mesh_floor = _attempt(lambda: load_mesh_floor(scenario), source, errors)
+        terrain = mesh_floor and mesh_floor.terrain
+    else:
+        terrain = _attempt(lambda: load_terrain(scenario), source, errors)
     plan = _attempt(lambda: plan_survey(scenario, terrain), source, errors)
     _attempt(lambda: _check_plugins(scenario), source, errors)
     _attempt(lambda: _check_speed(scenario), source, errors)
@@ -208,7 +229,9 @@ def prepare(scenario: Scenario) -> Mission:
         grid = _attempt(lambda: _grid(scenario, plan, terrain), source, errors)
     if errors or terrain is None or plan is None or grid is None or true_cameras is None or illumination is None:
         raise ScenarioError(errors)
-    return Mission(scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects)
+    return Mission(
+        scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects, mesh_floor
+    )
 
 
 def _attempt(build, source: Source, errors: list[str]):
@@ -221,13 +244,16 @@ def _attempt(build, source: Source, errors: list[str]):
 
 
 def load_terrain(scenario: Scenario) -> terrains.Terrain:
-    """Generates or reads the floor of a scenario.
+    """Returns the floor of a scenario, generated or read from its files.
 
     Raises:
-        TwinError: the floor cannot be generated or read.
+        TwinError: the floor cannot be generated or read, or a key of the section `terrain` has no effect on it.
     """
     t = scenario.terrain
     _check_texture_keys(t)
+    if t.kind == "mesh":
+        return load_mesh_floor(scenario).terrain
+    _check_mesh_keys(t)
     if t.kind != "file":
         given = [key for key in ("height_file", "texture_file", "orthophoto_file", "z") if getattr(t, key)]
         if given:
@@ -259,11 +285,18 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
 
 
 def _check_texture_keys(t: TerrainConfig) -> None:
-    """Raises TwinError if a floor with a photo has materials, or one without a photo has a way of tiling photos."""
+    """Raises TwinError if `cover` is set together with a photo, or `texture_tiling` is not the default without one."""
     if t.texture_file is not None and t.cover is not None:
         raise TwinError("terrain.cover", "has no effect on a floor with terrain.texture_file", "one of the two")
     if t.texture_file is None and t.texture_tiling != TerrainConfig.model_fields["texture_tiling"].default:
         raise TwinError("terrain.texture_tiling", "has no effect without a photo", "with terrain.texture_file")
+
+
+def _check_mesh_keys(t: TerrainConfig) -> None:
+    """Raises TwinError if a floor that is no mesh has keys of a mesh."""
+    for key in ("mesh_file", "mesh_up", "mesh_scale"):
+        if getattr(t, key) != TerrainConfig.model_fields[key].default:
+            raise TwinError(f"terrain.{key}", f"has no effect on terrain.kind = {t.kind!r}", 'terrain.kind = "mesh"')
 
 
 def _check_plugins(scenario: Scenario) -> None:
@@ -354,7 +387,7 @@ def _check_exposure(sensor: SensorConfig) -> None:
 
 
 def _check_white_balance(sensor: SensorConfig) -> None:
-    """Raises TwinError if gains or a colour temperature are set that the white balance does not use."""
+    """Raises TwinError if gains or a colour temperature are set, but not used by the white balance."""
     unused = {"white_gains": "gains", "white_temperature_k": "temperature"}
     for key, mode in unused.items():
         if getattr(sensor, key) != SensorConfig.model_fields[key].default and sensor.white_balance != mode:
@@ -446,13 +479,6 @@ def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
 
 
 def _widest(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
-    """Returns an upper bound of the size of the footprints, as a multiple of the footprint at `plan.altitude_m`.
-
-    For a path at constant height, the floor is taken to lie at or above the reference plane.
-    """
-    if plan.surface is None:
-        return 1.0
-    highest_m = max(
-        plan.references(t, plan.frames_of_track(t)[0]).position[:, 2].max() for t in range(1, plan.n_tracks + 1)
-    )
+    """Returns an upper bound of the size of the footprints, as a multiple of the footprint at `plan.altitude_m`."""
+    highest_m = plan.altitude_m if plan.surface is None else path_points(plan)[:, 2].max()
     return max(1.0, float(highest_m - terrain.lowest_m) / plan.altitude_m)

@@ -14,9 +14,9 @@ from terrains.objects.mesh_file import read_mesh
 from terrains.objects.model import ObjectModel, PlacedObject, model_of
 from terrains.objects.placement import disc_of, place
 from terrains.objects.shapes import SHAPES, build_shape
-from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
+from twin.world.clearance import path_points
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
 SHAPE_SIZE_M = 0.4  #: size of a built-in shape without `size_m`
@@ -50,14 +50,15 @@ def _entry(
 ) -> list[PlacedObject]:  # fmt: skip
     """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet.
 
-    Raises TwinError if the entry is invalid.
-
     Args:
         number: number of the entry, from 0.
         config: the entry.
-        models: models built so far, by shape, mesh file, colour and variant.
+        models: models built so far, by shape, mesh file and its upward axis, colour, width of a pipe, and variant.
         found: objects placed so far, which scattered objects do not overlap.
         world: terrain, and seed of the scenario.
+
+    Raises:
+        TwinError: the entry is invalid, or there are more triangles or objects than `MAX_FACES` or `MAX_OBJECTS`.
     """
     _check_keys(number, config)
     terrain, seed = world
@@ -78,7 +79,11 @@ def _entry(
 
 
 def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -> tuple[ObjectModel, ...]:
-    """Returns the shapes of an entry: the given variant of a built-in shape, or all variants if `variant` is None."""
+    """Returns the models of an entry: that of its mesh file, or the given variant of a built-in shape (None: all).
+
+    Raises:
+        TwinError: the mesh file cannot be read.
+    """
     if config.shape == "mesh":
         assert config.mesh_file is not None
         file = Path(config.mesh_file)
@@ -94,12 +99,12 @@ def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -
 
 
 def _pipe_width(config: ObjectConfig) -> float:
-    """Returns the width of a pipe as a fraction of its length; 0 where it is not given."""
+    """Returns the width of a pipe as a fraction of its length; 0 if it is not given."""
     return (config.width_m or 0.0) / (config.size_m or SHAPE_SIZE_M)
 
 
 def _check_keys(number: int, config: ObjectConfig) -> None:
-    """Raises TwinError for keys that are missing, or have no effect on this kind of object."""
+    """Raises TwinError for keys that are missing or have no effect on the object, and for a pipe wider than long."""
     field = f"objects.{number}"
     if config.shape == "mesh" and config.mesh_file is None:
         raise TwinError(f"{field}.mesh_file", "missing", 'a mesh, as shape is "mesh"')
@@ -127,11 +132,12 @@ def _unused_keys(config: ObjectConfig) -> list[str]:
 def check_path(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
     """Raises TwinError if the vehicle comes too close to an object on its planned path.
 
-    The object must be `clearance_m` below the cameras wherever the vehicle is above it.
+    The highest corner of the bounding box of an object must be `clearance_m` below the cameras wherever the vehicle is
+    above the circle around this box.
     """
     if not objects:
         return
-    path = _path_points(plan)
+    path = path_points(plan)
     for item in objects:
         disc, top_m = disc_of(item), item.corners_m()[:, 2].max()
         away = np.hypot(path[:, 0] - disc.x_m, path[:, 1] - disc.y_m) - disc.radius_m - VEHICLE_REACH_M
@@ -144,9 +150,3 @@ def check_path(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: f
                 f" z {top_m:.2f} m, the cameras are at {path[k, 2]:.2f} m",
                 f"objects at least {clearance_m:g} m below the cameras (plan.clearance_m)",
             )
-
-
-def _path_points(plan: SurveyPlan) -> Array:
-    """Returns points (n, 3) of the planned path, one per frame."""
-    tracks = range(1, plan.n_tracks + 1)
-    return np.concatenate([plan.references(t, plan.frames_of_track(t)[0]).position for t in tracks])

@@ -26,7 +26,7 @@ class Pace(NamedTuple):
     keyframe: bool = False
 
     def path_times(self, last_s: float, end_s: float, interval_s: float) -> Array:
-        """Returns the path times of the next frames [s]: one frame, or at full pace all up to the end of the track.
+        """Returns the path times (n,) of the next frames [s]: one frame, or at full pace all to the end of the track.
 
         Args:
             last_s: path time of the last frame flown.

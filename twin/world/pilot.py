@@ -36,8 +36,8 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
 
     A prediction contains no information on the deviation of the vehicle from its path. If the pilot corrects a
     predicted deviation, the true vehicle moves by it, and no measurement reveals this motion. The attitude is always
-    kept, the height if it was measured by pressure. The estimate is returned unchanged if its motion was measured or a
-    DVL reading is available.
+    kept; height and vertical velocity are kept if there is a reading of the pressure sensor. The estimate is returned
+    unchanged if its motion was measured or a DVL reading is available.
 
     Args:
         estimate: estimate of a frame.

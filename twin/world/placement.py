@@ -87,11 +87,15 @@ def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
 
 
 def read_geojson(file: Path, terrain: Terrain) -> Array:
-    """Reads a polygon from a GeoJSON file; returns its corners (n, 2) in the scene [m].
+    """Returns the corners (n, 2) of the polygon in a GeoJSON file, in the scene [m].
 
     The coordinates are in the CRS that the member "crs" names. In a file without this member they are longitude and
     latitude (RFC 7946) if the DEM names its CRS, all of them lie within +-180 and +-90 degrees and, read in the CRS of
     the DEM, no corner lies on the DEM; otherwise they are in the CRS of the DEM.
+
+    Args:
+        file: the GeoJSON file.
+        terrain: the floor, which determines the position of the scene in the CRS of the DEM.
 
     Raises:
         TwinError: the file cannot be read or does not contain exactly one polygon without holes, its coordinates cannot
@@ -102,7 +106,7 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
             raise TwinError("plan.polygon", f"{file.name!r} is too large", f"at most {_MAX_GEOJSON_BYTES} bytes")
         tree = json.loads(file.read_text(encoding="utf-8"))
         corners = np.array(_ring(tree, file), np.float64)[:, :2]
-    except (OSError, ValueError, TypeError, IndexError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise TwinError("plan.polygon", f"{file.name!r} cannot be read: {error}", _ONE_POLYGON) from None
     if not np.isfinite(corners).all():
         raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _ONE_POLYGON)

@@ -27,7 +27,7 @@ _PAIRS = 250
 _ITERATIONS = 25
 #: Relative tolerance of 1 - overlap.
 _TOLERANCE = 0.005
-#: Least `along_scale` and `across_scale` of a request: footprint on the floor relative to that on the reference plane.
+#: Least `along_scale` and `across_scale` of a request: spacing relative to that over the reference plane.
 _LEAST_SCALE = 0.05
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
@@ -43,20 +43,20 @@ class NonOverlap(NamedTuple):
 
 
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
-    """Plans the survey of a scenario; adapts height and spacing to the floor if the scenario asks for it.
+    """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
     Args:
         scenario: description of the survey.
         terrain: its floor; None: the survey is planned over the reference plane.
 
     Raises:
-        TwinError: no plan satisfies the scenario.
+        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `limits.check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     level = _PATTERNS[pattern](request)
     check_plan_size(scenario, level)
     if terrain is None or not _lies_over(level, terrain):
-        return level  # `prepare` reports that the path leaves the terrain
+        return level  # `prepare` reports that the path leaves the terrain or has too little clearance
     if scenario.plan.height == "floor":
         request = request._replace(surface=_surface(scenario, request, terrain))
     if scenario.plan.overlap_reference == "floor":
@@ -116,12 +116,12 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     """Returns the request with `along_scale` and `across_scale` reduced until the overlap over the floor suffices.
 
     The overlap suffices if all but SHORT_PERCENT of the pairs of keyframes, both along and across the swaths, have at
-    least the smaller of the required overlap and the overlap of the same plan over the reference plane. The scales
-    start at 1 and are repeatedly multiplied by the ratio of the allowed to the actual value of 1 - overlap. On a floor
-    at the reference plane they stay 1.
+    least the smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT of the pairs have over
+    the reference plane in the plan with scales of 1 at constant height. The scales start at 1 and are repeatedly
+    multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
 
     Raises:
-        TwinError: no spacing gives enough overlap.
+        TwinError: no spacing with scales of at least `_LEAST_SCALE` gives enough overlap.
     """
     make = _PATTERNS[pattern]
     whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request
@@ -153,7 +153,7 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
 
 
 def _n_whole(request: SurveyRequest, pattern: str) -> float:
-    """Returns the approximate number of tracks that fill the area: its longer side divided by the swath spacing."""
+    """Returns the longer side of the area divided by the swath spacing: a rough number of the tracks that fill it."""
     swath_m = _PATTERNS[pattern](request._replace(tracks=1)).swath_spacing_m
     return max(request.area_m) / swath_m
 

@@ -12,13 +12,13 @@ from twin.core.records import Image
 from twin.core.timing import StageTimer
 from twin.imaging.camera import StereoCamera
 from twin.imaging.image_formation import ImageFormation
-from twin.imaging.object_view import Objects
 from twin.imaging.renderer import Renderer
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sensors import NavigationSensors
-from twin.world.coverage import Coverage
+from twin.world.coverage import Coverage, true_heights
+from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step
 from twin.world.top_surface import top_surface
 from twin.world.world import CameraImages, TrueSurface, World, streams
@@ -35,7 +35,7 @@ class RenderedWorld(World):
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
         scene = scenes.builder.build(
-            mission.terrain,
+            mission.rendered_terrain,
             scenes.builder.CameraPair(rig.width_px, rig.height_px, vfov_deg, rig.baseline_m, rig.body_from_camera),
             physics_timestep_s(rig.frame_rate_hz), [lamp.position_m for lamp in scenario.lamps],
         )  # fmt: skip
@@ -49,14 +49,11 @@ class RenderedWorld(World):
             mission, stopwatch, vehicle, NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project)
         )
         self.renderer = Renderer(scene, rig.width_px, rig.height_px, vfov_deg)
-        objects = Objects(mission.objects, np.array(scenario.current.velocity_mps)) if mission.objects else None
-        image_formation = ImageFormation(scenario, mission.illumination, mission.terrain, rng["snow"], rig, objects)
+        floor, objects = mission.rendered_terrain, mission.rendered_objects()
+        image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, image_formation, scenario, *noise_rngs, stopwatch, cameras)
-        self._surface = None
-        if mission.objects:
-            floor_m = super().true_surface().height_m
-            self._surface = TrueSurface(*top_surface(mission.grid, floor_m, mission.objects))
+        self._surface = _surface(mission)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
 
@@ -77,3 +74,16 @@ class RenderedWorld(World):
 
     def seen(self) -> NDArray[np.bool_]:
         return self.coverage.seen
+
+
+def _surface(mission: Mission) -> TrueSurface | None:
+    """Returns the true surface of objects and of a mesh floor; None for a height grid without objects."""
+    grid, whole = mission.grid, mission.mesh_floor
+    if whole is None and not mission.objects:
+        return None
+    if whole is None:
+        return TrueSurface(*top_surface(grid, true_heights(grid, mission.terrain.height_at), mission.objects))
+    floor = floor_surface(whole, grid)
+    surface = top_surface(grid, floor.height_m, mission.objects)
+    overhung = surface.overhung | ((surface.objects == 0) & floor.overhung)
+    return TrueSurface(surface.height_m, surface.objects, overhung)

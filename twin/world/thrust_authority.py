@@ -23,6 +23,8 @@ _MAX_SLOPE = 0.6
 def check_thrust(scenario: Scenario, plan: SurveyPlan) -> None:
     """Checks that the thrusters hold station in the current, and reach the planned velocities against it.
 
+    A kinematic vehicle, and a path at constant height without current, are not checked.
+
     Raises:
         TwinError: a thruster saturates; the message gives the greatest allowed current or cruise speed.
     """
@@ -43,7 +45,10 @@ def check_thrust(scenario: Scenario, plan: SurveyPlan) -> None:
 
 
 def climb_slope(scenario: Scenario) -> float:
-    """Returns the greatest slope of a path: half the slope that saturates a thruster at cruise speed, at most 0.6."""
+    """Returns the greatest slope of a path: half the slope that saturates a thruster at cruise speed, at most 0.6.
+
+    It is 0.6 if the cruise speed alone saturates a thruster.
+    """
     speed_mps = scenario.plan.speed_mps
     ahead = np.array([speed_mps, 0.0, 0.0])
     excess = lambda climb: _load(scenario, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731

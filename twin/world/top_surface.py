@@ -1,8 +1,8 @@
 """True surface as seen from above: the highest of floor and objects at each cell of the map.
 
-The truth of a map is the highest surface at each cell centre, found by a parallel projection of all triangles, which is
-a vertical ray through each centre. Below an overhang, the map has the height of the object, not that of the floor.
-Plants are upright, as in still water.
+The truth of a map is the height of the highest surface, floor or object, on the vertical line through each cell centre.
+The objects are drawn in a parallel projection. Below an overhang, the map has the height of the object, not that of the
+floor. Plants are upright, as in still water.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ def _fill(block: TopSurface, grid: MapGrid, first: int, objects: Sequence[Placed
         y, reach_m = item.centre_m[1], item.radius_m
         if south_m - reach_m <= y <= north_m + reach_m:
             mesh = item.model.levels[0].mesh
-            draw_mesh(mesh, _FROM_ABOVE @ item.world_from_object, view, above, number + 1, item.model.closed)
-            draw_mesh(mesh, _FROM_BELOW @ item.world_from_object, view, below)
+            draw_mesh(mesh, FROM_ABOVE @ item.world_from_object, view, above, number + 1, item.model.closed)
+            draw_mesh(mesh, FROM_BELOW @ item.world_from_object, view, below)
     block.height_m[:] = -above.depth
     block.overhung[:] = (block.objects > 0) & (below.depth - floor_m > OVERHANG_M)
 
 
-_FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  # axes east, south, down
-_FROM_BELOW: Array = np.diag([1.0, -1.0, 1.0, 1.0])  # axes east, south, up, so that the lowest surface is the nearest
+FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  # axes east, south, down
+FROM_BELOW: Array = np.diag([1.0, -1.0, 1.0, 1.0])  # axes east, south, up, so that the lowest surface is the nearest

@@ -15,9 +15,10 @@ _BLOCK = 1024  # largest number of rows, and of columns, of samples that are com
 
 
 def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]:
-    """Returns the mean albedo (rows, cols, 3) of the floor in the cells of a grid, 255 = white; NaN outside.
+    """Returns the mean albedo (rows, cols, 3) of the floor in the cells of a grid, 255 = white.
 
-    The mean is taken over at least one sample per texel; samples are interpolated bilinearly, as in a rendered image.
+    The mean is taken over at least one sample per texel along x and y; samples are interpolated bilinearly, as in a
+    rendered image. It is NaN in cells whose middle sample lies outside the terrain.
     """
     rows, cols, _ = terrain.texture.shape
     texel_m = np.array(terrain.size_m) / [cols, rows]
@@ -54,14 +55,12 @@ def _mean_of_samples(texture: Image, across: Layer, down: Layer, n: int) -> Laye
 
 
 def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:
-    """Returns an albedo (rows, cols, 3) of the floor with NaN where an object is the true surface of the map.
-
-    The albedo does not contain the colours of the objects.
+    """Returns the albedo (rows, cols, 3) of the floor with NaN where an object is the true surface of the map.
 
     Args:
-        albedo: albedo of the floor on `grid`.
+        albedo: (rows, cols, 3) albedo of the floor on `grid`.
         grid: grid of the albedo, within `map_grid`.
-        objects: number of the object in each cell of `map_grid`, 0 for the floor; None without objects.
+        objects: 1 + number of the object at the top of each cell of `map_grid`, 0 for the floor; None without objects.
         map_grid: grid of the map.
     """
     if objects is None:

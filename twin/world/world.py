@@ -95,7 +95,7 @@ class World(ABC):
         """Returns the images of the cameras at the current pose."""
 
     def extra_pair(self) -> tuple[Image, Image]:
-        """Returns the left and the right image (H, W, 3) at the current pose; later frames do not change.
+        """Returns the left and the right image (H, W, 3) at the current pose; has no effect on later frames.
 
         Raises:
             TwinError: the world has no images.

@@ -138,7 +138,7 @@ class Solution(NamedTuple):
         cost: F at the minimum.
         chi2: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
         converged: false if the iterations ended before the minimum was reached.
-        cholesky: factor of the normal matrix of the poses, undamped.
+        cholesky: factor of the normal matrix of the poses, undamped, at the last linearisation.
         border: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal
             information of this parameter; None if there is no shared parameter.
     """
@@ -309,7 +309,13 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
     The Jacobian J_i with respect to the increment of pose i is computed from that of pose j: J_i = -J_j Ad(j_from_i).
 
     Args:
+        first, second: (m,) indices i and j of the poses.
+        by_j: (m, d, 6) Jacobians with respect to the increment of pose j.
+        information, weights, residuals: (m, d, d) information matrices, (m,) robust weights and (m, d) residuals.
+        i_from_j: (m, 4, 4) poses of j in i.
+        diagonal: (n, 6, 6) diagonal blocks, changed in place.
         off_diagonal: (m, 6, 6), filled with the blocks (i, j).
+        gradient: (n, 6) gradient, changed in place.
     """
     n = residuals.shape[1]
     half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
@@ -344,7 +350,9 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
     """Adds the mixed second derivatives of binary factors (poses and shared parameter) to the border (n, 6).
 
     Args:
+        first, second, by_j, i_from_j: see `_add_binary`.
         weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
+        border: (n, 6), changed in place.
     """
     for m in range(len(first)):
         slope = np.zeros(6)

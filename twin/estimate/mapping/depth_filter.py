@@ -203,8 +203,9 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
     """Returns depth and variance at pixel (x, y); NaN if one of its four neighbours is unknown or on another surface.
 
-    Inverse depth is interpolated, because it is linear on planes. The variance is interpolated linearly. It does not
-    decrease as for independent errors, because the matching windows of neighbouring pixels overlap.
+    Both are also NaN outside the image. Inverse depth is interpolated, because it is linear on planes. The variance is
+    interpolated linearly; it does not decrease as for independent errors, because the matching windows of neighbouring
+    pixels overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -296,7 +297,7 @@ def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_bas
 
     A pose error displaces the image point; the component of this displacement along the epipolar line has the same
     effect as an error of depth. NaN where a change of depth does not displace the image point: at the epipole, and
-    everywhere without translation.
+    everywhere without translation. 0 at pixels without disparity, and everywhere if `step_cov` is zero.
     """
     height, width = disparity.shape
     focal, cx, cy = camera

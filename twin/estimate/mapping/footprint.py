@@ -11,16 +11,18 @@ _MOST_CELLS = 4e7  # the cells of a map with more cells are enlarged, to limit i
 _CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that several disparities support each height
 
 
-def footprint_grid(result: SurveyResult, rig: StereoRig, cell_m: float | None = None) -> MapGrid:
+def footprint_grid(result: SurveyResult, rig: StereoRig) -> MapGrid:
     """Returns the grid that covers all keyframe images, each projected to the median depth of its matched points.
+
+    A cell is as large as three pixels at the median depth of all keyframes, or larger to limit the grid to about 4e7
+    cells.
 
     Args:
         result: result of a survey with at least one keyframe.
-        cell_m: side of a cell [m]; by default the size of three pixels at the median depth of all keyframes. It is
-            enlarged if the grid would have more than 4e7 cells.
+        rig: calibration of the images.
     """
     depth_m = result.keyframe_depth_m
-    cell = cell_m or _CELL_PX * float(np.median(depth_m)) / rig.focal_px
+    cell = _CELL_PX * float(np.median(depth_m)) / rig.focal_px
     corners = np.array([[0, 0], [rig.width_px, 0], [0, rig.height_px], [rig.width_px, rig.height_px]], np.float64)
     rays = np.column_stack([rig.normalised(corners - 0.5), np.ones(4)])
     poses = result.final.world_from_camera[result.keyframe_rows]

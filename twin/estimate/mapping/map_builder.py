@@ -16,6 +16,7 @@ from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap, Mask
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.vision import disparity
+from twin.estimate.vision.light_pattern import LightPattern
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -58,7 +59,7 @@ class _StereoDepth(NamedTuple):
 
     Args:
         pair: colour images.
-        gray: (H, W) float32 grey levels of the left image.
+        gray: (H, W) float32 grey levels of the left image, without the light pattern.
         depth: depth map of the left image, from this stereo pair alone.
     """
 
@@ -72,7 +73,7 @@ class _FilterState(NamedTuple):
 
     Args:
         depth: filtered depth map.
-        gray: (H, W) float32 grey levels of the left image.
+        gray: (H, W) float32 grey levels of the left image, without the light pattern.
         pose: (4, 4) world_from_camera.
         patch: heights of the depth map on the grid; None if the depth map does not overlap the grid.
     """
@@ -89,7 +90,7 @@ def build_map(
     rig: StereoRig,
     grid: MapGrid,
     progress: Callable[[int], None] | None = None,
-    max_disparity_px: int | None = None,
+    pattern: LightPattern | None = None,
 ) -> ElevationMap:
     """Builds the elevation map, its standard deviation and the orthomosaic.
 
@@ -99,14 +100,14 @@ def build_map(
         rig: calibration of the images, with square pixels.
         grid: grid of the map.
         progress: called with the number of keyframes processed so far.
-        max_disparity_px: largest disparity searched; if None, it is adapted to the disparities of the previous pair.
+        pattern: light pattern of the images, which is subtracted before matching; None: it is not known.
     """
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
-    search_range = disparity.SearchRange(rig, max_disparity_px)
+    search_range = disparity.SearchRange(rig)
     poses = path.world_from_camera
     step_cov = np.zeros((len(poses), 6, 6)) if path.step_cov is None else path.step_cov
     old = None
-    stereo = _prefetch(_measure_depth(pair, search_range, rig) for pair in keyframes)
+    stereo = _prefetch(_measure_depth(pair, search_range, rig, pattern) for pair in keyframes)
     for k, (pair, gray, stereo_depth) in enumerate(stereo):
         depth, inherited = stereo_depth, None
         if old is not None:
@@ -134,13 +135,23 @@ def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
             yield item
 
 
-def _measure_depth(pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig) -> _StereoDepth:
+def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:
+    """Returns the grey levels (H, W) of both images, not rounded to whole levels."""
+    left, right = (np.asarray(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), np.float32) for image in pair)
+    return left, right
+
+
+def _measure_depth(
+    pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig, pattern: LightPattern | None
+) -> _StereoDepth:
     """Computes the stereo depth of a pair and updates the search range for the next pair."""
-    left, right = (np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8) for image in pair)
+    left, right = gray_levels(pair)
+    if pattern is not None:
+        left, right = left - pattern.left, right - pattern.right
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
     stereo = stereo.with_sigma_below(MAX_STEREO_SIGMA_PX)
     search_range.update(stereo.disparity_px)
-    return _StereoDepth(pair, left.astype(np.float32), depth_filter.stereo_depth(stereo, rig))
+    return _StereoDepth(pair, left, depth_filter.stereo_depth(stereo, rig))
 
 
 def _advance(

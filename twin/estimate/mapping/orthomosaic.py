@@ -1,9 +1,9 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
 It is made in tiles of at most `TILE_PX` x `TILE_PX` pixels, one after the other; an image is read once for each tile
-that it touches, and once more if its exposure has to be estimated. Memory is that of one tile and of two images,
-whatever the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`) take 24 bytes per pixel,
-114 MB for a whole tile.
+that it touches, and once more if its exposure has to be estimated. Memory is that of one tile and of two images and
+does not depend on the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`) take 24 bytes
+per pixel, 114 MB for a whole tile.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@ bicubically. Where several images show a pixel, their colours are averaged with 
 
     w = r exp(-K tan^2(n)),
 
-n the angle of the view from the vertical (zero at nadir) and r a ramp from 0.001 at the border of the image to 1. K is
-so large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are
-blended. Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is smaller by a
-factor, so that it is used only where no other image shows the floor, or only far from nadir. A view of a pixel is
-discarded where nearer floor hides it.
+with n the angle of the view from the vertical (zero at nadir) and r a ramp from 0.001 at the border of the image to 1.
+K is so large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are
+blended. Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is multiplied by
+exp(-60), so that it is used only where other images do not show the floor, or show it far from nadir. A view of a pixel
+is discarded where nearer floor hides it.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
     """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is the box around the four corner rays between the lowest and the highest floor, or from the camera on, if this
-    is lower than the highest floor. It is infinite if the camera is below the lowest floor, or a corner of the image
-    does not look down.
+    It is the box around the parts of the four corner rays between the highest and the lowest floor; if the camera is
+    lower than the highest floor, they begin at the camera. The box is infinite if the camera is not above the lowest
+    floor, or if a corner ray does not point downwards.
 
     Args:
         world_from_camera: (4, 4) pose of the camera.
@@ -133,7 +133,7 @@ def add_view(
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
-    """Returns first and end row, first and end column of the pixels of a grid in a box, see `footprint`."""
+    """Returns first and end row, first and end column (exclusive) of the pixels of a grid in a box, see `footprint`."""
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
     cols = np.clip([(west - grid.west_m) / grid.cell_m, (east - grid.west_m) / grid.cell_m + 1], 0, grid.cols)
@@ -170,7 +170,8 @@ def _blend(
     """Adds the colours of an image to `colour`, `weight` and `best`, see `OrthoLayers`.
 
     Args:
-        first, end, left, right: rows and columns of the pixels to process.
+        height, colour, weight, best: see `OrthoLayers`.
+        first, end, left, right: first and end row, first and end column (exclusive) of the pixels to process.
         steps: (3, 3) change of the point in camera axes by one column, one row and one metre of height.
         origin: (3,) point of pixel (0, 0) at height 0 in camera axes.
         camera_at: x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].

@@ -166,7 +166,10 @@ def _contains_integer(a, b, c, e):
 
 @njit(cache=True, nogil=True)
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
-    """Rasterises all triangles of a depth map into `height`, `height_variance`, `systematic` and `pixel`, in place."""
+    """Rasterises the triangles of a depth map, except those that `rasterise` omits, in place.
+
+    It fills `height`, `height_variance`, `systematic` and `pixel`.
+    """
     out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):

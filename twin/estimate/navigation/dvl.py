@@ -40,7 +40,7 @@ class DvlState(NamedTuple):
         displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
             white noise [m^2].
         path_m: (1,) path length since the node [m].
-        complete: (1,) true unless a reading, that at the node included, has been missing.
+        complete: (1,) false if a reading at the node or since is missing.
     """
 
     velocity: Array
@@ -185,6 +185,8 @@ def _accumulate(state, model, step, a_from_b, cov):
     """Adds a frame to the integration since the node.
 
     Args:
+        state: `DvlState`, modified in place.
+        model: `DvlModel`.
         step: (3,) displacement since the previous frame, in the body axes at the previous frame [m].
         a_from_b, cov: (4, 4), (6, 6) motion of the camera since the previous frame, and its covariance.
     """

@@ -87,8 +87,8 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     """Projects a beacon, at the position (3,) in the world [m], into the left image.
 
     Returns:
-        Column and row (2,) [px], NaN if the beacon is behind the camera, and their Jacobian (2, 6) with respect to an
-        increment [rotation, translation] of the pose in camera axes.
+        Column and row (2,) [px], NaN for a beacon at a depth up to 1 mm or behind the camera, and their Jacobian (2, 6)
+        with respect to an increment [rotation, translation] of the pose in camera axes.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -117,7 +117,8 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
         model: `PressureAhrsModel`.
-        height_m, rpy_rad: readings of the height, and of roll, pitch and yaw (3,); NaN where there is no reading.
+        height_m, rpy_rad: readings of the height [m], and of roll, pitch and yaw (3,) [rad]; NaN where there is no
+            reading.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -244,7 +245,7 @@ def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise)
     The errors of roll, pitch and yaw are treated as rotations about the x, y and z axes of the body.
 
     Args:
-        rpy_rad: (3,) roll, pitch and yaw of the body.
+        rpy_rad: (3,) roll, pitch and yaw of the body [rad].
         camera_from_body: (4, 4) pose of the body in the camera.
         noise: believed noise of the navigation sensors.
     """

@@ -54,7 +54,7 @@ class Disparity(NamedTuple):
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
 
 
-def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity:
+def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) -> Disparity:
     """Computes the disparity of every pixel of the left image that is visible in both images.
 
     Semi-global matching (Hirschmueller 2008; OpenCV's variant with three path directions) of images with locally
@@ -65,7 +65,7 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
     with noise.
 
     Args:
-        left, right: (H, W) uint8 rectified grey images.
+        left, right: (H, W) uint8 or float32 rectified grey images.
         max_disparity_px: number of whole-pixel disparities searched, from 0 on; rounded up to a multiple of 16.
     """
     coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
@@ -75,27 +75,23 @@ def dense_disparity(left: Gray, right: Gray, max_disparity_px: int) -> Disparity
 
 
 class SearchRange:
-    """Range of the disparity search, adapted to the largest disparities of the last stereo pair.
+    """Range of the disparity search: the widest one at first, then adapted to the largest disparities of the last pair.
 
     Args:
         rig: calibration at the scale of the images.
-        fixed_px: fixed largest disparity [px]; None to adapt the range, starting from the widest one.
 
     Attributes:
         max_disparity_px: largest disparity to search [px].
     """
 
-    def __init__(self, rig: StereoRig, fixed_px: int | None = None):
-        self._fixed = fixed_px is not None
-        self._widest_px = fixed_px or int(MAX_DISPARITY_FRACTION * rig.width_px)
-        self.max_disparity_px = self._widest_px
+    def __init__(self, rig: StereoRig):
+        self._widest_px = self.max_disparity_px = int(MAX_DISPARITY_FRACTION * rig.width_px)
 
     def update(self, disparity_px: Map) -> None:
         """Adapts the range to the disparities (H, W) of the last pair; sets the widest range if too few are known."""
         known = disparity_px[np.isfinite(disparity_px)]
-        if not self._fixed:
-            wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px
-            self.max_disparity_px = min(int(wanted), self._widest_px)
+        wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px
+        self.max_disparity_px = min(int(wanted), self._widest_px)
 
 
 def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
@@ -140,7 +136,7 @@ def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
     return consistent
 
 
-def _normalise_contrast(image: Gray) -> Gray:
+def _normalise_contrast(image: Gray | Map) -> Gray:
     """Normalises local mean and contrast of an image, so that illumination and backscatter do not affect matching.
 
     Areas of low contrast are amplified less, because their contrast is mostly noise.

@@ -70,7 +70,7 @@ class RegionMeans(NamedTuple):
         return RegionMeans(self.weight + sums[:, 0], self.rows + sums[:, 1], self.jacobian + sums[:, 2:])
 
     def pattern(self, estimate: Array) -> float:
-        """Returns the RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
+        """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
 
         The expected contribution of matching noise is subtracted: the weighted sum of squares of the means has the
         expectation m - 4, for m regions and four estimated parameters. In focal lengths; 0 without observations.

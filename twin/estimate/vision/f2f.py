@@ -118,9 +118,9 @@ class FrameToFrame:
             interval_s: time since the last frame [s]; by default that of the frame rate.
 
         Returns:
-            The motion, and "ok" or the reason for a failure. The covariance of the motion is that of the pose of this
-            frame in the reference camera. The errors of successive motions partly cancel, so the sum of their
-            covariances is an upper bound.
+            The motion, and "ok" or the reason for a failure; at the first frame, the identity and "ok". The covariance
+            of a measured motion is that of the pose of this frame in the reference camera. The errors of successive
+            motions partly cancel, so the sum of their covariances is an upper bound.
         """
         if not self.started:
             self.started = True
@@ -170,9 +170,9 @@ class FrameToFrame:
     def _pyramid_levels(self, depth_m: Array) -> int:
         """Returns the number of pyramid levels with which the tracker bridges the error of the predicted positions.
 
-        A window finds a point up to about half its side away, on each level in pixels of twice the size. The variance
-        of the predicted positions is that of the filter's rotation about the x and y axes, plus that of its translation
-        across the optical axis at the median depth. At 15 frames a second one level suffices; at 5, the
+        A window finds a point up to about half its side away; each further level doubles this distance. The variance of
+        the predicted positions is that of the filter's rotation about the x and y axes, plus that of its translation
+        across the optical axis at the median depth. At 15 frames per second one level is sufficient; at 5, the
         acceleration of the vehicle moves the points by about 10 px more than predicted.
 
         Args:

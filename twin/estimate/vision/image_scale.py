@@ -23,7 +23,7 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
     Only binnings that divide the width and the height of the images are tried.
 
     Args:
-        left, right: (height, width, 3) images of the first stereo pair.
+        left, right: (height, width, 3) images of a stereo pair.
         rig: calibration at full image size.
         settings: settings of the estimators.
 

@@ -27,8 +27,8 @@ class Keyframe:
         dvl_displacement: displacement since the previous node, measured by the DVL; None if it was not measured, or if
             the link to the previous node is the F2F motion, which already includes the DVL.
         accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the part that registrations
-            with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference
-            between the values of two keyframes is the covariance of the motion between them.
+            with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference between the values
+            of two keyframes is the covariance of the motion between them.
         depth_m: median depth of the matched points [m].
         exposure: exposure of its images; None if it was not reported.
     """

@@ -50,8 +50,8 @@ def normalise(levels: Gray) -> Image:
 
     Returns:
         (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
-        surroundings of a pixel, which are cut off at the image border, so they do not permit matching to a hundredth
-        of a pixel.
+        surroundings of a pixel, which are completed by reflection at the image border. They therefore do not permit
+        matching to a hundredth of a pixel.
     """
     mean, square = _local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
@@ -83,7 +83,7 @@ def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """Returns the image (height, width, ...) with squares of `by` x `by` pixels averaged to one."""
+    """Returns the image (height, width, ...) with squares of `by` x `by` pixels averaged to one; they must tile it."""
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)

@@ -41,8 +41,8 @@ class Registration(NamedTuple):
     Args:
         correction: estimated pose of the frame in the camera at its predicted pose (predicted_from_estimated); its
             number of points is the number of cells, its residual is in normalised grey levels.
-        reference_keyframe: median of the keyframe numbers of the compared cells; half of the cells come from this
-            keyframe or older ones.
+        reference_keyframe: median of the keyframe numbers of the compared cells; at least half of the cells come from
+            this keyframe or older ones.
     """
 
     correction: two_view_motion.Motion
@@ -151,7 +151,7 @@ class Mosaic:
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
         """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
 
-        If many more than `_MAX_CELLS` cells are textured, a regular subset is returned; if too few are, None.
+        If at least twice `_MAX_CELLS` cells are textured, a regular subset is returned; if too few are, None.
         """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)

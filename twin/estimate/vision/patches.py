@@ -13,8 +13,8 @@ Systematic errors of patch matching, measured against the simulated truth, and t
 - Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. With cubic
   B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
   (`matching.gray`).
-- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
-  cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
+- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, which cuts off its
+  window, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
   Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
 
 Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to

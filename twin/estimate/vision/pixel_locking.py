@@ -5,14 +5,14 @@ by -A sin(2 pi u) in column and by -A sin(2 pi v) in row, with u and v the colum
 amplitude. Digital image correlation has the same systematic error, of period one pixel (Schreier, Braasch & Sutton
 2000, "Systematic errors in digital image correlation caused by intensity interpolation", Opt. Eng. 39). Neighbouring
 points on a smooth floor have nearly the same sub-pixel position, so their biases do not average out. The amplitude
-depends on texture and optics and differs between surveys: 0.010 px was measured over the floor of `reef`, and
-0 over the photographed gravel of `horseshoe`. It is therefore an unknown of the motion between two stereo pairs
+depends on texture and optics and differs between surveys: 0.010 px was measured over the floor of `reef`, and 0 over
+the photographed gravel of `horseshoe`. It is therefore an unknown of the motion between two stereo pairs
 (`two_view_motion.pair_motion`); this module gives its derivatives.
 
 Where a patch is scaled, sheared or rotated between the images, the sub-pixel position varies over the patch, and the
 biases of its pixels partly cancel. Averaging the sine over a patch of side s multiplies its amplitude along an image
-axis by sinc(s d1) sinc(s d2), with (d1, d2) that axis's row of the warp minus the identity
-and sinc t = sin(pi t) / (pi t).
+axis by sinc(s d1) sinc(s d2), with (d1, d2) that axis's row of the warp minus the identity and
+sinc t = sin(pi t) / (pi t).
 """
 
 from __future__ import annotations

@@ -298,7 +298,7 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
     coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
     determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
-    counts as 50 points. The prior information is added to M and S.
+    counts as 50 points. The prior information is added to M, and times the squared scale of the residuals to S.
 
     Args:
         normals: normal equations at the last iteration.

@@ -113,8 +113,8 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
     """Estimates the light of all lamps that reaches a vertex after one scattering, times the response of the vertex.
 
-    The estimate is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around the
-    lamps.
+    The estimate is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around lamps
+    and sun.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -193,6 +193,8 @@ def share_of_escape(scene, density, path_m):
 @njit(cache=True, nogil=True)
 def light_above(scene, from_water, density, path_m, x, y, z):
     """Returns the radiance just below the surface from a direction: sky, and the sun's disc for walks in water [cd/m2].
+
+    The radiance of the disc is weighted by `share_of_escape`.
 
     Args:
         from_water: whether the last vertex of the walk is a scattering in the water.

@@ -1,4 +1,4 @@
-"""Estimator of another package in a survey (`estimate.plugin`): map and metrics follow from its poses."""
+"""Estimator of another package in a survey (`estimate.plugin`) or a replay: map and metrics follow from its poses."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, SurveyResult, Trajectory
+from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
@@ -16,9 +17,13 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import ESTIMATORS
 from twin.plugin.protocols import EstimatorSetup
-from twin.world.mission import Mission
 
 METHODS = ("update", "covariance", "finish")
+KEY = "estimate.plugin"  # key of a scenario that names the plug-in
+NOTE = (
+    "The trajectories are those of the plug-in {}: its online poses (shown as F2F and as online) and the poses that it "
+    "returned at the end (final). There are no links and no alignments."
+)
 _NO_POSE = "the plug-in measured no pose"
 
 
@@ -29,22 +34,30 @@ class PluginNavigator(Navigator):
     method `finish`. There are no links and no alignments.
 
     Args:
-        mission: the survey to fly; the plug-in gets its believed calibration, start and sensor noise.
-        name: value of `estimate.plugin`.
-        vision: images of the keyframes, for the map.
+        name: "module:Class", or the name of an entry point.
+        setup: believed calibration, start and sensor noise, which the plug-in gets.
+        settings: settings of the stereo matching, and of the choice of keyframes where the frames leave it open.
+        vision: images of the keyframes, for the map; closed by the caller.
         stopwatch: timer of the stages; the time of the plug-in is that of the stage "f2f".
+        key: key or option that names the plug-in, for messages.
 
     Raises:
         TwinError: the plug-in cannot be loaded.
     """
 
-    def __init__(self, mission: Mission, name: str, vision: StereoVision, stopwatch: StageTimer):
-        noise, start = mission.scenario.believed_noise(), mission.start
-        settings = replace(mission.scenario.estimator_settings(), use_ga=False, use_f2m=False)
-        super().__init__(mission.rig, settings, start, noise, vision, stopwatch=stopwatch)
-        setup = EstimatorSetup(mission.rig, start.copy(), noise)
-        self._plugin = GuardedPlugin("estimate.plugin", ESTIMATORS, name, METHODS, setup)
-        self._images, self._pose, self._cov = vision, start.copy(), np.zeros((6, 6))
+    def __init__(
+        self,
+        name: str,
+        setup: EstimatorSetup,
+        settings: EstimatorSettings,
+        vision: StereoVision,
+        stopwatch: StageTimer,
+        key: str = KEY,
+    ):
+        settings = replace(settings, use_ga=False, use_f2m=False)
+        super().__init__(setup.rig, settings, setup.start, setup.noise, vision, stopwatch=stopwatch)
+        self._plugin = GuardedPlugin(key, ESTIMATORS, name, METHODS, setup)
+        self._images, self._pose, self._cov = vision, setup.start.copy(), np.zeros((6, 6))
         self._node_covs: list[Array] = []
         self._finishes = True
 
@@ -56,7 +69,6 @@ class PluginNavigator(Navigator):
             OSError: images could not be written.
         """
         interval_s = self._interval_s(frame.time_s)
-        keyframe = self._stereo_keyframe(frame, track)
         with self.stopwatch("f2f"):
             found = self._plugin.call("update", frame)
             cov = self._plugin.call("covariance")
@@ -65,8 +77,9 @@ class PluginNavigator(Navigator):
             self._pose = self._plugin.poses("update", found, (4, 4))
         self._cov = np.zeros((6, 6)) if cov is None else self._plugin.covariance("covariance", cov)
         self.log.n_lost += found is None
+        self.f2f_pose = self.filter.world_from_camera = self._pose  # by which keyframes are chosen
+        keyframe = self._stereo_keyframe(frame, track)
         if keyframe is not None:
-            keyframe.world_from_camera = self._pose
             self.network.add(keyframe)
             self._node_covs.append(self._cov)
         moved = geometry.inverse(last) @ self._pose if len(self.log) else np.eye(4)
@@ -86,7 +99,7 @@ class PluginNavigator(Navigator):
         """Returns the trajectories of the plug-in and the keyframes.
 
         Raises:
-            PluginFailed: `finish` of the plug-in failed.
+            PluginFailed: `finish` of the plug-in raised an exception or returned an unusable value.
         """
         result = super().finish()
         n = len(result.online)

@@ -1,0 +1,223 @@
+"""A mesh as the whole sea floor: turned upwards, centred, and divided into tiles that are drawn like objects.
+
+Only tiles in view are drawn. All levels of detail of a tile have its full geometry, so there are no cracks between
+tiles; the coarser levels have smoother colours, which filters the colours of vertices as a mip map filters a texture.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.objects.detail import Level, cell_colours
+from terrains.objects.mesh import Mesh, extent
+from terrains.objects.mesh_file import TexturedMesh
+from terrains.objects.model import ObjectModel, PlacedObject
+from terrains.objects.texture_pyramid import Textures, textures_of
+
+TILE_M = 1.0  #: side of a tile; larger if there were more than MAX_TILES tiles
+MAX_TILES = 4000
+LONGEST_EDGE_M = 0.5  #: longer edges are halved; for a mesh larger than 200 m, those longer than a 400th of it
+LARGEST_CELL_M = 0.1  #: over which the colours of vertices are averaged in the coarsest level
+NO_GROUP = -1  #: `PlacedObject.group` of a tile
+
+Array = NDArray[np.float64]
+
+
+class FloorTile(NamedTuple):
+    """Part of a mesh floor with one texture.
+
+    Args:
+        placed: the triangles as an object.
+        texture: number of its texture in `FloorTiles.textures`; -1: the colours of the vertices.
+        uv: (n, 3) float32 texture coordinates of its vertices (across and down), and side of a texel there [m].
+    """
+
+    placed: PlacedObject
+    texture: int
+    uv: NDArray[np.float32]
+
+
+class FloorTiles(NamedTuple):
+    """Mesh floor in tiles, with its textures."""
+
+    tiles: tuple[FloorTile, ...]
+    textures: Textures
+
+
+def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
+    """Returns a mesh in metres with its upper side up, centred at x = y = 0.
+
+    A mesh encloses a volume, or is an open sheet. Its triangles are turned over if the volume is negative, or if most
+    of the area of a sheet, projected onto a level plane, faces down.
+
+    Args:
+        read: the mesh as read from a file.
+        scale: metres per unit of the file.
+    """
+    vertices, faces = read.mesh.vertices_m.astype(np.float64) * scale, read.mesh.faces
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    up_m2 = _upward_m2(vertices, faces)
+    area_m2, volume_m3 = float(up_m2.sum()), float(np.einsum("ij,ij->", a, np.cross(b, c)))
+    is_sheet = abs(area_m2) > 0.01 * np.abs(up_m2).sum()
+    if (area_m2 if is_sheet else volume_m3) < 0:
+        faces = faces[:, ::-1]
+    vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    mesh = Mesh(vertices.astype(np.float32), np.ascontiguousarray(faces, np.int32), read.mesh.colours)
+    return read._replace(mesh=mesh)
+
+
+def divided(whole: TexturedMesh) -> TexturedMesh:
+    """Returns a mesh whose long edges are halved until none is longer than LONGEST_EDGE_M, without cracks.
+
+    The rasterizer leaves out a triangle with a corner behind the camera, so that no triangle should be large.
+    """
+    longest_m = max(LONGEST_EDGE_M, float(np.ptp(whole.mesh.vertices_m, axis=0).max()) / 400)
+    while True:
+        faces = whole.mesh.faces
+        corners = whole.mesh.vertices_m[faces].astype(np.float64)
+        long = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) > longest_m
+        if not long.any():
+            return whole
+        whole = _halved(whole, long)
+
+
+def _halved(whole: TexturedMesh, long: NDArray[np.bool_]) -> TexturedMesh:
+    """Returns a mesh with the marked edges (m, 3) halved; edge k of a triangle joins its corners k and k + 1.
+
+    A triangle with one, two or three halved edges becomes two, three or four triangles.
+    """
+    mesh, n = whole.mesh, len(whole.mesh.vertices_m)
+    ends = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2)[long], axis=1)
+    pairs, number = np.unique(ends, axis=0, return_inverse=True)
+    middle = np.full(long.shape, -1, np.int64)
+    middle[long] = n + number.ravel()
+    # turned so that the triangles with one halved edge have it first, those with two have them first and second
+    count = long.sum(axis=1)
+    first = np.where(count == 1, long.argmax(axis=1), np.where(count == 2, (long.argmin(axis=1) + 1) % 3, 0))
+    turn = (first[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(mesh.faces.astype(np.int64), turn, axis=1).T
+    ab, bc, ca = np.take_along_axis(middle, turn, axis=1).T
+    pieces = {
+        0: [(a, b, c)],
+        1: [(a, ab, c), (ab, b, c)],
+        2: [(a, ab, c), (ab, bc, c), (ab, b, bc)],
+        3: [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)],
+    }
+    parts = [(np.stack(piece, axis=1)[count == k], whole.texture[count == k]) for k in pieces for piece in pieces[k]]
+    positions = mesh.vertices_m[pairs].mean(axis=1, dtype=np.float64)
+    colours = np.rint(mesh.colours[pairs].mean(axis=1))
+    return TexturedMesh(
+        Mesh(
+            np.concatenate([mesh.vertices_m, positions.astype(np.float32)]),
+            np.concatenate([faces for faces, _ in parts]).astype(np.int32),
+            np.concatenate([mesh.colours, colours.astype(np.uint8)]),
+        ),
+        np.concatenate([whole.uv, whole.uv[pairs].mean(axis=1)]),
+        np.concatenate([texture for _, texture in parts]),
+        whole.images,
+    )
+
+
+def raised(whole: TexturedMesh, height_m: float) -> TexturedMesh:
+    """Returns a mesh moved up by a height [m]."""
+    vertices = whole.mesh.vertices_m + np.array([0, 0, height_m], np.float32)
+    return whole._replace(mesh=whole.mesh._replace(vertices_m=vertices))
+
+
+def upward_part(mesh: Mesh) -> Mesh:
+    """Returns the mesh without the triangles that are vertical or face down."""
+    return mesh._replace(faces=mesh.faces[_upward_m2(mesh.vertices_m.astype(np.float64), mesh.faces) > 0])
+
+
+def downward_part(mesh: Mesh) -> Mesh:
+    """Returns the mesh without the triangles that are vertical or face up."""
+    return mesh._replace(faces=mesh.faces[_upward_m2(mesh.vertices_m.astype(np.float64), mesh.faces) < 0])
+
+
+def tiles_of(whole: TexturedMesh) -> FloorTiles:
+    """Returns a mesh floor in square tiles; a triangle belongs to the tile in which its centre lies."""
+    mesh, texture = whole.mesh, whole.texture
+    centres = mesh.vertices_m[mesh.faces].mean(axis=1)[:, :2]
+    side_m = TILE_M
+    while True:
+        column, row = np.floor((centres - centres.min(axis=0)) / side_m).astype(np.int64).T
+        keys, tile = np.unique(np.stack([texture, row, column], axis=1), axis=0, return_inverse=True)
+        if len(keys) <= MAX_TILES or (keys[:, 1:] == 0).all():
+            break
+        side_m *= 1.5
+    uv, colours = _texture_places(whole), _colour_levels(whole)
+    order = np.argsort(tile.ravel(), kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(tile.ravel()))[:-1])
+    tiles = tuple(_tile(mesh, part, uv, colours, int(key[0])) for part, key in zip(parts, keys, strict=True))
+    return FloorTiles(tiles, textures_of(whole.images))
+
+
+def _tile(
+    mesh: Mesh, part: NDArray[np.int64], uv: NDArray[np.float32], colours: list[tuple[NDArray[np.uint8], float]],
+    texture: int,
+) -> FloorTile:  # fmt: skip
+    """Returns the tile of the triangles with the numbers `part`.
+
+    Args:
+        mesh: the whole floor.
+        part: (k,) numbers of triangles.
+        uv: (n, 3) see `FloorTile.uv`, of all vertices.
+        colours: colours (n, 3) of all vertices, and side of the cells [m] over which they are means, finest first.
+        texture: number of the texture.
+    """
+    used, faces = np.unique(mesh.faces[part], return_inverse=True)
+    vertices, faces = mesh.vertices_m[used], np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
+    kept = colours if texture < 0 else colours[:1]
+    levels = tuple(Level(Mesh(vertices, faces, values[used]), cell_m) for values, cell_m in kept)
+    low, high = extent(levels[0].mesh)
+    centre = (low + high) / 2
+    radius_m = float(np.linalg.norm(vertices - centre, axis=1).max())
+    model = ObjectModel(levels, low, high, centre, radius_m)
+    return FloorTile(PlacedObject(model, np.eye(4), 1.0, NO_GROUP), texture, uv[used])
+
+
+def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
+    """Returns (n, 3): texture coordinates of the vertices, from the upper left corner, and side of a texel there [m].
+
+    The side of a texel is the root of the ratio of the areas of a triangle on the floor and in the texture; at a
+    vertex, it is the mean over its triangles.
+    """
+    mesh, n = whole.mesh, len(whole.mesh.vertices_m)
+    corners, places = mesh.vertices_m[mesh.faces].astype(np.float64), whole.uv[mesh.faces].astype(np.float64)
+    floor_m2 = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    first, second = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+    texels = np.array([image.shape[0] * image.shape[1] for image in whole.images] or [0.0], np.float64)
+    area = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) * texels[whole.texture]
+    side_m = np.sqrt(floor_m2 / np.maximum(area, 1e-12))
+    total = np.bincount(mesh.faces.ravel(), np.repeat(side_m, 3), n)
+    count = np.bincount(mesh.faces.ravel(), minlength=n)
+    u, v = whole.uv.T
+    return np.stack([u, 1 - v, total / np.maximum(count, 1)], axis=1).astype(np.float32)
+
+
+def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]:
+    """Returns the colours (n, 3) of the vertices with 0, and their means over cubic cells with the side [m]."""
+    mesh = whole.mesh
+    levels = [(mesh.colours, 0.0)]
+    if (whole.texture >= 0).all():
+        return levels
+    cell_m = median_edge_m(mesh)
+    while cell_m <= LARGEST_CELL_M:
+        levels.append((cell_colours(mesh, cell_m), cell_m))
+        cell_m *= np.sqrt(2)
+    return levels
+
+
+def median_edge_m(mesh: Mesh) -> float:
+    """Returns the median length of the edges of the triangles [m]."""
+    corners = mesh.vertices_m[mesh.faces]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+
+
+def _upward_m2(vertices: Array, faces: NDArray[np.int32]) -> Array:
+    """Returns twice the area (m,) of the triangles projected onto a level plane; negative where they face down [m2]."""
+    a, b, c = np.moveaxis(vertices[faces][:, :, :2], 1, 0)
+    return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]

@@ -1,0 +1,219 @@
+"""Recorded readings in a replay: the world follows gravity, bad rows are named, what cannot be used is left out."""
+
+import re
+import shutil
+
+import bags
+import exported_run
+import numpy as np
+import pytest
+import recorded_datasets as recorded
+from recorded_datasets import RIG
+
+import twin
+from twin.core import geometry
+from twin.core.records import Readings
+from twin.datasets.aiding import Aiding
+from twin.datasets.bag_reader import BagReader
+from twin.datasets.readings import RecordedReadings, SensorSeries, read_folder
+from twin.datasets.replay import ReplayOptions, open_dataset
+from twin.errors import TwinError
+from twin.exchange import euroc, ros2
+
+N = 8
+SIGMAS_RAD = np.deg2rad([0.2, 0.2, 0.5])
+SCENARIO = {
+    "navigation": {
+        "pressure_sigma_m": 0.01, "attitude_sigma_deg": 0.2, "heading_sigma_deg": 0.5, "dvl_sigma_mps": 0.005,
+    }
+}  # fmt: skip
+BODIES = recorded.poses(N) @ geometry.inverse(RIG.body_from_camera)
+VELOCITY_MPS = np.array([0.03 * RIG.frame_rate_hz, 0.0, 0.0])
+
+
+def noisy_readings(turned_rad=0.0):
+    """Returns the function frame number -> readings with the noise of SCENARIO; heights 30 m lower than in the scene.
+
+    `turned_rad` is an error of the attitude that grows with every frame.
+    """
+    rng = np.random.default_rng(2)
+
+    def reading(k):
+        body, noise = BODIES[k], rng.normal(size=7)
+        attitude = geometry.rpy_from_rotation(body[:3, :3]) + SIGMAS_RAD * noise[1:4] + turned_rad * k
+        height = float(recorded.poses(N)[k, 2, 3]) - 30 + 0.01 * noise[0]
+        return Readings(height, geometry.wrap_angle(attitude), body[:3, :3].T @ VELOCITY_MPS + 0.005 * noise[4:])
+
+    return reading
+
+
+@pytest.fixture(scope="module")
+def contents(tmp_path_factory):
+    return exported_run.flown(tmp_path_factory.mktemp("run"), N, noisy_readings(), scenario=SCENARIO)
+
+
+@pytest.fixture(scope="module")
+def folder(contents, tmp_path_factory):
+    found = tmp_path_factory.mktemp("euroc")
+    euroc.export(contents, found)
+    return found
+
+
+def replayed(folder, out, **options):
+    return twin.replay(folder, out, ReplayOptions(outputs=(), **options))
+
+
+def tilts_deg(result):
+    """Returns the angles between the estimated and the true direction of gravity in camera axes."""
+    cosines = np.einsum("ni,ni->n", result.final.world_from_camera[:, 2, :3], recorded.poses(N)[:, 2, :3])
+    return np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def test_attitude_and_pressure_make_the_world_level(folder, tmp_path):
+    """The mean of 8 readings has a standard deviation of 0.07 degrees per axis; the plane of the hills is tilted."""
+    found = replayed(folder, tmp_path / "aided")
+    assert found.metrics["replay"]["aiding"] == "pressure, attitude, dvl"
+    assert tilts_deg(found.result).max() < 0.25
+    assert found.metrics["trajectory"]["final"]["ate_max_m"] < 0.004
+    assert not any("standard deviations" in warning for warning in found.metrics["warnings"])
+    alone = replayed(folder, tmp_path / "alone", aiding=False)
+    assert alone.metrics["replay"]["aiding"] == "none" and tilts_deg(alone.result).min() > 0.4
+    sigma = np.sqrt(found.result.node_cov[0].diagonal())
+    assert np.deg2rad(0.02) < sigma[0] < np.deg2rad(0.2)  # the tilt of the first pose is not exact
+
+
+def test_a_bag_has_the_same_readings(contents, folder, tmp_path):
+    ros2.export(contents, tmp_path)
+    bag = replayed(tmp_path / "ros2_bag", tmp_path / "bag").result
+    assert np.abs(bag.final.positions - replayed(folder, tmp_path / "euroc").result.final.positions).max() < 1e-6
+
+
+def test_an_attitude_of_another_body_is_a_warning(tmp_path):
+    contents = exported_run.flown(tmp_path / "run", N, noisy_readings(turned_rad=0.05), scenario=SCENARIO)
+    euroc.export(contents, tmp_path / "set")
+    found = replayed(tmp_path / "set", tmp_path / "out").metrics
+    assert any(w.startswith("The readings of attitude deviate from the final path") for w in found["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "line", "message"),
+    [
+        ("pressure0", "2000000000,nan", r"pressure0/data.csv:10: is not a line of numbers \(allowed: 2 finite"),
+        ("pressure0", "2000000000", r"pressure0/data.csv:10: is not a line of numbers"),
+        ("pressure0", "1000000000,-28", r"data.csv:10: the time 1 s is not after .* before, 2.4 s \(allowed: incr"),
+        ("pressure0", "9000000000,1e6", r"data.csv:10: the height from pressure is 1e\+06 m \(allowed: -12000 to"),
+        ("ahrs0", "9000000000,0,0,90", r"data.csv:10: the attitude is 90 rad \(allowed: -6.28319 to 6.28319 rad"),
+        ("dvl0", "9000000000,0,25,0", r"data.csv:10: the velocity of the DVL is 25 m/s \(allowed: -20 to 20 m/s"),
+    ],
+)  # fmt: skip
+def test_a_bad_row_is_named_with_its_value(folder, tmp_path, sensor, line, message):
+    copied = copy_of(folder, tmp_path)
+    with (copied / "mav0" / sensor / "data.csv").open("a") as file:
+        file.write(line + "\n")
+    with pytest.raises(TwinError, match=message):
+        open_dataset(copied, ReplayOptions())
+    assert open_dataset(copied, ReplayOptions(aiding=False)).aiding is None
+
+
+def copy_of(folder, tmp_path):
+    """Returns a copy of a data set."""
+    shutil.copytree(folder, tmp_path / "set")
+    return tmp_path / "set"
+
+
+@pytest.mark.parametrize("text", ["sigma: [1, 2]", "sigma: small", "sigma: -1"])
+def test_an_impossible_standard_deviation_is_named(folder, tmp_path, text):
+    copied = copy_of(folder, tmp_path)
+    (copied / "mav0" / "pressure0" / "sensor.yaml").write_text(text)
+    with pytest.raises(
+        TwinError, match=r"(?s)sensor.yaml: sigma: .* \(allowed: a number or 1 numbers|are -1 \(allowed: positive"
+    ):
+        open_dataset(copied, ReplayOptions())
+
+
+def test_readings_without_a_standard_deviation_or_a_direction_of_gravity_are_not_used(folder, tmp_path):
+    copied = copy_of(folder, tmp_path)
+    (copied / "mav0" / "ahrs0" / "sensor.yaml").unlink()
+    aiding = open_dataset(copied, ReplayOptions()).aiding
+    assert aiding.used == ["dvl"]
+    assert aiding.notes[0] == "The readings in ahrs0 are not used: sensor.yaml states no `sigma`."
+    assert "no attitude states the direction of gravity" in aiding.notes[1]
+    assert read_folder(tmp_path, np.eye(4)) is None
+
+
+def series(rate_hz, values, sigma):
+    return SensorSeries(np.arange(len(values)) / rate_hz + 5.0, np.array(values, float), np.full(len(values[0]), sigma))
+
+
+def test_velocities_are_interpolated_and_their_noise_is_that_of_a_frame():
+    """At 5 Hz, 3 frames at 15 Hz share a reading: their sum has the variance of 3 independent errors 3^0.5 larger."""
+    velocity = series(5.0, [[0, 0, 0], [0.2, 0, 0], [0.2, 0, 0]], 0.01)
+    aiding = Aiding(RecordedReadings(np.eye(4), velocity=velocity), np.eye(4), 5.0, 15.0)
+    np.testing.assert_allclose(aiding.at(0.1).dvl_mps, [0.1, 0, 0])
+    assert aiding.at(0.5).dvl_mps is None and aiding.at(0.1).pressure_z_m is None
+    assert aiding.noise.dvl_mps == pytest.approx(0.01 * 3**0.5)
+    gapped = series(5.0, [[0.1, 0, 0]] * 5, 0.01)
+    gapped = Aiding(
+        RecordedReadings(np.eye(4), velocity=gapped._replace(times_s=np.array([5, 5.2, 5.4, 5.6, 6.6]))),
+        np.eye(4),
+        5.0,
+        15.0,
+    )
+    assert gapped.at(0.5).dvl_mps is not None and gapped.at(1.0).dvl_mps is None
+
+
+def test_an_attitude_belongs_to_the_frame_within_ten_milliseconds():
+    attitude = series(10.0, [[0, 0, 0.1], [0, 0, 0.2]], 0.01)
+    aiding = Aiding(RecordedReadings(np.eye(4), attitude=attitude), np.eye(4), 5.0, 15.0)
+    assert aiding.at(0.009).ahrs_rpy_rad[2] == 0.1 and aiding.at(0.011).ahrs_rpy_rad is None
+
+
+STATIC = {
+    ("base_link", bags.LEFT): RIG.body_from_camera,
+    ("base_link", "dvl"): geometry.pose(np.eye(3), np.array([0.3, 0, 0])),
+}
+
+
+def bag_readings(tmp_path, *messages):
+    """Returns the readings in a bag of one stereo pair and the given messages (topic, message) at its start."""
+    start = bags.START_NS
+    found = [
+        ("/tf_static", start, bags.ROS.transforms(start, STATIC)),
+        *bags.stereo(recorded.frames(recorded.poses(1))),
+    ]
+    path = bags.write(tmp_path / "bag", [*found, *((topic, start, message) for topic, message in messages)])
+    readings = BagReader().read(path).readings
+    if isinstance(readings, TwinError):
+        raise readings
+    return readings
+
+
+def attitude_message(**changed):
+    message = bags.ROS.attitude(bags.START_NS, np.array([0.1, 0.2, 0.3]), SIGMAS_RAD)
+    for key, value in changed.items():
+        setattr(message.orientation if key == "w" else message, key, value)
+    return message
+
+
+def test_the_body_of_a_bag_is_the_frame_of_its_attitude(tmp_path):
+    found = bag_readings(tmp_path, ("/imu/data", attitude_message()))
+    np.testing.assert_allclose(found.attitude.values, [[0.1, 0.2, 0.3]], atol=1e-12)
+    np.testing.assert_allclose(found.attitude.sigmas, SIGMAS_RAD)
+    np.testing.assert_allclose(found.body_from_left, RIG.body_from_camera)
+
+
+def test_readings_of_a_bag_that_cannot_be_used_are_named(tmp_path):
+    start, speed = bags.START_NS, np.array([0.1, 0, 0])
+    unknown = attitude_message(orientation_covariance=np.zeros(9))
+    elsewhere = bags.ROS.velocity(start, speed, 0.01)
+    elsewhere.header.frame_id = "dvl"
+    cases = {
+        "they state no covariance": [("/imu", unknown)],
+        r"several topics have it \(/a, /b\)": [("/a", attitude_message()), ("/b", attitude_message())],
+        "the DVL is not at the origin": [("/imu", attitude_message()), ("/dvl", elsewhere)],
+        "no covariance": [("/pressure", bags.ROS.pressure(start, 2e5, 0.0))],
+    }
+    for number, (note, messages) in enumerate(cases.items()):
+        assert re.search(note, " ".join(bag_readings(tmp_path / str(number), *messages).notes)), note
+    with pytest.raises(TwinError, match=r"/imu: message 1: the orientation is 3, .* \(allowed: a unit quaternion\)"):
+        bag_readings(tmp_path / "bad", ("/imu", attitude_message(w=3.0)))

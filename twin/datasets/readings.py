@@ -1,0 +1,157 @@
+"""Recorded readings of navigation sensors: pressure, attitude and Doppler velocity log, and their EuRoC-like files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.datasets.text_files import read_table, read_yaml, text_rows
+from twin.errors import TwinError
+
+
+class SensorQuantity(NamedTuple):
+    """A measured quantity.
+
+    Args:
+        name: name for messages.
+        folder: folder of its readings in an EuRoC-like data set.
+        unit: unit of its values and standard deviations.
+        n: number of its values.
+        largest: largest absolute value.
+    """
+
+    name: str
+    folder: str
+    unit: str
+    n: int
+    largest: float
+
+
+HEIGHT = SensorQuantity("height from pressure", "pressure0", "m", 1, 12_000.0)
+ATTITUDE = SensorQuantity("attitude", "ahrs0", "rad", 3, 2 * np.pi)
+VELOCITY = SensorQuantity("velocity of the DVL", "dvl0", "m/s", 3, 20.0)
+
+
+class SensorSeries(NamedTuple):
+    """Readings of one sensor.
+
+    Args:
+        times_s: (n,) increasing times, in the clock of the data set [s].
+        values: (n, k) readings.
+        sigmas: (k,) standard deviations of a reading.
+    """
+
+    times_s: Array
+    values: Array
+    sigmas: Array
+
+
+class RecordedReadings(NamedTuple):
+    """Readings of the navigation sensors of a data set; None where a sensor was not recorded or cannot be used.
+
+    Args:
+        body_from_left: (4, 4) pose of the left camera, before rectification, in the body that the sensors refer to.
+        height: heights of the left camera above any horizontal plane [m].
+        attitude: roll, pitch and yaw of the body in a world whose z axis points up [rad].
+        velocity: velocities of the origin of the body over ground, in body axes [m/s].
+        notes: sentences on readings that are not used.
+    """
+
+    body_from_left: Array
+    height: SensorSeries | None = None
+    attitude: SensorSeries | None = None
+    velocity: SensorSeries | None = None
+    notes: tuple[str, ...] = ()
+
+
+def checked_series(
+    quantity: SensorQuantity, times_s: Array, values: Array, sigmas: Array, places: list[str]
+) -> SensorSeries:
+    """Returns the readings of a sensor after checking them.
+
+    Args:
+        quantity: the measured quantity.
+        times_s: (n,) times [s].
+        values: (n, k) readings.
+        sigmas: (k,) standard deviations.
+        places: place of each reading (file and line, or topic and message), for messages.
+
+    Raises:
+        TwinError: a time is not after that before, a value is not finite or too large, or a standard deviation is not
+            positive.
+    """
+    late = np.flatnonzero(np.diff(times_s) <= 0)
+    if len(late):
+        k = int(late[0]) + 1
+        problem = f"the time {times_s[k]:.9g} s is not after that of the reading before, {times_s[k - 1]:.9g} s"
+        raise TwinError(places[k], problem, "increasing times")
+    bad = np.argwhere(~(np.abs(values) <= quantity.largest))
+    if len(bad):
+        k, column = (int(index) for index in bad[0])
+        problem = f"the {quantity.name} is {values[k, column]:g} {quantity.unit}"
+        raise TwinError(places[k], problem, f"-{quantity.largest:g} to {quantity.largest:g} {quantity.unit}")
+    if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+        shown = ", ".join(f"{sigma:g}" for sigma in sigmas)
+        raise TwinError(places[0], f"the standard deviations of the {quantity.name} are {shown}", "positive numbers")
+    return SensorSeries(times_s, values, sigmas)
+
+
+def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
+    """Returns the readings in the folders pressure0, ahrs0 and dvl0 of an EuRoC-like data set; None without any.
+
+    `data.csv` has the time [ns] and the values, `sensor.yaml` their standard deviations as `sigma` (one number or one
+    per value). Readings without a standard deviation are not used.
+
+    Args:
+        root: folder of the sensors.
+        body_from_left: (4, 4) pose of the left camera in the body.
+
+    Raises:
+        TwinError: a file is damaged, or a value is impossible.
+    """
+    found: list[SensorSeries | None] = []
+    notes: list[str] = []
+    for quantity in (HEIGHT, ATTITUDE, VELOCITY):
+        file = root / quantity.folder / "data.csv"
+        sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.is_file() else None
+        if file.is_file() and sigmas is None:
+            notes.append(f"The readings in {quantity.folder} are not used: sensor.yaml states no `sigma`.")
+        found.append(None if sigmas is None else _read_csv(file, quantity, sigmas))
+    height, attitude, velocity = found
+    if not notes and height is attitude is velocity is None:
+        return None
+    return RecordedReadings(body_from_left, height, attitude, velocity, tuple(notes))
+
+
+def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array) -> SensorSeries | None:
+    """Returns the readings in a file data.csv; None without any.
+
+    Raises:
+        TwinError: a line is not a time and finite values, or a value is impossible.
+    """
+    rows, lines = read_table(file, 1 + quantity.n), [number for number, _ in text_rows(file)]
+    if not len(rows):
+        return None
+    places = [f"{file}:{number}" for number in lines]
+    return checked_series(quantity, rows[:, 0] * 1e-9, rows[:, 1:], sigmas, places)
+
+
+def _sigmas(file: Path, n: int) -> Array | None:
+    """Returns the standard deviations (n,) that a file sensor.yaml states as `sigma`; None if it states none.
+
+    Raises:
+        TwinError: the file is damaged, or `sigma` is neither a number nor n numbers.
+    """
+    value = read_yaml(file).get("sigma") if file.is_file() else None
+    if value is None:
+        return None
+    try:
+        given = np.array(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        given = np.zeros(0)
+    if len(given) not in (1, n):
+        raise TwinError(f"{file}: sigma", f"{str(value)[:60]!r} is not allowed", f"a number or {n} numbers")
+    return np.broadcast_to(given, (n,)).copy()

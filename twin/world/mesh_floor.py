@@ -1,0 +1,245 @@
+"""Sea floor that is a mesh, e.g. a photogrammetric model: what is rendered, and its surface as seen from above.
+
+The mesh is rendered in tiles. Plan, clearance, placed objects and the surrogate use a height grid of its highest
+surface. The truth of the map is the highest surface at each cell, by a parallel projection of all triangles. Below the
+mesh lies a height grid of its lowest surface that faces up, lowered so that it is seen only through holes of the mesh;
+holes have the height and the colour of the nearest node of the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, minimum_filter
+
+import terrains
+from terrains.objects.floor_mesh import (
+    FloorTiles,
+    divided,
+    downward_part,
+    levelled,
+    median_edge_m,
+    raised,
+    tiles_of,
+    upward_part,
+)
+from terrains.objects.mesh import Mesh, extent
+from terrains.objects.mesh_file import read_textured_mesh
+from terrains.terrain import texture_shape
+from twin.core.records import Array, Image, MapGrid
+from twin.errors import TwinError
+from twin.imaging.mesh_raster import Projection, Target, draw_mesh
+from twin.imaging.object_view import Objects, draw_objects
+from twin.scenario.model import Scenario, TerrainConfig
+from twin.world.coverage import true_heights
+from twin.world.top_surface import FROM_ABOVE, FROM_BELOW, OVERHANG_M
+
+FIELD = "terrain.mesh_file"
+FINEST_GRID_M = 0.005  #: least spacing of the height grid
+MOST_NODES = 2_000_000  #: of the height grid; its spacing grows beyond `terrain.grid_m` if necessary
+MARGIN_M = 0.005  #: by which the height grid below the mesh is lowered
+_ROWS_PER_BLOCK = 256  # the images of a block take 35 bytes per texel
+
+Layer = NDArray[np.float32]
+
+
+class MeshFloor(NamedTuple):
+    """Sea floor that is a mesh.
+
+    Args:
+        terrain: height grid of the highest surface, with its colours as texture.
+        under: height grid below the mesh, which is rendered with it.
+        tiles: the mesh.
+    """
+
+    terrain: terrains.Terrain
+    under: terrains.Terrain
+    tiles: FloorTiles
+
+
+class FloorSurface(NamedTuple):
+    """Surface of a mesh floor from above: height [m] float32 and overhung bool (rows, cols), see `TopSurface`."""
+
+    height_m: Layer
+    overhung: NDArray[np.bool_]
+
+
+def load_mesh_floor(scenario: Scenario) -> MeshFloor:
+    """Reads the mesh of a scenario and computes its height grids.
+
+    Raises:
+        TwinError: a key contradicts terrain.kind, or the mesh cannot be read or used as a floor.
+    """
+    t = scenario.terrain
+    file = _mesh_file(t)
+    y_up = t.mesh_up == "y" or (t.mesh_up is None and file.suffix.lower() == ".glb")
+    whole = divided(levelled(read_textured_mesh(file, FIELD, y_up), t.mesh_scale))
+    grid = _node_grid(whole.mesh, t.grid_m, file)
+    top = -_depth([whole.mesh], grid, FROM_ABOVE)
+    covered = np.isfinite(top)
+    if not covered.any():
+        raise TwinError(FIELD, f"{file.name!r} has no surface that faces up", "a mesh that covers the planned area")
+    lowest_m = top[covered].min()
+    whole, top = raised(whole, -lowest_m), top - lowest_m
+    upward = upward_part(whole.mesh)
+    tiles = tiles_of(whole)
+    drawn, nearest = Objects((), floor=tiles), _nearest(covered)
+    top_m = top[nearest]
+    colours = _colours(drawn, grid, grid.cell_m)[0][nearest]
+    low = _lowest(upward, grid)
+    under_m = np.asarray(minimum_filter(np.where(np.isfinite(low), low, top_m), 3) - MARGIN_M, np.float32)
+    texture = _texture(drawn, grid, colours, scenario)
+    n_filled = int((~covered).sum())
+    return MeshFloor(_terrain(top_m, grid, texture, n_filled), _terrain(under_m, grid, colours, n_filled), tiles)
+
+
+def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
+    """Returns the highest surface of a mesh floor at the cell centres of a grid.
+
+    Where the mesh has a hole, this is the height grid below it. A cell is overhung if the mesh has a surface that faces
+    down more than OVERHANG_M above one that faces up.
+    """
+    meshes = [tile.placed.model.levels[0].mesh for tile in floor.tiles.tiles]
+    top = -_depth(meshes, grid, FROM_ABOVE)
+    low = _depth([upward_part(mesh) for mesh in meshes], grid, FROM_BELOW)
+    roof = -_depth([downward_part(mesh) for mesh in meshes], grid, FROM_ABOVE)
+    under = true_heights(grid, floor.under.height_at)
+    return FloorSurface(np.where(np.isfinite(top), top, under), roof - low > OVERHANG_M)
+
+
+def _mesh_file(t: TerrainConfig) -> Path:
+    """Returns the file of the mesh; raises TwinError if it is missing, or other keys contradict it."""
+    if t.mesh_file is None:
+        raise TwinError(FIELD, "missing", 'a mesh, as terrain.kind is "mesh"')
+    for key in ("height_file", "texture_file", "orthophoto_file", "z", "cover", "plugin"):
+        if getattr(t, key) is not None:
+            raise TwinError(f"terrain.{key}", 'has no effect on a mesh (terrain.kind = "mesh")', "without it")
+    return Path(t.mesh_file)
+
+
+def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
+    """Returns the grid whose cell centres are the nodes of the height grid, in the middle of the extent of the mesh.
+
+    The spacing is the median length of an edge, but at least FINEST_GRID_M and at most `coarsest_m`, or as large as
+    MOST_NODES requires. Raises TwinError if the mesh is smaller than two nodes.
+    """
+    low, high = extent(mesh)
+    size = (high - low)[:2]
+    wanted_m = min(max(median_edge_m(mesh), FINEST_GRID_M), coarsest_m)
+    step_m = max(wanted_m, float(np.sqrt(size.prod() / MOST_NODES)), float(size.max()) / MOST_NODES)
+    n = np.floor(size / step_m + 1e-3).astype(int) + 1  # an extent of single precision may be too small
+    if n.min() < 2:
+        raise TwinError(
+            FIELD, f"{file.name!r} covers {size[0]:.3g} m x {size[1]:.3g} m", "a mesh that covers the planned area"
+        )
+    step_m = min(step_m, float((size / (n - 1)).min()) * (1 - 1e-6))  # rays along the border might pass by the mesh
+    west_m, north_m = -(n[0] - 1) * step_m / 2, (n[1] - 1) * step_m / 2
+    return MapGrid(west_m - step_m / 2, north_m + step_m / 2, step_m, int(n[1]), int(n[0]))
+
+
+def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
+    """Returns the depth (rows, cols) at which vertical rays through the cell centres first meet meshes; inf: never.
+
+    Args:
+        meshes: meshes in world axes.
+        grid: the grid.
+        axes: FROM_ABOVE, for the negative height of the highest surface, or FROM_BELOW, for that of the lowest.
+    """
+    depth = np.full((grid.rows, grid.cols), np.inf, np.float32)
+    for mesh in meshes:
+        draw_mesh(mesh, axes, _projection(grid, 0), Target(depth))
+    return depth
+
+
+def _projection(grid: MapGrid, first: int) -> Projection:
+    """Returns the parallel projection whose pixels are the cells of a grid from row `first` on."""
+    column, row = -grid.west_m / grid.cell_m - 0.5, grid.north_m / grid.cell_m - 0.5 - first
+    return Projection(1 / grid.cell_m, column, row, -np.inf, False)
+
+
+def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
+    """Returns the least height (rows, cols) of surfaces that face up: at the cell centre and of vertices in the cell.
+
+    It is inf where there are none.
+    """
+    low = _depth([upward], grid, FROM_BELOW)
+    x, y, z = upward.vertices_m[np.unique(upward.faces)].T
+    col, row = (x - grid.west_m) / grid.cell_m, (grid.north_m - y) / grid.cell_m
+    cells = np.clip(row, 0, grid.rows - 1).astype(np.int64), np.clip(col, 0, grid.cols - 1).astype(np.int64)
+    np.minimum.at(low, cells, z)
+    return low
+
+
+def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Returns row and column (rows, cols) of the nearest covered node of each node."""
+    rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
+    return rows, cols
+
+
+def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArray[np.bool_]]:
+    """Returns the colours (rows, cols, 3) of the mesh from above, and in which cells the mesh is seen.
+
+    Args:
+        drawn: the tiles of the mesh.
+        grid: the cells; their width is `grid.cell_m`.
+        row_m: their height, nearly equal to the width.
+    """
+    stretch = grid.cell_m / row_m
+    axes = np.diag([1.0, stretch, 1.0, 1.0]) @ FROM_ABOVE
+    colours, seen = np.zeros((grid.rows, grid.cols, 3), np.uint8), np.zeros((grid.rows, grid.cols), np.bool_)
+    square = replace(grid, north_m=grid.north_m * stretch)
+    for first in range(0, grid.rows, _ROWS_PER_BLOCK):
+        rows = slice(first, min(first + _ROWS_PER_BLOCK, grid.rows))
+        shape = rows.stop - rows.start, grid.cols
+        normal, uv = (np.empty((*shape, 3), np.float32) for _ in range(2))
+        label = np.zeros(shape, np.uint16)
+        target = Target(np.full(shape, np.inf, np.float32), colours[rows], normal, label, uv)
+        view = _projection(square, first)
+        draw_objects(drawn, target, axes, _borders(view, shape), view)
+        seen[rows] = label > 0
+    return colours, seen
+
+
+def _borders(view: Projection, shape: tuple[int, int]) -> Array:
+    """Returns the planes (4, 4) around a parallel view with (rows, cols) pixels, see `Objects.in_view`."""
+    corner = np.array([view.cx_px, view.cy_px])
+    west, north = (-0.5 - corner) / view.focal_px
+    east, south = (np.array(shape[::-1]) - 0.5 - corner) / view.focal_px
+    return np.array([[1, 0, 0, -west], [-1, 0, 0, east], [0, 1, 0, -north], [0, -1, 0, south]], np.float64)
+
+
+def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) -> Image:
+    """Returns the texture (h, w, 3) of the highest surface, between the outermost nodes of the height grid.
+
+    Args:
+        drawn: the tiles of the mesh.
+        grid: grid of the nodes.
+        colours: (rows, cols, 3) colours of the nodes, which fill holes.
+        scenario: size of the texels.
+    """
+    t, ny, nx = scenario.terrain, grid.rows, grid.cols
+    size_m = (nx - 1) * grid.cell_m, (ny - 1) * grid.cell_m
+    texel_m = terrains.TextureSource(scenario.texel_m, coarsen=t.texture_px_m is None).texel_m(size_m)
+    rows, cols = texture_shape((ny, nx), grid.cell_m, texel_m)
+    west_m, north_m = grid.west_m + grid.cell_m / 2, grid.north_m - grid.cell_m / 2
+    texels = MapGrid(west_m, north_m, size_m[0] / cols, rows, cols)
+    texture, seen = _colours(drawn, texels, size_m[1] / rows)
+    row, col = np.nonzero(~seen)
+    node_row, node_col = (row + 0.5) / rows * (ny - 1), (col + 0.5) / cols * (nx - 1)
+    texture[row, col] = colours[np.rint(node_row).astype(int), np.rint(node_col).astype(int)]
+    return texture
+
+
+def _terrain(height_m: Layer, grid: MapGrid, texture: Image, n_filled: int) -> terrains.Terrain:
+    """Returns the terrain with the heights (rows, cols) of the nodes of a grid, row 0 = north."""
+    west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
+    heights, texel_m = (
+        np.ascontiguousarray(height_m[::-1], np.float32),
+        (grid.cols - 1) * grid.cell_m / texture.shape[1],
+    )
+    return terrains.Terrain(heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m, n_filled)
