@@ -1,8 +1,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
+PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: env demo test slow agreement
+.PHONY: env demo test long slow agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions
 
@@ -19,7 +20,10 @@ test: env ## style, types and the fast tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest $(PARALLEL)
+
+long: env ## small surveys, their reports and Monte Carlo references: tests of seconds each
+	$(BIN)/python -m pytest -m 'long and not slow' $(PARALLEL)
 
 slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow

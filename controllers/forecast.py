@@ -60,8 +60,8 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
 
     Args:
         plan: the survey plan.
-        baseline_m: stereo baseline b.
-        disparity_sigma_px: standard deviation sigma_d of the disparity.
+        baseline_m: stereo baseline b [m].
+        disparity_sigma_px: standard deviation sigma_d of the disparity [px].
     """
     tracks = range(1, plan.n_tracks + 1)
     keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])

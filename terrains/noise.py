@@ -45,7 +45,7 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
 
     The random values of every octave have the same standard deviation, so an image of a floor with this texture shows
     detail at any distance. Starting with the coarsest octave, the field is repeatedly doubled in size and the next
-    octave is added. The total computing time is 4/3 of that of the finest octave.
+    octave is added.
 
     Args:
         shape: (rows, cols) of the result.

@@ -13,6 +13,7 @@ from twin.app.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
 from twin.surrogate.error_model import BinningFactors, ScatterLaw
+from twin.surrogate.window_texture import EVEN_TEXTURE, WindowTexture
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 
@@ -59,7 +60,7 @@ def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2
     """The error model has no scatter over cells, and further keyframes, which depend on the baseline, add nothing."""
     fitted = error_model_file.load()
     gainless = fitted.model.depth_error._replace(gain=0.0)
-    model = fitted.model._replace(depth_error=gainless, depth_cell_scatter=ScatterLaw(0.0, 1.0))
+    model = fitted.model._replace(depth_error=gainless, depth_texture_scatter=ScatterLaw(0.0, 1.0))
     error_model_file.save(replace(fitted, model=model), tmp_path / "one.toml")
     flat = (
         "terrain.kind=flat",
@@ -77,33 +78,41 @@ def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2
 FITTED = error_model_file.load()
 
 
-def _expected_over_a_flat_floor(binning, model, monkeypatch):
+def _expected_over_a_flat_floor(binning, model, monkeypatch, texture=EVEN_TEXTURE):
     """Returns the expected error where the estimators bin the images, with a bound of 0.05 px of the matched images."""
     mission = prepare(load_scenario("reef", [*SMALL, "terrain.kind=flat", "terrain.relief_m=0.0"]))
     fitted = replace(FITTED, model=model)
     monkeypatch.setattr(expected_error.error_model_file, "load", lambda _: fitted)
     matching = SimpleNamespace(
-        binning=binning, depths_m=np.array([1.0, 3.0]), bounds_px=np.full(2, 0.05), lamp_share=1.0
-    )
+        binning=binning, depths_m=np.array([1.0, 3.0]), bounds_px=np.full(2, 0.05), lamp_share=1.0,
+        window_bounds_px=np.full(2, 0.05 * texture.median_ratio), texture=texture,
+    )  # fmt: skip
     monkeypatch.setattr(expected_error, "Matchability", lambda *_: matching)
     return expected_error.expected_error(mission, forecast_over_floor(mission))
 
 
-@pytest.mark.parametrize(("binning", "law"), [(1, 0.4), (2, 0.5)])
-def test_the_expected_error_scatters_over_cells_by_the_share_of_the_error_model(binning, law, monkeypatch):
-    """The logarithm of the error, over a level floor at one depth, has the standard deviation 0.6 times the law."""
-    model = FITTED.model._replace(
-        depth_cell_scatter=ScatterLaw(0.4, 0.0), depth_binned_scatter=BinningFactors(0.5, 0.5), error_scatter_share=0.6
+@pytest.mark.parametrize("binning", [1, 2])
+def test_the_expected_error_scatters_over_cells_as_the_texture_over_windows(binning, monkeypatch):
+    """The logarithm of the error, over a level floor at one depth, has the standard deviation 0.6 times 2 times 0.2."""
+    model = FITTED.model._replace(depth_texture_scatter=ScatterLaw(2.0, 0.0), error_scatter_share=0.6)
+    found = _expected_over_a_flat_floor(binning, model, monkeypatch, WindowTexture(1.0, 0.2))
+    assert np.log(found.sigma_m).std() == pytest.approx(0.6 * 0.4, rel=0.01)  # 20,000 even quantiles
+
+
+def test_the_expected_error_is_that_of_the_bound_of_the_median_window(monkeypatch):
+    """The depth error is proportional to the bound here, and all other errors of a level floor are zero."""
+    proportional = FITTED.model.depth_error._replace(floor_px=0.0)
+    model = FITTED.model._replace(depth_error=proportional, depth_texture_scatter=ScatterLaw(0.0, 1.0))
+    even, uneven = (
+        _expected_over_a_flat_floor(1, model, monkeypatch, WindowTexture(ratio, 0.4)).sigma_m for ratio in (1.0, 1.3)
     )
-    found = _expected_over_a_flat_floor(binning, model, monkeypatch)
-    assert np.log(found.sigma_m).std() == pytest.approx(0.6 * law, rel=0.01)  # 20,000 even quantiles
+    np.testing.assert_allclose(uneven / even, 1.3, rtol=1e-9)
 
 
 def test_the_expected_error_of_binned_images_has_the_factor_of_the_error_model(monkeypatch):
     """A pixel of binned images is two pixels wide, so the same error in pixels is twice as large in metres."""
-    none = BinningFactors(0.0, 0.0)
     model = FITTED.model._replace(
-        depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_binned_scatter=none, depth_binned_error=BinningFactors(1.5, 2.0)
+        depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_binned_error=BinningFactors(1.5, 2.0)
     )
     full, binned = (_expected_over_a_flat_floor(by, model, monkeypatch).sigma_m for by in (1, 2))
     np.testing.assert_allclose(binned / full, 2 * 1.5, rtol=1e-9)
@@ -118,6 +127,15 @@ def test_a_plan_on_the_plane_warns_of_the_overlap_that_the_floor_lacks(summary):
 def test_effects_that_the_error_model_leaves_out_are_named():
     given = summary_of("calibration_error.focal_error=0.01").warnings
     assert "the expected error does not include the effects of [calibration_error]" in given
+
+
+def test_the_summary_counts_the_objects_and_names_a_surrogate_that_leaves_them_out():
+    crate = 'objects=[{shape="crate", position_m=[0.0, 0.0], size_m=0.3}]'
+    for fidelity, left_out in (("rendered", False), ("surrogate", True)):
+        given = summary_of(crate, f"imaging.fidelity={fidelity}")
+        assert plan_summary.as_json(given, "")["objects"] == 1
+        assert dict(plan_summary.rows(given))["objects"].startswith("1, not included" if left_out else "1, included")
+        assert any(w.endswith("both leave out [[objects]]") for w in given.warnings) == left_out
 
 
 def test_the_table_has_four_statistics_in_ascending_order(summary):

@@ -328,6 +328,17 @@ def test_two_images_of_the_same_name_are_refused(tmp_path):
         read_dataset(tmp_path)
 
 
+def test_a_superscript_digit_is_no_number(euroc, tmp_path):
+    recorded.write_folder(tmp_path / "plain", frames_of(2))
+    for side in ("left", "right"):
+        (tmp_path / "plain" / side / "0001.png").rename(tmp_path / "plain" / side / "\u00b2.png")
+    (tmp_path / "plain" / "times.txt").unlink()
+    assert len(read_dataset(tmp_path / "plain")[0].images) == 2
+    (euroc / "mav0" / "cam0" / "data.csv").write_text("\u00b2,a.png\n")
+    with pytest.raises(TwinError, match="is not a time and a file name"):
+        read_dataset(euroc)
+
+
 @pytest.mark.parametrize("name", ["../../../secret.png", "/etc/passwd", "a\0b"])
 def test_a_list_cannot_name_a_file_outside_its_folder(euroc, name):
     (euroc / "mav0" / "cam0" / "data.csv").write_text(f"1000000000,{name}\n")
@@ -437,3 +448,20 @@ def test_a_pose_per_line_belongs_to_the_frame_of_its_number_also_where_an_image_
         row = int(np.argmin(np.abs(truth.times_s - frame.time_s)))
         assert truth.times_s[row] == pytest.approx(frame.time_s, abs=1e-9)
         np.testing.assert_allclose(truth.world_from_camera[row], poses[int(frame.left.stem)], atol=1e-9)
+
+
+def test_a_stored_image_of_another_size_is_not_used():
+    """A reader of another package returns objects whose `pixels` may ignore the size."""
+
+    class Stored:
+        name = "frame 7"
+
+        def size_px(self):
+            return 6, 4
+
+        def pixels(self, size_px):
+            return np.zeros((4, 6), np.uint8)
+
+    assert image_files.read_rgb(Stored(), (6, 4), image_files.ImageFormat()).shape == (4, 6, 3)
+    with pytest.raises(image_files.UnreadableImage, match="another size"):
+        image_files.read_rgb(Stored(), (8, 4), image_files.ImageFormat())

@@ -13,12 +13,15 @@ from recorded_datasets import RIG
 import twin
 from twin.core import geometry
 from twin.core.records import Readings
-from twin.datasets.aiding import Aiding
+from twin.core.settings import EstimatorSettings
+from twin.datasets.aiding import Aiding, Opening
 from twin.datasets.bag_reader import BagReader
 from twin.datasets.readings import RecordedReadings, SensorSeries, read_folder
 from twin.datasets.replay import ReplayOptions, open_dataset
 from twin.errors import TwinError
 from twin.exchange import euroc, ros2
+
+pytestmark = pytest.mark.long
 
 N = 8
 SIGMAS_RAD = np.deg2rad([0.2, 0.2, 0.5])
@@ -98,7 +101,7 @@ def test_an_attitude_of_another_body_is_a_warning(tmp_path):
 @pytest.mark.parametrize(
     ("sensor", "line", "message"),
     [
-        ("pressure0", "2000000000,nan", r"pressure0/data.csv:10: is not a line of numbers \(allowed: 2 finite"),
+        ("pressure0", "2000000000,deep", r"pressure0/data.csv:10: is not a line of numbers \(allowed: 2 finite"),
         ("pressure0", "2000000000", r"pressure0/data.csv:10: is not a line of numbers"),
         ("pressure0", "1000000000,-28", r"data.csv:10: the time 1 s is not after .* before, 2.4 s \(allowed: incr"),
         ("pressure0", "9000000000,1e6", r"data.csv:10: the height from pressure is 1e\+06 m \(allowed: -12000 to"),
@@ -166,6 +169,34 @@ def test_an_attitude_belongs_to_the_frame_within_ten_milliseconds():
     attitude = series(10.0, [[0, 0, 0.1], [0, 0, 0.2]], 0.01)
     aiding = Aiding(RecordedReadings(np.eye(4), attitude=attitude), np.eye(4), 5.0, 15.0)
     assert aiding.at(0.009).ahrs_rpy_rad[2] == 0.1 and aiding.at(0.011).ahrs_rpy_rad is None
+
+
+@pytest.mark.parametrize(
+    ("attitude_s", "height_s", "known", "used"),
+    [
+        (0.0, 0.0, None, ["pressure", "attitude"]),
+        (20.0, 0.0, None, []),
+        (0.0, 20.0, None, ["attitude"]),
+        (20.0, 0.0, np.eye(4), ["pressure", "attitude"]),
+        (0.0, 20.0, np.eye(4), ["attitude"]),
+    ],
+)
+def test_readings_that_no_first_frame_has_are_not_used_later(monkeypatch, attitude_s, height_s, known, used):
+    """Heights of -30 m in a world whose start is at 1.5 m would otherwise be fused as they are."""
+    attitude, height = series(10.0, [[0.0, 0.0, 0.0]] * 300, 0.01), series(10.0, [[-30.0]] * 300, 0.01)
+    attitude = attitude._replace(times_s=attitude.times_s + attitude_s)
+    height = height._replace(times_s=height.times_s + height_s)
+    aiding = Aiding(RecordedReadings(np.eye(4), height=height, attitude=attitude), np.eye(4), 5.0, 10.0)
+    at_start = geometry.pose(np.eye(3), np.array([0.0, 0.0, 1.5]))
+    monkeypatch.setattr(Aiding, "_first_motions", lambda self, _: [(np.eye(4), self.at(k / 10)) for k in range(60)])
+    start = aiding.start(Opening((), RIG, EstimatorSettings(), at_start), known)
+    assert aiding.used == used and len(aiding.notes) == 2 - len(used)
+    assert (start is None) == (not used)
+    later = aiding.at(25.0)
+    assert (later.pressure_z_m is None) == ("pressure" not in used)
+    assert (later.ahrs_rpy_rad is None) == ("attitude" not in used)
+    if "pressure" in used:
+        assert later.pressure_z_m == pytest.approx(1.5 if known is None else 0.0)
 
 
 STATIC = {

@@ -26,6 +26,8 @@ from twin.plugin import loading
 from twin.report import recording, survey_page
 from twin.report.run_folder import load_run
 
+pytestmark = pytest.mark.long
+
 N = 10
 PATH = recorded.poses(N)
 
@@ -73,6 +75,8 @@ def test_the_run_folder_is_that_of_a_survey(replayed):
     np.testing.assert_array_equal(run.keyframes.map_from_world, replayed.elevation.map_from_world)
     page = survey_page.write_report(replayed.folder).read_text()
     assert "frames of recorded stereo data" in page and "reference plane" not in page
+    assert "moved by the alignment of the replay" in page and "no transform is fitted" not in page
+    assert "points to the bow" not in page
     assert recording.write_recording(replayed.folder).is_file()
 
 

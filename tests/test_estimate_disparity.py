@@ -164,3 +164,16 @@ def test_the_stereo_geometry_is_the_two_view_geometry_of_the_rig():
     view = epipolar.two_view(right_from_left, RIG.matrix, RIG.baseline_m)
     np.testing.assert_allclose(view.matrix, epipolar.STEREO.matrix, atol=1e-12)
     np.testing.assert_allclose(view.epipole, epipolar.STEREO.epipole, atol=1e-12)
+
+
+def test_a_disparity_that_the_last_iteration_makes_negative_is_unknown():
+    """The other image is moved so that the true disparity is -0.3 px: no point in front of both cameras has it."""
+    rng = np.random.default_rng(4)
+    texture = cv2.GaussianBlur(rng.normal(127, 200, (60, 90)).astype(np.float32), (0, 0), 2)
+    moved = cv2.warpAffine(
+        texture, np.array([[1, 0, 0.3], [0, 1, 0]]), (90, 60), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    start = np.full((60, 90), 0.2, np.float32)
+    found = epipolar.refine(texture, moved, start, epipolar.STEREO, iterations=1)
+    assert np.isnan(found.disparity_px[10:-10, 10:-10]).mean() > 0.9
+    assert not (found.disparity_px < 0).any() and np.isnan(found.sigma_px[np.isnan(found.disparity_px)]).all()

@@ -9,6 +9,7 @@ from twin.core.records import MapGrid
 from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, MeanIllumination, build_map
+from twin.estimate.mapping.surface import HeightPatch
 
 RIG = small_rig(160, 120)
 GRID = MapGrid(-2.0, 1.6, 0.02, 160, 200)
@@ -141,6 +142,37 @@ def test_the_lower_of_two_heights_is_chosen_unless_the_higher_is_much_more_certa
 def test_two_heights_that_agree_form_one_hypothesis():
     _, sigma = fused_heights((0.0, 1e-4), (0.001, 1e-4))
     np.testing.assert_allclose(sigma, 0.01 / np.sqrt(2), rtol=1e-3)
+
+
+def level_map(low_m, area):
+    """Returns heights around the centre of two views of a floor, level at 0; the second has `low_m` in an area."""
+    mapper = elevation.ElevationMapper(GRID)
+    for lowered in (np.zeros(X.shape, bool), area):
+        height = np.where((np.abs(X) < 0.4) & (np.abs(Y) < 0.4), 0.0, np.nan).astype(np.float32)
+        height[lowered] = low_m
+        variance_m2, systematic_m2 = (np.full(X.shape, variance, np.float32) for variance in (1e-4, 1e-6))
+        pixel = np.zeros((*X.shape, 2), np.float32)
+        mapper.fuse(HeightPatch(0, 0, height, variance_m2, systematic_m2, pixel, 0.002))
+    return mapper.result().height_m
+
+
+def block(rows, cols):
+    area = np.zeros(X.shape, bool)
+    area[80 : 80 + rows, 100 : 100 + cols] = True
+    return area
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(1, 1), (1, 2), (2, 1)])
+def test_a_lower_height_that_the_neighbours_contradict_is_not_chosen(rows, cols):
+    np.testing.assert_allclose(level_map(-0.3, block(rows, cols))[block(rows, cols)], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(2, 2), (2, 8), (8, 8)])
+def test_the_lower_height_is_chosen_at_the_corners_and_sides_of_a_pit(rows, cols):
+    area = block(rows, cols)
+    found = level_map(-0.3, area)
+    np.testing.assert_allclose(found[area], -0.3, atol=1e-6)
+    np.testing.assert_allclose(found[~area & np.isfinite(found)], 0.0, atol=1e-6)
 
 
 def test_sigma_of_cells_next_to_a_step_includes_the_height_of_the_other_side():

@@ -1,6 +1,7 @@
 """Tests of the storage of the keyframes' images."""
 
 import numpy as np
+import pytest
 
 from twin.estimate.vision import image_spool, matching
 
@@ -16,4 +17,17 @@ def test_a_pair_larger_than_the_cache_is_still_returned(tmp_path, monkeypatch):
         for got, image, expected in zip(spool.gray(row), spool.pair(row), levels[2 * row : 2 * row + 2], strict=True):
             np.testing.assert_allclose(got, expected, atol=0.0625)  # half precision below 256
             np.testing.assert_allclose(matching.gray(image), expected)
+    spool.close()
+
+
+@pytest.mark.parametrize("contents", [b"", b"\x89PNG\r\n", b"no image"])
+def test_a_damaged_image_is_an_error_that_names_its_file(tmp_path, contents):
+    spool = image_spool.ImageSpool(tmp_path)
+    image = np.zeros((24, 32, 3), np.uint8)
+    spool.put(3, image, image, (matching.gray(image), matching.gray(image)))
+    spool.flush()
+    (tmp_path / "000003_right.png").write_bytes(contents)
+    assert spool.left(3).shape == image.shape
+    with pytest.raises(OSError, match="000003_right.png is damaged"):
+        spool.pair(3)
     spool.close()

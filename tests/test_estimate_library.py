@@ -12,6 +12,8 @@ from twin.estimate.mapping import depth_filter, surface
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.viewing_plane import viewing_plane
 
+pytestmark = pytest.mark.long
+
 RENDERED = scene.small_rig(400, 300, 55.0, 0.15)
 CROP, ROW_SCALE = (slice(0, 280), slice(20, 360)), 0.9
 #: The same images cropped off centre, with rows resampled: fx / fy = 1 / 0.9.

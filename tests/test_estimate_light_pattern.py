@@ -7,7 +7,7 @@ from seafloor_scene import digitise, down_camera, plane, render_view, small_rig
 from twin.core.records import MapGrid
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
 from twin.estimate.vision import disparity
-from twin.estimate.vision.light_pattern import light_pattern
+from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
 
 RIG = small_rig(80, 60)  # images binned by 4
 INSIDE = np.s_[4:-4, 16:-4]
@@ -41,7 +41,7 @@ def test_the_light_of_lamps_is_not_matched_as_texture_once_it_is_known():
     rng = np.random.default_rng(2)
     surveyed = [faint_pair(x_m, 2.2, rng, lamps=60.0, contrast=0.06) for x_m in np.arange(12) * 0.7]
     truth = surveyed[0][1]
-    pattern = light_pattern(pair for pair, _ in surveyed)
+    pattern = light_pattern([pattern_fit(pair) for pair, _ in surveyed], (60, 80))
     assert pattern is not None
 
     def gross(left, right):
@@ -61,7 +61,7 @@ def test_the_map_of_a_faintly_textured_floor_is_right_without_the_light_pattern(
     grays = [faint_pair(x, 2.2, rng, lamps=60.0, contrast=0.06)[0] for x in x_m]
     pairs = [KeyframeImages(*(np.repeat(g[..., None], 3, 2).astype(np.uint8) for g in pair)) for pair in grays]
     path = KeyframePath(np.array([down_camera(x, 0.3 * x, 2.2) for x in x_m]), np.zeros((len(x_m), 6, 6)))
-    pattern = light_pattern(gray_levels(pair) for pair in pairs)
+    pattern = light_pattern([pattern_fit(gray_levels(pair)) for pair in pairs], (60, 80))
     grid = MapGrid(-1.0, 2.0, 0.1, 30, 52)
     median, median_before = (
         np.nanmedian(np.abs(build_map(pairs, path, RIG, grid, pattern=p).height_m)) for p in (pattern, None)
@@ -70,10 +70,32 @@ def test_the_map_of_a_faintly_textured_floor_is_right_without_the_light_pattern(
     assert median < 0.5 * median_before
 
 
-def test_texture_of_a_few_images_is_not_taken_for_a_light_pattern():
+def test_coefficients_that_vary_between_the_images_as_much_as_their_mean_are_left_in_the_images():
     rng = np.random.default_rng(3)
-    pairs = [faint_pair(x_m, 2.2, rng, contrast=1.0)[0] for x_m in (0.0, 0.7, 1.4)]
-    pattern = light_pattern(pairs)
+    fits = rng.normal(0.0, 1.0, (30, 2, 7, 7))
+    fits[:, :, 0, 2] += 20.0  # the light
+    pattern = light_pattern(list(fits), (60, 80))
     assert pattern is not None
-    assert (pattern.left - pattern.left.mean()).std() < 0.2 * np.std(pairs[0][0])
-    assert light_pattern(pairs[:1]) is None
+    found, mean = pattern_fit(pattern), fits.mean(axis=0)
+    np.testing.assert_allclose(found[:, 0, 2], mean[:, 0, 2], rtol=0.02)
+    others = np.ones((2, 7, 7), bool)
+    others[:, 0, 2] = False
+    assert np.sum(found[others] ** 2) < 0.5 * np.sum(mean[others] ** 2)
+
+
+def test_texture_that_dominates_the_light_is_not_taken_for_a_light_pattern():
+    """The images of the survey overlap by 90 %, so that their mean contains the texture of the floor."""
+    rng = np.random.default_rng(3)
+    fits = [pattern_fit(faint_pair(x_m, 2.2, rng, lamps=4.0, contrast=1.0)[0]) for x_m in np.arange(12) * 0.2]
+    assert light_pattern(list(fits), (60, 80)) is None
+
+
+def test_the_brightness_of_the_images_does_not_decide_whether_there_is_a_light_pattern():
+    rng = np.random.default_rng(4)
+    fits = rng.normal(0.0, 1.0, (20, 2, 7, 7))
+    fits[:, :, 0, 0] += 100.0
+    assert light_pattern(list(fits), (60, 80)) is None
+
+
+def test_one_keyframe_has_no_light_pattern():
+    assert light_pattern([np.ones((2, 7, 7))], (60, 80)) is None

@@ -9,6 +9,7 @@ from twin.core import geometry
 from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import Stopwatch
+from twin.errors import SurveyAborted
 from twin.estimate.network import KeyframeNetwork
 from twin.estimate.vision.keyframes import Keyframe
 
@@ -28,3 +29,25 @@ def network():
 def test_a_track_without_nodes_is_not_aligned(network):
     assert network.align_window(2) is None
     assert not network.history.alignments and not network.history.before_ga
+
+
+def test_after_any_error_of_a_measurement_nothing_is_pending_and_the_network_is_not_aligned(network):
+    def fails():
+        raise np.linalg.LinAlgError("singular")
+
+    for measure in (fails, list):
+        network._queue.submit(measure)
+    with pytest.raises(np.linalg.LinAlgError):
+        network.truncate(100)
+    network.truncate(100)
+    assert network.align_all() is None
+
+
+def test_an_alignment_that_fails_leaves_no_positions_before_it(network, monkeypatch):
+    def fails(*_, **__):
+        raise SurveyAborted("the global alignment failed")
+
+    monkeypatch.setattr(network, "_align", fails)
+    with pytest.raises(SurveyAborted):
+        network.align_window(1)
+    assert len(network.history.before_ga) == len(network.history.after_ga) == 0

@@ -188,3 +188,9 @@ def test_offsets_that_contradict_each_other_are_uncertain():
     contrary = combine([DisparityOffset(2e-3 + 0.02 * (-1) ** k, 1e-3) for k in range(20)], 20, 1.0, 277.0)
     assert agreeing.estimate == pytest.approx(contrary.estimate)
     assert contrary.sigma == pytest.approx(20 * agreeing.sigma)
+
+
+def test_the_value_of_a_finding_of_a_row_offset_is_comparable_with_its_limit():
+    result = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION._replace(row_offset_px=-0.3)])
+    (finding,) = check_survey(result, RIG)
+    assert finding.value == 0.3 > finding.limit and "-0.30 px" in finding.sentence

@@ -213,6 +213,16 @@ def test_an_ifdo_file_calls_the_images_of_a_replay_recorded(contents, tmp_path, 
     assert header.get("image-illumination") == (None if replayed else "artificial light")
 
 
+@pytest.mark.parametrize(
+    ("lamps", "sun_lx", "light"),
+    [([{}], 0.0, "artificial light"), ([], 100.0, "sunlight"), ([{}], 100.0, "mixed light")],
+)
+def test_an_ifdo_file_names_the_light_of_the_scenario(contents, tmp_path, lamps, sun_lx, light):
+    scenario = {"lamps": lamps, "sun": {"illuminance_lx": sun_lx}}
+    (file, _) = ifdo.export(replace(contents, scenario=scenario), tmp_path)
+    assert json.loads(file.read_text())["image-set-header"]["image-illumination"] == light
+
+
 def test_jpeg_is_written_on_request(contents, tmp_path):
     euroc.export(replace(contents, jpeg_quality=90), tmp_path)
     dataset, _ = read_dataset(tmp_path)

@@ -16,6 +16,8 @@ from twin.core.records import Readings
 from twin.errors import TwinError
 from twin.simulate.autopilot import nominal_controller
 
+pytestmark = pytest.mark.long
+
 SMALL = [
     "terrain.size_m=[4.0, 3.5]",
     "terrain.kind=flat",

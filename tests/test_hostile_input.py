@@ -29,6 +29,7 @@ from twin.world import limits
 LIMIT_S = 15.0
 
 
+@pytest.mark.long
 @settings(max_examples=25, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
 @given(mutations(), st.sampled_from((write_case, write_inline)))
 def test_a_mutated_scenario_is_accepted_or_refused(tmp_path_factory, changes, write):
@@ -236,6 +237,7 @@ def edited(text, key, value):
     return json.dumps(tree)
 
 
+@pytest.mark.long
 def test_an_edited_run_folder_is_read_or_refused_with_the_name_of_its_file(run_folder):
     refused = 0
     for name, key, value in EDITS:
@@ -266,6 +268,7 @@ def report_of(run_folder, tmp_path):
     return page
 
 
+@pytest.mark.long
 def test_the_report_shows_odd_texts_literally(report_of):
     page = report_of(
         ("metrics.json", "name", "<script>$\\frac[/x]"),
@@ -276,6 +279,7 @@ def test_the_report_shows_odd_texts_literally(report_of):
         assert text not in page and text.replace("<", "&lt;").replace(">", "&gt;").removeprefix("&lt;td&gt;") in page
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "key"), [("metrics.json", "map"), ("keyframes/index.json", "frames")])
 def test_the_report_of_a_run_without_a_part_is_written_or_refused(report_of, tmp_path, name, key):
     try:

@@ -119,6 +119,7 @@ def wall(height_m, spacing_m=0.05):
     return types.SimpleNamespace(height_m=height, spacing_m=spacing_m, west_m=-5.0, south_m=-5.0)
 
 
+@pytest.mark.long
 def test_the_shadow_of_a_wall_is_its_height_over_the_tangent_of_the_refracted_elevation():
     pose, depth = looking_down(2.0), np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
     to_sun = np.array(direction_to_sun(30.0, 180.0))  # in the west
@@ -214,6 +215,7 @@ def reference_scene(water, elevation_deg, surface_m, sky_share=0.2, albedo=0.0):
     return ReferenceScene(band, np.zeros((0, 7)), (), albedo, sun=sun), source, band
 
 
+@pytest.mark.long
 def test_the_reference_in_absorbing_water_is_exact():
     """Sun: mu0 E exp(-a z / mu0); sky: 2 pi integral L mu exp(-a z / mu); on a floor and on a plane above it."""
     _, source, _ = reference_scene("clear", 45.0, 5.0)

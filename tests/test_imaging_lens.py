@@ -90,6 +90,7 @@ def test_a_known_lens_is_rectified_to_a_hundredth_of_a_pixel(lens):
     assert np.abs(np.array(back) - [u + cameras.margin_px[0], v + cameras.margin_px[1]]).max() < 0.01
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lens", STRONG)
 def test_a_frame_of_a_known_lens_equals_that_of_a_pinhole(lens):
     cameras = make_true_cameras(scenario(lens=lens))

@@ -137,6 +137,7 @@ def light_of(**terrain: object) -> np.ndarray:
     return parts.total[..., 1]
 
 
+@pytest.mark.long
 def test_the_image_of_a_smooth_rough_floor_is_that_of_lambert() -> None:
     np.testing.assert_allclose(light_of(material="oren_nayar", roughness_deg=0.0), light_of(), rtol=1e-5)
 

@@ -58,6 +58,14 @@ def test_radiance_under_daylight_in_clear_water_is_albedo_over_pi():
     np.testing.assert_allclose(light, 1000 / np.pi * albedo / 255, rtol=1e-5)
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_illuminance_of_a_missing_floor_is_nan_also_in_clear_water():
+    depth = floor(3.0)[1]
+    depth[0, 0] = np.inf
+    lux = optics_with(CLEAR, (), SunConfig(illuminance_lx=1000)).floor_lx(depth, 0)
+    assert np.isnan(lux[0, 0]).all() and lux[CENTRE] == pytest.approx(1000, rel=1e-5)
+
+
 def test_a_lamp_in_clear_water_obeys_the_inverse_square_law_and_lamberts_cosine():
     optics = optics_with(CLEAR, (AT_CAMERA,), DARK)
     light = optics.radiance(*floor(2.0), 0)

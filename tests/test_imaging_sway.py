@@ -68,6 +68,17 @@ def test_the_largest_displacement_bounds_that_of_every_vertex(speed: float) -> N
     assert 0.97 * bound < most < bound * (1 + 1e-5)
 
 
+def test_the_bound_holds_for_a_plant_on_a_slope() -> None:
+    """The axis of the plant points 40 deg against the current, so the tip also moves with the current as it sinks."""
+    current_mps, item = np.array([5.0, 0.0, 0.0]), plant()
+    tilted = item.world_from_object @ geometry.pose(geometry.so3_exp(np.array([0.0, -0.7, 0.0])), np.zeros(3))
+    item = item._replace(world_from_object=tilted)
+    period_s = 2.0 * (KELP.high_m - KELP.low_m)[:2].max() / (sway.STROUHAL * 5.0)
+    most = max(np.linalg.norm(moved(item, current_mps, t), axis=1).max() for t in np.arange(30) / 30 * period_s)
+    bound = largest_displacement_m(item, current_mps)
+    assert 0.97 * bound < most < bound * (1 + 1e-5)
+
+
 def test_a_plant_that_bends_into_the_view_is_drawn() -> None:
     """The bounding sphere of the upright plant lies left of the view; the current bends its tip into the view."""
     camera = geometry.pose(geometry.rotations_of_down_camera(np.array(0.0)), np.array([0.0, 0.0, 12.0]))

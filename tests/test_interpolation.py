@@ -5,6 +5,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from twin.core import interpolation
+from twin.core.map_slopes import map_slopes
 
 ROWS, COLUMNS = np.mgrid[:9, :11].astype(np.float32)
 
@@ -39,3 +40,12 @@ def test_bilinear_interpolation_reproduces_bilinear_functions():
     image = 1 + 2 * COLUMNS + 3 * ROWS - COLUMNS * ROWS
     value = interpolation.bilinear(image, 5, 4, 0.6, 0.3)
     assert value == pytest.approx(1 + 2 * 4.3 + 3 * 5.6 - 4.3 * 5.6, abs=1e-5)
+
+
+def test_the_slopes_of_a_plane_are_exact_and_zero_along_a_single_cell():
+    """Height 0.3 x - 0.2 y: row 0 is in the north."""
+    x, y = np.meshgrid(np.arange(4) * 0.5, -np.arange(3) * 0.5)
+    plane = 0.3 * x - 0.2 * y
+    for part, expected in ((plane, (0.3, -0.2)), (plane[:1], (0.3, 0.0)), (plane[:, :1], (0.0, -0.2))):
+        for found, value in zip(map_slopes(part, 0.5), expected, strict=True):
+            np.testing.assert_allclose(found, np.full(part.shape, value), atol=1e-12)

@@ -17,6 +17,7 @@ from twin.app import doctor
 from twin.app.termination import sigterm_as_interrupt
 from twin.core.interrupts import StageGuard
 from twin.core.timing import Stopwatch
+from twin.errors import TwinError
 from twin.estimate.pipeline import Navigator
 from twin.exchange import mesh
 from twin.report import recording, survey_page
@@ -127,6 +128,15 @@ def test_an_interrupt_of_the_map_files_keeps_an_orthomosaic_that_was_finished(tm
         record = SurveyRecord(result, None, None, None, Stopwatch(), metrics, has_orthomosaic=finished)
         assert folder.finish(record, StageGuard())["reason"] == "interrupted; maps skipped"
     assert {file.name for file in tmp_path.glob("*.tif")} == ({"mosaic.tif"} if finished else set())
+
+
+def test_metrics_that_cannot_be_written_are_an_error_of_the_out_option(tmp_path):
+    result: Any = None
+    record = SurveyRecord(result, None, None, None, Stopwatch(), {"status": "complete", "reason": ""})
+    with RunFolder(tmp_path, Scenario(), None) as folder:
+        (tmp_path / "metrics.json").mkdir()
+        with pytest.raises(TwinError, match=r"--out: .*metrics.json cannot be written: "):
+            folder.finish(record, StageGuard())
 
 
 def test_an_interrupted_flight_and_an_interrupted_map_are_both_named(tmp_path, monkeypatch):

@@ -13,6 +13,8 @@ from twin.plugin import guard
 from twin.plugin.guard import GuardedPlugin, PluginFailed
 from twin.world.mission import load_terrain, prepare
 
+pytestmark = pytest.mark.long
+
 TINY = [
     "terrain.size_m=[5.0, 4.0]",
     "rig.image_width_px=192",
@@ -164,6 +166,13 @@ def test_a_fault_of_a_controller_ends_the_survey_with_its_name(tmp_path, name, r
     assert (result.folder / "metrics.json").exists()
     planned = Trajectory.load(result.folder / "trajectory_reference.tum")
     assert len(planned) > 0 and np.abs(planned.positions).max() < 3  # the plug-in could not change the plan
+
+
+def test_every_call_of_a_plugin_without_a_method_names_the_method():
+    plugin = GuardedPlugin("terrain.plugin", "twin.terrains", "other_package:Dunes", ["heights", "command"])
+    for method in ("command", "heights", "command"):
+        with pytest.raises(PluginFailed, match="terrain.plugin other_package:Dunes: has no method command"):
+            plugin.call(method, np.zeros(2), np.zeros(2), 1)
 
 
 def test_an_estimator_of_another_package_is_mapped_and_judged(tmp_path):

@@ -29,6 +29,7 @@ def run_tests(folder, target):
     assert done.returncode == 0, done.stdout[-3000:]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["controller", "reader"])
 def test_a_new_plugin_is_installed_by_pip_and_passes_its_own_test(tmp_path, kind):
     folder = tmp_path / f"my-{kind}"

@@ -14,6 +14,8 @@ from twin.exchange import mesh
 from twin.report import mesh_picture
 from twin.report.survey_page import write_report
 
+pytestmark = pytest.mark.long
+
 GRID = MapGrid(-2.0, 1.5, 0.05, 60, 80)
 ASPECT = mesh_picture.WIDTH_PX / mesh_picture.HEIGHT_PX
 

@@ -196,3 +196,10 @@ def test_the_live_viewer_logs_every_frame_and_the_path_at_keyframes(tmp_path):
     entities = contents(tmp_path / "live.rrd")
     assert entities["/world/rig"][1] == 6 and entities["/world/path/online"][1] == 2
     assert {"frame", "sim_time"} <= entities["/world/rig"][0]
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1), (2, 300_000)])
+def test_a_map_of_one_row_or_column_has_a_surface_without_triangles(shape):
+    """The last shape has one row after subsampling."""
+    surface = recording_surfaces.floor_surface(Raster(MapGrid(0, 0, 0.1, *shape), np.zeros(shape)))
+    assert len(surface.triangles) == 0 and (surface.normals == [0, 0, 1]).all()

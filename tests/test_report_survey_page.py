@@ -19,6 +19,8 @@ from twin.report.stage_table import stage_rows
 from twin.report.style import FIGURE_STYLE
 from twin.report.survey_page import sample_images, write_report
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

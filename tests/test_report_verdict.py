@@ -165,6 +165,28 @@ def test_a_replay_lists_only_figures_that_it_has():
     assert "Position error, final" in labels and not [label for label in labels if label.startswith("Map")]
 
 
+def test_the_altitude_of_a_plan_is_given_above_what_it_refers_to():
+    plane, floor = (
+        wording.conditions({"plan": {"altitude_m": 2.0, "height": height}}) for height in ("plane", "floor")
+    )
+    assert plane.startswith("2 m above the reference plane") and floor.startswith("2 m above the smoothed floor")
+
+
+def test_an_unfinished_replay_has_no_conditions():
+    assert wording.headline(None, {"replay": {}}) == "This replay is unfinished: it has no metrics.json."
+
+
+def test_links_without_a_closed_form_are_not_reported_as_missing():
+    links = copy.deepcopy(good()["links"])
+    assert "RMS translation error" in wording.closed_form_comparison(links)
+    for row in (links["along"], links["across"]):
+        row["closed_form_translation_rmse_m"] = None
+    assert "not computed" in wording.closed_form_comparison(links)
+    for row in (links["along"], links["across"]):
+        row["count"] = 0
+    assert "No motion" in wording.closed_form_comparison(links)
+
+
 def test_every_map_statistic_is_reported_with_completeness():
     metrics = changed(map={"completeness": 0.876, "completeness_area": 0.765})
     for figure in wording.key_figures(metrics):
@@ -272,3 +294,9 @@ def test_a_kinematic_vehicle_is_ideal():
     calm = [override for override in REAL if not override.startswith("current")]
     found = idealisations(load_scenario("reef", [*calm, 'vehicle.dynamics="kinematic"']))
     assert found == ["The water is ideal: no current.", "The vehicle is ideal: no forces, no inertia."]
+
+
+def test_an_area_without_the_centre_of_a_cell_is_named():
+    empty = changed(map={"completeness_area": None, "le90_area_m": None})
+    meaning = {figure.label: figure.meaning for figure in wording.key_figures(empty)}["Map LE90, asked area"]
+    assert meaning == "the asked area contains no cell centre"

@@ -62,6 +62,7 @@ def _within(truth, share):
     return share * truth.value + 3 * truth.standard_error
 
 
+@pytest.mark.long
 def test_table_and_files_hold_all_cells(tmp_path):
     found = list(cells(FEW._replace(pixels=PIXELS[:2]), 640, "petzold"))
     summary = write(found, tmp_path / "light")

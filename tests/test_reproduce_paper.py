@@ -150,6 +150,7 @@ def test_an_interrupted_alignment_ends_the_experiment():
         finished(navigator, StageGuard())
 
 
+@pytest.mark.long
 def test_the_figures_are_drawn(flights, tmp_path):
     both = {"coarse": flights.coarse, "fine": flights.fine}
     paper_sheet.draw_paths(both, tmp_path / "a.png")

@@ -11,6 +11,8 @@ from twin.reproduce.block import BLOCK_M, CORE_M, HEIGHT_M, block_on_sand
 from twin.reproduce.turbidity import SETTINGS, relative_contrast, render_levels, table, write
 from twin.scenario.file import load_scenario
 
+pytestmark = pytest.mark.long
+
 SMALL = ("rig.image_width_px=160", "rig.image_height_px=120")
 RANGES_M = np.array([0.5, 1.0, 2.0, 4.0])
 

@@ -12,6 +12,8 @@ import twin
 from twin import survey
 from twin.errors import TwinError
 
+pytestmark = pytest.mark.long
+
 EXAMPLE = Path(__file__).parent.parent / "docs" / "example_world.py"
 TINY = [
     "terrain.size_m=[5.0, 4.0]",

@@ -26,6 +26,11 @@ TURBIDITY = "water.turbidity = { log_uniform = [1.0, 40.0] }"
             "7: vary.water.turbidity.lognormal: [1.0, 40.0]: not allowed (allowed: one of unif",
         ),
         ("[1.0, 40.0]", '["a", 40.0]', "7: vary.water.turbidity.log_uniform.0: 'a': not allowed (allowed: a number)"),
+        (
+            "[1.0, 40.0]",
+            '["1.0", 40.0]',
+            "7: vary.water.turbidity.log_uniform.0: '1.0': not allowed (allowed: a number",
+        ),
         (TURBIDITY, "seed = { choice = [1, 2] }", "7: vary.seed: the seed cannot be set or varied here"),
         (
             '["water.jerlov", "sun',

@@ -44,6 +44,7 @@ def table(study, tmp_path):
     return rows(tmp_path / "whole")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jobs", [1, 2, 4])
 def test_the_table_does_not_depend_on_the_number_of_workers(study, table, tmp_path, jobs):
     with open_engine(jobs) as engine:

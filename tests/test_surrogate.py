@@ -46,6 +46,7 @@ from twin.surrogate.map_model import (
 from twin.surrogate.matchability import Matchability, bound_ratios, bounds_px, lamp_share, unevenness_px
 from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
 from twin.surrogate.vision import corner_count, match_sigma_px, overlap_inflation
+from twin.surrogate.window_texture import EVEN_TEXTURE, window_texture
 from twin.surrogate_fit import fit, rendered_surveys
 from twin.surrogate_fit.comparison import UNIT_PX, ComparisonVision, single_error_models
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
@@ -115,6 +116,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
     assert bound(15.0) > 100 > 1 > bound(2.0) > 2 * bound(1.2)
 
 
+@pytest.mark.long
 def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels():
     """Binned pixels show coarse texture better than the full images do."""
     found, unbinned = [], []
@@ -131,6 +133,7 @@ def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels
     assert all(px * binning < 0.9 * full for (binning, px), full in zip(found[1:], unbinned[1:], strict=True))
 
 
+@pytest.mark.long
 def test_a_survey_in_snow_that_prevents_all_matches_is_refused_even_with_extrapolate():
     """All bounds are infinite, so no binning is better than another and the matches have no error to sample."""
     size = "rig.image_width_px=128", "rig.image_height_px=96"
@@ -513,12 +516,16 @@ def test_an_edge_does_not_change_the_unevenness_of_the_floor_around_it():
 
 
 def test_the_variance_of_a_cell_decreases_with_the_number_of_keyframes_and_their_distance(vision, no_errors):
-    """By the law c + (1 - c) / (1 + g (n - 1)), g = gain B^2 / (B^2 + half^2), for steps B of 1 and 2 baselines."""
-    law, baseline_m = DepthLaw(0.1, 0.0, 0.0, 0.2, 2.0, 1.5), vision.rig.baseline_m
+    """By the law c + (1 - c) / (1 + g (n - 1)), g = gain B^2 / (B^2 + half^2) + noise_gain s, for steps B of 0 to 2.
+
+    The steps are in baselines, and the share s of image noise is 0.64 / (0.36 + 0.64).
+    """
+    law, baseline_m = DepthLaw(0.06, 2.0, 0.0, 0.2, 2.0, 1.5, 0.5), vision.rig.baseline_m
     errors, model = no_errors._replace(sigma_law=law, depth_sigma_px=np.full(2, 0.1)), vision.scene.map_model
+    errors = errors._replace(sigma_noise_share=law.noise_share(np.full(2, 0.04)))
     for part in model._runs:
         part[:] = 0
-    for step in (1, 2):
+    for step in (1e-6, 1, 2):
         poses = [tilted(0.1 + step * baseline_m * k, 0.2, 2.0) for k in range(4)]
         variances = {}
         for n in (1, 4):
@@ -528,11 +535,11 @@ def test_the_variance_of_a_cell_decreases_with_the_number_of_keyframes_and_their
                 patch.row : patch.row + patch.height_m.shape[0], patch.col : patch.col + patch.height_m.shape[1]
             ]
             variances[n] = np.where(model.views[window] == n, patch.variance_m2, np.nan)
-        gain = 2.0 * step**2 / (step**2 + 1.5**2)
+        gain = 2.0 * step**2 / (step**2 + 1.5**2) + 0.5 * 0.64
         ratio = (variances[4] / variances[1])[np.isfinite(variances[4] / variances[1])]
         assert len(ratio) > 1000
         np.testing.assert_allclose(ratio, 0.2 + 0.8 / (1 + 3 * gain), rtol=1e-4)
-        assert law.relative_variance(4, step) == pytest.approx(0.2 + 0.8 / (1 + 3 * gain))
+        assert law.relative_variance(4, step, 0.04) == pytest.approx(0.2 + 0.8 / (1 + 3 * gain))
 
 
 def test_the_errors_of_a_map_are_normal_with_the_standard_deviation_of_their_cell(vision, no_errors):
@@ -681,7 +688,7 @@ def test_rough_cells_have_more_holes(vision, no_errors):
     assert known[inside][rough[inside]].mean() < 0.9 * known[inside][~rough[inside]].mean()
 
 
-TRUE_DEPTH = DepthLaw(0.05, 1.5, 1.2, 0.05, 3.0, 1.4)
+TRUE_DEPTH = DepthLaw(0.05, 1.5, 1.2, 0.05, 3.0, 1.4, 0.8)
 TRUE_EDGE = SigmaLaw(0.7, 12.0)
 
 
@@ -691,19 +698,29 @@ def map_statistics(rng, scatter=0.02):
     The variances of sampled maps are the sums of those of their errors, with the parameters of `ErrorModel()`.
     """
     model = ErrorModel()
-    conditions = (0.02, 0, 0.5), (0.02, 1, 1.5), (0.04, 0, 3), (0.04, 1, 0.7), (0.1, 1, 2), (0.1, 0, 1)
+    conditions = (
+        (0.02, 0, 0.5),
+        (0.02, 1, 1.5),
+        (0.04, 0, 3),
+        (0.04, 1, 0.7),
+        (0.1, 1, 2),
+        (0.1, 0, 1),
+        (0.1, 0, 0.1),
+        (0.02, 0, 0.1),
+    )
     for bound_px, lamp, step in conditions:
         survey = {"bound_px": [bound_px], "lamp_share": [lamp], "binning": [1, 1], "metres_per_px": [8e-3**0.5]}
+        survey |= {"window_ratio": [1.0]}
         classes = ("smooth1", 1, 0.0), ("smooth4", 5, 0.0), ("smooth15", 20, 0.0), ("rough9", 11, 0.05)
         for name, views, rough_px in (*classes, ("rougher9", 11, 0.2), ("steep", 5, 0.0), ("edge", 4, 1.0)):
             pose, per_px2 = 1e-7, 8e-3
             lateral, edge = (1e-5 if name == "steep" else 0.0), (1e-3 if name == "edge" else 0.0)
-            depth_px = TRUE_DEPTH.sigma_px(bound_px, lamp) ** 2 * TRUE_DEPTH.relative_variance(views, step)
+            depth_px = TRUE_DEPTH.sigma_px(bound_px, lamp) ** 2 * TRUE_DEPTH.relative_variance(views, step, bound_px)
             relief = relief_error_px(rough_px, 0.4, 0.05) ** 2
             images = pose + per_px2 * (depth_px + relief) + 1.5**2 * lateral + TRUE_EDGE(bound_px) ** 2 * edge
             images *= float(np.exp(scatter * rng.standard_normal()))
             sampled_px = model.depth_error.sigma_px(bound_px, lamp) ** 2 * model.depth_error.relative_variance(
-                views, step
+                views, step, bound_px
             )
             sampled_px += relief_error_px(rough_px, model.relief_error_gain, model.relief_error_limit_px) ** 2
             sampled = (
@@ -720,12 +737,19 @@ def map_statistics(rng, scatter=0.02):
 
 def test_the_fit_recovers_the_variances_of_maps():
     found = fit._fit_map_variances(list(map_statistics(np.random.default_rng(0))), "error", ErrorModel())
-    for bound_px, lamp, views, step in ((0.02, 0, 1, 1), (0.1, 1, 5, 1), (0.04, 0.5, 10, 0.6), (0.03, 1, 4, 3)):
+    for bound_px, lamp, views, step in (
+        (0.02, 0, 1, 1),
+        (0.1, 1, 5, 1),
+        (0.04, 0.5, 10, 0.6),
+        (0.03, 1, 4, 3),
+        (0.1, 0, 9, 0),
+    ):
         fitted, true = (
-            law.sigma_px(bound_px, lamp) * np.sqrt(law.relative_variance(views, step))
+            law.sigma_px(bound_px, lamp) * np.sqrt(law.relative_variance(views, step, bound_px))
             for law in (found.depth, TRUE_DEPTH)
         )
         assert fitted == pytest.approx(true, rel=0.05)
+    assert found.depth.noise_gain == pytest.approx(0.8, rel=0.2)
     assert found.lateral_sigma_px == pytest.approx(1.5, rel=0.05)
     assert found.relief_gain == pytest.approx(0.4, rel=0.15)
     assert found.relief_limit_px == pytest.approx(0.05, rel=0.1)
@@ -752,7 +776,7 @@ def test_the_fit_takes_into_account_that_errors_raise_the_variance_of_a_sampled_
     surveys = list(map_statistics(np.random.default_rng(0)))
     larger = [{k: [*v[:5], 1.44 * v[5], *v[6:]] if k.startswith("map") else v for k, v in s.items()} for s in surveys]
     laws = [fit._fit_map_variances(s, "error", ErrorModel()).depth for s in (surveys, larger)]
-    first, second = (law.sigma_px(0.05, 0.5) * np.sqrt(law.relative_variance(3, 1.5)) for law in laws)
+    first, second = (law.sigma_px(0.05, 0.5) * np.sqrt(law.relative_variance(3, 1.5, 0.05)) for law in laws)
     assert first / second == pytest.approx(1.2, rel=0.03)
 
 
@@ -781,18 +805,49 @@ def test_surveys_with_binned_images_determine_a_factor_and_not_the_laws_of_depth
 
 
 def test_the_fit_recovers_the_scatter_of_depth_over_the_cells_of_a_map():
-    true = ScatterLaw(0.9, 0.05)
+    """The scatter of a survey is proportional to that of its texture, with and without binning."""
+    true, surveys = ScatterLaw(2.4, 0.05), []
+    for binning, texture, bound_px in ((1, 0.2, 0.02), (1, 0.5, 0.06), (2, 0.3, 0.2), (4, 0.6, 0.1)):
+        scatter = {"map_scatter_smooth4": [float(true(bound_px, texture))], "map_scatter_edge": [3.0]}
+        surveys.append({"bound_px": [bound_px], "texture_scatter": [texture], "binning": [binning, binning], **scatter})
+    np.testing.assert_allclose(fit._fit_texture_scatter(surveys, ErrorModel().depth_texture_scatter), true, rtol=1e-3)
+    assert fit._fit_texture_scatter([{"bound_px": [0.1]}], true) == true
 
-    def surveys(binning, scatters):
-        for bound_px, value in zip((0.02, 0.06, 0.2), scatters, strict=True):
-            scatter = {"map_scatter_smooth4": [value], "map_scatter_edge": [3.0]}
-            yield {"bound_px": [bound_px], "binning": [binning, binning], **scatter}
 
-    rows = [*surveys(1, true(np.array([0.02, 0.06, 0.2]))), *surveys(2, (0.9, 1.1, 1.0))]
-    law, binned = fit._fit_cell_scatter(rows, ErrorModel().depth_cell_scatter)
-    np.testing.assert_allclose(law, true, rtol=1e-3)
-    assert binned == (1.0, 0.0)
-    assert fit._fit_cell_scatter([{"bound_px": [0.1]}], true)[0] == true
+def test_an_evenly_textured_image_has_the_same_bound_in_all_windows():
+    """Columns alternate between two grey levels, so each window has the gradient of the whole image."""
+    even = np.tile([0.0, 3.0], (40, 20))
+    assert window_texture(even) == pytest.approx(EVEN_TEXTURE, abs=1e-9)
+    assert window_texture(np.full((40, 40), 7.0)) == EVEN_TEXTURE
+
+
+def test_the_bound_of_a_window_is_inversely_proportional_to_its_gradient():
+    """Three quarters of the image have the contrast 1, one quarter 4; windows across the border are few."""
+    contrast = np.repeat([1.0, 4.0], [1500, 500])[None]
+    texture = window_texture(contrast * np.tile([0.0, 1.0], (60, 1000)))
+    assert texture.median_ratio == pytest.approx(np.sqrt((3 * 1 + 16) / 4), rel=0.01)
+    assert texture.scatter == pytest.approx(np.log(4) * np.sqrt(3) / 4, rel=0.01)
+    assert window_texture(5 * contrast * np.tile([0.0, 1.0], (60, 1000))) == pytest.approx(texture)
+
+
+def test_dense_matching_has_the_bound_of_the_median_window_and_the_scatter_of_the_windows(vision):
+    matching, law = vision.scene.matchability, ScatterLaw(2.0, 0.03)
+    model = vision.model._replace(depth_error=DepthLaw(0.0, 1.0, 0.0, 0.01, 3.0, 1.0), depth_texture_scatter=law)
+    errors = vision._cell_errors(model, (4, 4))
+    assert matching.texture.median_ratio > 1 and matching.texture.scatter > 0.1
+    np.testing.assert_allclose(errors.depth_error_px, matching.bounds_px * matching.texture.median_ratio)
+    np.testing.assert_allclose(errors.cell_scatter, law(matching.bounds_px, matching.texture.scatter))
+
+
+def test_the_share_of_noise_in_the_variance_of_depth_grows_with_the_bound_of_the_median_window(vision):
+    """It is c^2 / (c0^2 + c^2) at the bound c, if the error without noise is that of noise at the bound c0."""
+    window_px = vision.scene.matchability.window_bounds_px
+    laws = [DepthLaw(slope * window_px[0], slope, 1.0, 0.01, 3.0, 1.0, 0.8) for slope in (1.5, 3.0)]
+    errors = vision._cell_errors(vision.model._replace(depth_error=laws[0], depth_sigma=laws[1]), (4, 4))
+    share = window_px**2 / (window_px[0] ** 2 + window_px**2)
+    assert share[0] == 0.5 and share[-1] > 0.505
+    np.testing.assert_allclose(errors.error_noise_share, share)
+    np.testing.assert_allclose(errors.sigma_noise_share, share)
 
 
 def test_the_fit_finds_the_share_of_the_scatter_of_cells_that_their_true_errors_have():
@@ -967,6 +1022,7 @@ def test_every_point_is_matched_in_the_model_with_which_images_are_compared():
         ("[model]\nsteady = 0.5\n", "steady was renamed to match_bias_fraction"),
         ("[model]\nf2f_sigma_px = { floor = 0.1, rise = 1 }\n", "floor was renamed to floor_px, rise was renamed"),
         ("[misfit]\nplace_px = 0.1\n", "place_px was renamed to match_sigma_px"),
+        ("[model]\ndepth_cell_scatter = 1\n", "depth_cell_scatter was renamed to depth_texture_scatter"),
     ],
 )
 def test_a_file_that_is_not_an_error_model_is_rejected(content, message, tmp_path):
@@ -982,6 +1038,7 @@ def test_former_names_of_the_error_model_lead_to_present_ones():
     assert not set(error_model_file._RENAMED) & present
 
 
+@pytest.mark.long
 def test_the_fit_recovers_the_error_model_of_simulated_surveys():
     """A surrogate with other errors than the compared one takes the place of the images.
 
@@ -992,7 +1049,7 @@ def test_the_fit_recovers_the_error_model_of_simulated_surveys():
         f2f_sigma_px=SigmaLaw(0.04, 2.0), f2f_error_ratio=1.0, f2f_anticorrelation=0.4, distance_growth=4.0,
         relief_gain=0.3, mosaic_sigma_px=SigmaLaw(0.3, 1.0), lateral_sigma_px=0.5,
         depth_sigma=DepthLaw(0.1, 2.0, 0.0, 0.01, 3.0, 1.0), depth_error=DepthLaw(0.08, 2.0, 0.0, 0.01, 3.0, 1.0),
-        depth_cell_scatter=ScatterLaw(0.8, 0.03),
+        depth_texture_scatter=ScatterLaw(2.0, 0.03),
     )  # fmt: skip
     waters = [['water.jerlov="I"'], ['water.jerlov="III"'], ["lamps=[]", "sun.illuminance_lx=2000"]]
     statistics = [compare_survey(mission(*water), true, seed) for seed, water in enumerate(waters)]
@@ -1007,10 +1064,12 @@ def test_the_fit_recovers_the_error_model_of_simulated_surveys():
     assert fitted.f2f_anticorrelation == pytest.approx(true.f2f_anticorrelation, abs=0.1)
     assert fitted.distance_growth == pytest.approx(true.distance_growth, rel=0.25)
     sigmas = [
-        m.depth_sigma.sigma_px(bound_px, 1.0) * np.sqrt(m.depth_sigma.relative_variance(6, 1)) for m in (fitted, true)
+        m.depth_sigma.sigma_px(bound_px, 1.0) * np.sqrt(m.depth_sigma.relative_variance(6, 1, bound_px))
+        for m in (fitted, true)
     ]
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.15)
-    assert fitted.depth_cell_scatter(bound_px) == pytest.approx(true.depth_cell_scatter(bound_px), rel=0.15)
+    scatters = [m.depth_texture_scatter(bound_px, 1.0) for m in (fitted, true)]
+    assert scatters[0] == pytest.approx(scatters[1], rel=0.15)
     assert fitted.depth_ratio_scatter < 0.1
     # the lateral error does not vary with the sigma of its cell, to which the fit relates all errors
     assert fitted.lateral_sigma_px == pytest.approx(true.lateral_sigma_px, rel=0.3)
@@ -1102,6 +1161,7 @@ def test_diverged_physics_ends_the_compiled_loop_with_an_error():
         assert len(world) == len(navigator.log) == 2  # the frame at which it was detected is kept
 
 
+@pytest.mark.long
 def test_a_survey_without_optional_outputs_loads_no_graphics_library(tmp_path):
     """MuJoCo, OpenGL and the drawing libraries would take 100 MB in each worker of a study."""
     line = f"""

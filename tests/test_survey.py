@@ -138,6 +138,7 @@ def test_sensors_that_do_not_aid_do_not_reach_the_estimators():
     assert first_frame("navigation.aiding=[]").readings == records.Readings()
 
 
+@pytest.mark.long
 def test_every_aid_reaches_position_and_alignment(tmp_path):
     aids = [
         'navigation.aiding=["dvl", "usbl", "beacons"]',
@@ -160,6 +161,7 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
         assert np.sqrt(((path.positions - true.positions) ** 2).sum(axis=1).mean()) < 4e-3
 
 
+@pytest.mark.long
 def test_mosaic_and_alignment_can_be_left_out(tmp_path):
     result = fly(tmp_path / "run", "estimate.use_ga=false", "estimate.use_f2m=false", "plan.area_m=[0.3, 0.5]")
     assert result.status == "complete"
@@ -175,6 +177,7 @@ def stop_at(share, error):
     return progress
 
 
+@pytest.mark.long
 def test_an_interrupted_survey_reports_its_reason_and_keeps_partial_results(tmp_path, monkeypatch):
     monkeypatch.setattr("twin.report.survey_page.draw_all", lambda _: {})  # figures take longer than the flight
     stop = stop_at(0.5, KeyboardInterrupt())
@@ -186,6 +189,7 @@ def test_an_interrupted_survey_reports_its_reason_and_keeps_partial_results(tmp_
     assert (result.folder / "report.html").exists()
 
 
+@pytest.mark.long
 def test_a_nan_in_the_physics_aborts_with_the_reason(tmp_path, monkeypatch):
     command = survey.make_pilot
 
@@ -205,6 +209,7 @@ def test_a_nan_in_the_physics_aborts_with_the_reason(tmp_path, monkeypatch):
     assert "physics diverged at 4" in result.metrics["reason"]
 
 
+@pytest.mark.long
 def test_lost_vision_aborts_the_survey_with_a_reason(tmp_path):
     result = fly(tmp_path / "run", "water.jerlov=9C", "water.turbidity=20")
     assert result.status == "aborted"
@@ -232,6 +237,7 @@ def test_an_impossible_survey_is_rejected_before_anything_is_written(tmp_path, o
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.long
 def test_a_failed_alignment_is_reported_and_partial_results_are_kept(tmp_path, monkeypatch):
     def fail(*_):
         raise np.linalg.LinAlgError("not every pose is held")
@@ -245,6 +251,7 @@ def test_a_failed_alignment_is_reported_and_partial_results_are_kept(tmp_path, m
     assert result.metrics["trajectory"]["online"]["ate_rmse_m"] < 0.05
 
 
+@pytest.mark.long
 def test_a_full_disk_in_the_background_is_reported_and_partial_results_are_kept(tmp_path, monkeypatch):
     """Links are measured in the background: an error is raised when they are collected."""
 

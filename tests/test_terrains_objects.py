@@ -84,6 +84,36 @@ def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
     assert np.abs(mesh.colours[:, 0] - (mesh.vertices_m[:, 0] + 1) / 2 * 255).max() < 2
 
 
+def material_box(factor, texture=None):
+    """Returns a box with a glTF material."""
+    from PIL import Image
+
+    image = None if texture is None else Image.fromarray(np.full((4, 4, 3), texture, np.uint8))
+    box = CUBE.copy()
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=factor, baseColorTexture=image)
+    box.visual = trimesh.visual.TextureVisuals(None if image is None else np.zeros((8, 2)), material)
+    return box
+
+
+@pytest.mark.parametrize(("texture", "expected"), [(None, [255, 128, 0]), (100, [100, 100, 100])])
+def test_the_base_colour_of_a_glb_material_is_its_colour_without_a_texture(tmp_path, texture, expected):
+    material_box([255, 128, 0, 255], texture).export(tmp_path / "box.glb")
+    np.testing.assert_array_equal(np.unique(read(tmp_path / "box.glb").colours, axis=0), [expected])
+    floor = mesh_file.read_textured_mesh(tmp_path / "box.glb", FIELD)
+    shown = floor.mesh.colours if texture is None else floor.images[0].reshape(-1, 3)
+    np.testing.assert_array_equal(np.unique(shown, axis=0), [expected])
+
+
+def test_a_mesh_in_coordinates_of_a_map_projection_keeps_its_shape(tmp_path):
+    """Single precision rounds a northing of 5000 km to 0.5 m."""
+    fine = CUBE.subdivide().subdivide()
+    far = fine.copy()
+    far.vertices = fine.vertices + [500_000.0, 5_000_000.0, -20.0]
+    far.export(tmp_path / "far.obj", digits=6)
+    found = read(tmp_path / "far.obj").vertices_m.astype(float)
+    assert np.abs(found - found.mean(axis=0) - fine.vertices + fine.vertices.mean(axis=0)).max() < 1e-5
+
+
 def ply_header(n_faces):
     return f"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nelement face {n_faces}\nend_header\n".encode()
 
@@ -185,6 +215,7 @@ def poses_of(items):
     return np.array([item.world_from_object for item in items])
 
 
+@pytest.mark.long
 def test_objects_of_an_entry_stand_in_the_same_places_whatever_other_entries_there_are(tmp_path):
     """Entries stand in two areas that do not overlap; the later entry is changed, and an entry is added after both."""
     west = {"shape": "crate", "per_m2": 0.5, "size_m": 0.2, "area_m": [2.0, 4.0], "centre_m": [-2.5, 0.0]}
@@ -239,3 +270,20 @@ def test_objects_that_do_not_fit_are_errors(keys, field, problem):
     with pytest.raises(TwinError, match=problem) as raised:
         scattered(**keys)
     assert raised.value.field == field
+
+
+def test_a_grey_texture_of_16_bits_keeps_its_brightness(tmp_path):
+    """30000 of 65535 is 117 of 255; Pillow's conversion to RGB gives 255."""
+    from PIL import Image
+
+    image = Image.fromarray(np.full((4, 6), 30000, np.uint16))
+    assert image.mode == "I;16"
+    for one in (image, image.convert("I")):
+        np.testing.assert_array_equal(mesh_file._rgb(one), np.full((4, 6, 3), 117))
+    image.save(tmp_path / "grey.png")
+    (tmp_path / "square.mtl").write_text("newmtl grey\nmap_Kd grey.png\n")
+    (tmp_path / "square.obj").write_text(
+        "mtllib square.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl grey\nf 1/1 2/2 3/3\n"
+    )
+    assert (mesh_file.read_textured_mesh(tmp_path / "square.obj", FIELD).images[0] == 117).all()
+    assert (read(tmp_path / "square.obj").colours == 117).all()

@@ -1,5 +1,6 @@
 """Surveys other than the lawnmower of the ROV: loops and the paper's level motion; every scene can be planned."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 import scenes
 from twin import survey
 from twin.core.records import Trajectory
-from twin.errors import ScenarioError, SurveyAborted
+from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
 from twin.simulate.kinematic_vehicle import KinematicVehicle
-from twin.world.mission import prepare
+from twin.world.mission import _check_speed, prepare
+
+pytestmark = pytest.mark.long
 
 SCENES = sorted(Path(scenes.__file__).parent.glob("*.toml"))
 SMALL = [
@@ -101,8 +104,6 @@ def test_a_kinematic_vehicle_has_the_commanded_horizontal_velocity():
     [
         (["plan.area_m=[2.0, 1.0]"], "--set: plan.area_m: 2 x 1 m: loops need a square area (allowed: the disc"),
         (["plan.area_m=[7.0, 7.0]"], "--set: plan.area_m: 7 x 7 m is larger than the terrain (allowed: up to 6.00 x"),
-        # sideways the vehicle is slower than ahead; on a disc of 3 m only the wish is too fast
-        (["plan.speed_mps=0.7"], "--set: plan.speed_mps: 0.7: too fast for the thrusters (allowed: up to 0.63)"),
         (["plan.altitude_m=0.7"], "--set: plan.altitude_m: 0.7: the cameras come within "),
         (
             ["vehicle.dynamics=kinematic", "current.velocity_mps=[0.1, 0.0, 0.0]"],
@@ -115,6 +116,13 @@ def test_an_impossible_plan_is_rejected_with_its_key(overrides, message):
     with pytest.raises(ScenarioError) as refused:
         prepare(load_scenario("reef", [*LOOPS, *overrides]))
     assert message in str(refused.value)
+
+
+def test_the_speed_limit_of_loops_is_that_of_the_slowest_direction_at_the_speed_that_is_flown():
+    mission = prepare(load_scenario("reef", [*LOOPS, "plan.speed_mps=0.7"]))
+    assert mission.plan.speed_mps < 0.3  # of loops with a diameter of 0.8 m
+    with pytest.raises(TwinError, match=r"0.7: too fast for the thrusters \(allowed: up to 0.63\)"):
+        _check_speed(mission.scenario, dataclasses.replace(mission.plan, speed_mps=0.7))
 
 
 def test_the_speed_limit_is_that_of_the_bow_and_a_kinematic_vehicle_has_none():

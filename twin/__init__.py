@@ -61,8 +61,7 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
-        TwinError: the run folder cannot be written, or the world cannot be created.
-        OSError: metrics.json cannot be written at the end.
+        TwinError: the run folder, or metrics.json at the end, cannot be written, or the world cannot be created.
     """
     from twin import survey
 

@@ -1,8 +1,8 @@
 """Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 a survey is not complete, or a requirement is missed; 2 invalid input, missing system library
-or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by SIGTERM. `twin view` returns the status of
-the viewer.
+Exit status: 0 success; 1 a survey is not complete, a requirement is missed, or no plan is recommended; 2 invalid input,
+missing system library or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by SIGTERM. `twin view`
+returns the status of the viewer.
 """
 
 from __future__ import annotations

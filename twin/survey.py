@@ -50,8 +50,7 @@ def run(
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
-        TwinError: the run folder cannot be written, or the world cannot be created.
-        OSError: metrics.json cannot be written at the end.
+        TwinError: the run folder, or metrics.json at the end, cannot be written, or the world cannot be created.
     """
     mission = prepare(scenario)
     stopwatch, guard = Stopwatch(), StageGuard()

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from terrains.objects.detail import Level, cell_colours
 from terrains.objects.mesh import Mesh, extent
-from terrains.objects.mesh_file import TexturedMesh
+from terrains.objects.mesh_file import MAX_FACES, TexturedMesh
 from terrains.objects.model import ObjectModel, PlacedObject
 from terrains.objects.texture_pyramid import Textures, textures_of
 
 TILE_M = 1.0  #: side of a tile; larger if there were more than MAX_TILES tiles
 MAX_TILES = 4000
 LONGEST_EDGE_M = 0.5  #: longer edges are halved; for a mesh larger than 200 m, those longer than a 400th of it
+MAX_DIVIDED = 2 * MAX_FACES  #: largest number of triangles after long edges have been halved
 LARGEST_CELL_M = 0.1  #: over which the colours of vertices are averaged in the coarsest level
 NO_GROUP = -1  #: `PlacedObject.group` of a tile
 
@@ -73,6 +74,9 @@ def divided(whole: TexturedMesh) -> TexturedMesh:
     """Returns a mesh whose long edges are halved until none is longer than LONGEST_EDGE_M, without cracks.
 
     The rasterizer leaves out a triangle with a corner behind the camera, so that no triangle should be large.
+
+    Raises:
+        ValueError: more than MAX_DIVIDED triangles would be needed, because the mesh has many long slivers.
     """
     longest_m = max(LONGEST_EDGE_M, float(np.ptp(whole.mesh.vertices_m, axis=0).max()) / 400)
     while True:
@@ -81,6 +85,8 @@ def divided(whole: TexturedMesh) -> TexturedMesh:
         long = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) > longest_m
         if not long.any():
             return whole
+        if len(faces) + int(long.sum()) > MAX_DIVIDED:
+            raise ValueError(f"has long triangles that make more than {MAX_DIVIDED} when divided")
         whole = _halved(whole, long)
 
 

@@ -87,7 +87,7 @@ def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMe
     if n_texels > MAX_TEXELS:
         raise TwinError(field, f"{file.name!r} has textures of {n_texels} texels", f"at most {MAX_TEXELS} texels")
     uv = np.concatenate([part.uv for part in parts])
-    arrays = tuple(np.asarray(image.convert("RGB"), np.uint8) for image in images)
+    arrays = tuple(_rgb(image) for image in images)
     return TexturedMesh(_upright(mesh, y_up), uv, np.concatenate(numbers), arrays)
 
 
@@ -101,8 +101,8 @@ class _Part(NamedTuple):
 
 
 def _part(part: Any) -> _Part:
-    """Returns a trimesh mesh with its texture, or with the colours of its vertices if it has no texture."""
-    n, texture = len(part.vertices), _texture_of(part)
+    """Returns a trimesh mesh with its texture, else the base colour of its material or the colours of its vertices."""
+    n, texture, factor = len(part.vertices), _texture_of(part), _base_colour(part)
     colours = np.full((n, 3), 255, np.uint8)
     if texture is not None:
         image, uv = texture
@@ -111,6 +111,8 @@ def _part(part: Any) -> _Part:
     coloured = hasattr(part.visual, "vertex_colors") and part.visual.defined
     if coloured:
         colours = np.asarray(part.visual.vertex_colors)[:, :3]
+    elif factor is not None:
+        coloured, colours = True, np.broadcast_to(factor, (n, 3))
     return _Part(_mesh(part.vertices, part.faces, colours), np.zeros((n, 2), np.float32), None, coloured)
 
 
@@ -124,12 +126,28 @@ def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> 
         raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
     _check_size(file, field)
     try:
-        return convert(_parts(_loaded(file)))
+        return convert(_near_origin(_parts(_loaded(file))))
     except MemoryError:
         raise
     except Exception as error:  # trimesh raises any of many types for a damaged file
         reason = " ".join(str(error).split())[:200]
         raise TwinError(field, f"{file.name!r} cannot be read: {type(error).__name__}: {reason}", FORMATS) from error
+
+
+def _near_origin(parts: list[Any]) -> list[Any]:
+    """Returns trimesh meshes, moved together to the origin if its distance is more than 8 times their extent.
+
+    Georeferenced models have coordinates of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
+    """
+    corners = [np.asarray(part.vertices) for part in parts if len(part.vertices)]
+    if not corners:
+        return parts
+    low, high = np.min([c.min(axis=0) for c in corners], axis=0), np.max([c.max(axis=0) for c in corners], axis=0)
+    centre = (low + high) / 2
+    if np.isfinite(centre).all() and np.abs(centre).max() > 8 * (high - low).max():
+        for part in parts:
+            part.vertices = np.asarray(part.vertices) - centre
+    return parts
 
 
 def _upright(mesh: Mesh, y_up: bool) -> Mesh:
@@ -171,7 +189,7 @@ def _parts(loaded: Any) -> list[Any]:
 
 
 def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) -> Mesh:
-    """Returns a mesh with the texture or vertex colours of a trimesh mesh; with `albedo` if it has neither.
+    """Returns a mesh with the texture, vertex colours or base colour of a trimesh mesh; with `albedo` without any.
 
     A textured mesh is divided into at most `most_faces` triangles, or not at all.
     """
@@ -182,6 +200,8 @@ def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) ->
         textured = _textured(part, most_faces)
         if textured is not None:
             return textured
+        if (factor := _base_colour(part)) is not None:
+            colours = np.broadcast_to(factor, (len(part.vertices), 3))
     elif part.visual.defined:
         colours = np.asarray(part.visual.vertex_colors)[:, :3]
     return _mesh(part.vertices, part.faces, colours)
@@ -211,7 +231,27 @@ def _textured(part: Any, most_faces: int) -> Mesh | None:
     while 0 < len(divided[1]) * 4 <= most_faces:
         divided = trimesh.remesh.subdivide(*divided[:2], vertex_attributes=divided[2])
     vertices, faces, attributes = divided
-    return _mesh(vertices, faces, _sampled(np.asarray(image.convert("RGB")), attributes["uv"]))
+    return _mesh(vertices, faces, _sampled(_rgb(image), attributes["uv"]))
+
+
+def _rgb(image: Any) -> NDArray[np.uint8]:
+    """Returns the colours (h, w, 3) of a PIL image; grey levels of 16 bits are divided by 257.
+
+    Pillow gives grey images of 16 bits a mode of integers ("I;16", "I"), whose conversion to RGB clips at 255.
+    """
+    if not image.mode.startswith("I"):
+        return np.asarray(image.convert("RGB"), np.uint8)
+    grey = np.rint(np.clip(np.asarray(image, np.float64), 0, 65535) / 257).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def _base_colour(part: Any) -> tuple[int, ...] | None:
+    """Returns red, green and blue, 0 to 255, of the baseColorFactor of a glTF material; None if it states none.
+
+    It is used without a texture only: trimesh, for example, writes textures with a factor of 0.4 that is not intended.
+    """
+    factor = getattr(getattr(part.visual, "material", None), "baseColorFactor", None)
+    return None if factor is None else tuple(int(value) for value in np.asarray(factor)[:3])
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:

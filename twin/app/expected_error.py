@@ -13,7 +13,6 @@ from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.core.records import StereoRig
 from twin.surrogate import error_model_file
-from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.map_model import (
     EDGE_VIEWS_EXPONENT,
     WINDOW_PX,
@@ -37,8 +36,8 @@ class ExpectedError(NamedTuple):
 
     Args:
         sigma_m: (n,) standard deviation of the height error at floor points spread evenly over the images [m].
-        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height, without the
-            losses at edges and near the border of the images.
+        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height. Losses at edges
+            and near the border of the images are neglected.
         bound_px: largest Cramér-Rao bound of image matching at the depths of these points [px of the matched images].
         fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
     """
@@ -78,13 +77,13 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     """Returns the expected height error of the map, without the errors of the poses.
 
     The error has three parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
-    length f [px] and baseline b [m]; it decreases with the distance between consecutive keyframes and with the number
-    of keyframes that observe a point, which is 1 / (1 - overlap along the leg). A lateral error of the mapped surface
-    causes a height error proportional to the slope of the floor. Edges and other roughness within the matching window
-    cause an error that increases with the roughness. The standard deviations of all errors, and the scatter of the
-    disparity error over the cells of a map, come from the error model fitted to rendered surveys. The disparity error
-    depends on the water, light, texture and sensor of the scenario, through the Cramér-Rao bound of image matching
-    (`Matchability`).
+    length f [px] and baseline b [m]. This depth error decreases with the distance between consecutive keyframes and
+    with the number of keyframes that observe a point, which is 1 / (1 - overlap along the leg). A lateral error of the
+    mapped surface causes a height error proportional to the slope of the floor. Edges and other roughness within the
+    matching window cause an error that increases with the roughness. The standard deviations of all errors, and the
+    scatter of the disparity error over the cells of a map, come from the error model fitted to rendered surveys. The
+    disparity error depends on the water, light, texture and sensor of the scenario, through the Cramér-Rao bound of
+    image matching (`Matchability`).
     """
     rig, scenario = mission.rig, mission.scenario
     fitted = error_model_file.load(scenario.imaging.error_model)
@@ -93,13 +92,16 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     depth, slope, rough_m, edge_m = _floor_points(mission, forecast, rig)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
-    sigma_px = np.interp(depth, matching.depths_m, model.depth_error.sigma_px(table, matching.lamp_share))
+    one_px = model.depth_error.sigma_px(matching.window_bounds_px, matching.lamp_share)
+    sigma_px = np.interp(depth, matching.depths_m, one_px)
     sigma_px *= model.depth_binned_error(matching.binning)
     in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
     poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
     step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
-    share = float(model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m))
-    scatter = np.interp(depth, matching.depths_m, _error_scatter(model, table, matching.binning))
+    window = np.interp(depth, matching.depths_m, matching.window_bounds_px)
+    share = model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m, window)
+    scatters = model.error_scatter_share * model.depth_texture_scatter(table, matching.texture.scatter)
+    scatter = np.interp(depth, matching.depths_m, scatters)
     evenly = (0.5 + np.arange(len(depth)) * _GOLDEN_RATIO) % 1
     sigma_px *= np.exp(scatter * ndtri(np.clip(evenly, 1e-6, 1 - 1e-6)))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
@@ -115,15 +117,6 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     )  # fmt: skip
 
 
-def _error_scatter(model: ErrorModel, bounds_px: Array, binning: int) -> Array:
-    """Returns the standard deviation (m,) over map cells of the logarithm of the disparity error, at bounds (m,) [px].
-
-    It is `ErrorModel.error_scatter_share` times that of the reported standard deviation, which depends on the binning.
-    """
-    binned = np.full(len(bounds_px), model.depth_binned_scatter(binning))
-    return model.error_scatter_share * (model.depth_cell_scatter(bounds_px) if binning == 1 else binned)
-
-
 def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array, Array]:
     """Returns properties of the floor at n points spread evenly over the images.
 
@@ -131,7 +124,7 @@ def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig)
 
     Args:
         mission: the survey.
-        forecast: poses of the keyframes and depths of the floor in their images.
+        forecast: poses of the keyframes, surface of floor and objects, and its depths in their images.
         matched: calibration of the images that are matched, which may be binned.
     """
     rig, grid = mission.rig, mission.grid
@@ -141,7 +134,7 @@ def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig)
     image, ray = image[kept], ray[kept]
     depth, poses = forecast.depth_m[image, ray], forecast.keyframes.world_from_camera[image]
     x, y, _ = (poses[:, :3, 3] + depth[:, None] * np.einsum("nij,nj->ni", poses[:, :3, :3], rays[ray])).T
-    heights = true_heights(grid, mission.terrain.height_at)
+    heights = true_heights(grid, forecast.surface.height_at)
     down, east = np.gradient(heights, grid.cell_m)
     typical_m = float(np.median(depth)) if len(depth) else 1.0
     window_cells = WINDOW_PX * typical_m / matched.focal_px / grid.cell_m

@@ -68,8 +68,9 @@ def export(
 
     Raises:
         TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
-            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or an image or
-            the true poses of the run are damaged; the formats before the one that needs them were written.
+            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or a
+            package is not installed, or an image or the true poses of the run are damaged; the formats before the one
+            that needs them were written.
         OSError: a file cannot be written.
     """
     chosen = chosen_formats(names)

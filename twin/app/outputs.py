@@ -71,10 +71,7 @@ def _check_path(path: Path, option: str, allowed: str) -> None:
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError unless a file can be created in the path, if that is a folder, or in the closest folder above.
-
-    Folders that do not exist are skipped.
-    """
+    """Raises TwinError unless a file can be created in `path`, or in its closest existing parent if it is no folder."""
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest
     try:

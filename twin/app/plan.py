@@ -17,19 +17,20 @@ from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
 from twin.world.mission import Mission
 
 _SHADE_SAMPLES = 400
+_LEAST_DRAWN_M = 0.005  #: height above the floor at which the outlines of the objects are drawn
 
 
 def draw(summary: PlanSummary, file: Path) -> Path:
     """Writes a PNG of the plan from above; returns its path.
 
-    The left panel shows sea floor, planned path, footprint of the first image and survey area. The right panel shows
-    the survey area and the overlap over the floor, and marks where the overlap is less than required.
+    The left panel shows sea floor, objects, planned path, footprint of the first image and survey area. The right panel
+    shows the survey area and the overlap over the floor, and marks where the overlap is less than required.
     """
     mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(14, 6.5))
         plan, overlap = figure.subplots(1, 2, sharex=True, sharey=True)
-        _draw_floor(plan, mission)
+        _draw_floor(plan, summary)
         _draw_path(plan, mission)
         _draw_overlap(overlap, summary)
         plan.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
@@ -69,17 +70,21 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
             axes.figure.colorbar(shown, ax=axes, label="overlap", shrink=0.8)
 
 
-def _draw_floor(axes: Axes, mission: Mission) -> None:
-    """Draws the shaded sea floor, with height contours unless it is level."""
-    t = mission.terrain
+def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
+    """Draws the shaded surface of sea floor and objects, the outlines of the objects, and contours of the floor."""
+    mission = summary.mission
+    t, top = mission.terrain, summary.floor.surface
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
-    height = t.height_at(*np.meshgrid(x, y))
+    height, top_m = (surface.height_at(*np.meshgrid(x, y)) for surface in (t, top))
     steps = (x[1] - x[0], y[0] - y[1])
-    shade = LightSource(315, 45).hillshade(height, vert_exag=1, dx=steps[0], dy=steps[1])
+    shade = LightSource(315, 45).hillshade(top_m, vert_exag=1, dx=steps[0], dy=steps[1])
     axes.imshow(shade, cmap="gray", vmin=-0.5, vmax=1.1, extent=(t.west_m, t.east_m, t.south_m, t.north_m))
     if np.ptp(height) > 0:
         contours = axes.contour(x, y, height, levels=6, cmap="viridis", linewidths=0.8)
         axes.clabel(contours, fmt="%.2f m", fontsize=7)
+    if top is not t:
+        axes.contour(x, y, top_m - height, levels=[_LEAST_DRAWN_M], colors=[COLOURS["truth"]], linewidths=0.9)
+        axes.plot([], [], color=COLOURS["truth"], linewidth=0.9, label=f"{len(mission.objects)} objects")
 
 
 def _draw_path(axes: Axes, mission: Mission) -> None:

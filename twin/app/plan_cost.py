@@ -16,9 +16,9 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    """Estimated computing cost of a survey: time on an idle 2-core machine [s], peak memory and disk [MB].
+    """Estimated computing cost of a survey: time [s], peak memory and disk [MB].
 
-    The time is fitted to processor times.
+    The time is the processor time on an idle 2-core machine.
     """
 
     wall_s: float

@@ -48,7 +48,7 @@ class PlanSummary:
     Args:
         mission: the survey.
         plane: properties of the plan; footprint, overlaps, disparity and depth error refer to the reference plane.
-        floor: properties of the planned images over the floor.
+        floor: properties of the planned images over the floor with its objects.
         error: expected height error of the map.
         cost: computing time, memory and disk space of the simulation.
         require: value, limit and verdict of each required metric that can be predicted.
@@ -152,7 +152,7 @@ def _short_overlap(mission: Mission, floor: FloorForecast) -> list[str]:
 
 
 def _limits_of_validity(mission: Mission, error: ExpectedError) -> list[str]:
-    """Returns a sentence if the expected error is extrapolated, and one if it leaves out effects of the scenario."""
+    """Returns sentences: the expected error is extrapolated; it leaves out effects; the plan leaves out the objects."""
     sentences = []
     if error.bound_px > _EXTRAPOLATED * error.fitted_bound_px:
         sentences.append(
@@ -167,6 +167,8 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> list[str]:
     if any(given.values()):
         sections = ", ".join(name for name, present in given.items() if present)
         sentences.append(f"the expected error does not include the effects of {sections}")
+    if mission.objects and scenario.imaging.fidelity != "rendered":
+        sentences.append("the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]")
     return sentences
 
 
@@ -191,10 +193,17 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
         ("water", provenance_of(mission.scenario.water)),
+        *([("objects", _objects_text(mission))] if mission.objects else []),
         ("coverage of the area by both cameras", percent(summary.floor.coverage)),
         ("expected LE90 of the map", _expected_le90(summary)),
         ("simulation", cost_text(summary.cost)),
     ]
+
+
+def _objects_text(mission: Mission) -> str:
+    """Returns the number of objects, and whether the properties over the floor include them, as text."""
+    included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
+    return f"{len(mission.objects)}, {included} in the properties over the floor"
 
 
 def _expected_le90(summary: PlanSummary) -> str:
@@ -240,7 +249,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
 
     Args:
         summary: the summary of the plan.
-        picture: path of the drawing of the plan, which is copied to the object.
+        picture: path of the drawing of the plan; a value of the object.
     """
     mission, error = summary.mission, summary.error
     plane = summary.plane._asdict()
@@ -249,6 +258,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
         {
             "schema": "twin.plan/1",
             "name": mission.scenario.name,
+            "objects": len(mission.objects),
             "water": provenance_of(mission.scenario.water),
             "plan": plane | {"duration_s": plane["duration_s"] + hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},

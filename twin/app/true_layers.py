@@ -218,7 +218,7 @@ def _points(depth_m: NDArray[np.floating], rig: StereoRig) -> Array:
 
 
 def _uint8(image: Image) -> Image:
-    """Returns an image as 8-bit values; NaN, where nothing is seen through clear water, becomes black."""
+    """Returns an image as 8-bit values; NaN becomes black."""
     return np.clip(np.round(np.nan_to_num(image, nan=0.0)), 0, 255).astype(np.uint8)
 
 

@@ -56,7 +56,9 @@ def ray_grid(rig: StereoRig, n_columns: int) -> Array:
 
 
 def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array) -> Array:
-    """Returns the depth (n, m) along the optical axis [m] at pixels (m, 2) of n images; inf where there is no floor.
+    """Returns the depth (n, m) of the floor along the optical axis [m] at pixels (m, 2) of n images.
+
+    The depth is inf where the ray of a pixel does not meet the floor, see `cast_ray`.
 
     Args:
         field: the floor.
@@ -88,12 +90,12 @@ def cast_camera_ray(field, pose, a, b):
 
 @njit(cache=True, nogil=True)
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
-    """Returns the smallest t >= 0 at which the ray o + t d meets the floor; inf if it does not.
+    """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
     The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
     each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
-    is 0 if o lies below the floor, and inf also if d does not point downwards, if this traversal starts outside the
-    grid, or if it enters a cell without floor before the ray meets the floor.
+    is inf if d does not point downwards, if the traversal starts outside the grid, or if it leaves the grid or enters a
+    cell without floor before the ray meets the floor.
     """
     if not dz < 0:
         return np.inf

@@ -28,7 +28,7 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
     Args:
         field: the floor.
         first, second: (n, 4, 4) world_from_camera of the images of each pair.
-        rig: calibration of both cameras.
+        rig: calibration of the camera that takes both images.
 
     Returns:
         The overlaps, 0 to 1; NaN where the first image shows no floor.

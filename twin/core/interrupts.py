@@ -16,12 +16,12 @@ T = TypeVar("T")
 class StageGuard:
     """Context manager that delivers interrupts only within a stage; one that arrives between two stages waits.
 
-    A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered;
-    usually it raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the main
-    thread, which alone receives signals, the context has no effect.
+    A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered.
+    This handler usually raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the
+    main thread, which alone receives signals, the context has no effect.
 
     Attributes:
-        cause: why the survey ended early; "" if it did not.
+        cause: why the survey is aborted, set by the caller; "" if there is no such cause.
         skipped: names of the stages that an interrupt ended.
     """
 
@@ -47,7 +47,7 @@ class StageGuard:
         """Delivers interrupts within this context, including a pending one that arrived before it.
 
         Raises:
-            KeyboardInterrupt: an interrupt came before or within the context.
+            KeyboardInterrupt: an interrupt is pending or arrives within the context.
         """
         self._open = True
         try:
@@ -71,7 +71,7 @@ class StageGuard:
 
     @property
     def reason(self) -> str:
-        """Returns why a survey was aborted and the skipped stages ("interrupted; map skipped"); "" if it was not."""
+        """Returns why the survey is aborted and the skipped stages ("interrupted; map skipped"); "" if it is not."""
         return f"{self.cause or 'interrupted'}; {', '.join(self.skipped)} skipped" if self.skipped else self.cause
 
     def _receive(self, number: int, frame: FrameType | None) -> None:

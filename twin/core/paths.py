@@ -1,4 +1,4 @@
-"""Checks of paths from user input or files, which may be invalid: null byte, too long, loop of symbolic links."""
+"""Paths from user input or files, which may be invalid: null byte, too long, loop of symbolic links."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def resolved(path: Path) -> Path:
 
 
 def path_problem(path: Path) -> str | None:
-    """Returns why the file system rejects a path (null byte, too long, loop of links, no permission), or None.
+    """Returns why the file system rejects a path, or None; the path need not exist.
 
-    The path need not exist.
+    The reasons are a null byte, excessive length, and a loop of links, or a missing permission in the folders above.
     """
     text = str(path)
     if "\0" in text:
         return "contains a null byte"
     try:
-        path.lstat()
+        path.stat()
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:

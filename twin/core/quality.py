@@ -1,4 +1,4 @@
-"""Records of the estimators' self-checks: consistency measured during a survey, and findings."""
+"""Records on the quality of a survey: consistency of the estimates, findings, and durations of actions."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class EstimationQuality(NamedTuple):
         link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected;
             None without an alignment.
         epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
-        frame_sigma_m: standard deviation (3-D) of the position of a frame relative to the last keyframe, by
-            frame-to-frame motion alone, just before the next keyframe; 90th percentile over the keyframes [m]; None if
-            it is not known at any keyframe.
+        frame_sigma_m: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by
+            frame-to-frame motion alone; 90th percentile over the keyframes [m]; None if it is not known at any
+            keyframe.
         disparity_offset: offset of all disparities that the links imply; None without images, or if the offset is
             not observable.
     """

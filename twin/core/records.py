@@ -359,7 +359,7 @@ class SurveyResult:
 
     @property
     def step_cov(self) -> Array:
-        """Returns the covariance (n_keyframes, 6, 6) of the link from the previous keyframe; zeros without a link."""
+        """Returns `Link.own_cov` (n_keyframes, 6, 6) of the link from the previous keyframe; zeros without a link."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))
         chain = self.links.j == self.links.i + 1
         cov[self.links.j[chain]] = self.links.own_cov[chain]
@@ -394,12 +394,10 @@ class MapGrid:
 class ElevationMap:
     """Digital elevation model with its uncertainty and orthomosaic.
 
-    Cells without a measurement have NaN in `height_m` and `sigma_m`, and are black in `mosaic`.
-
     Args:
         grid: cells in x and y of the map frame.
-        height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m].
-        mosaic: (rows, cols, 3) uint8 RGB.
+        height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m]; NaN where unknown.
+        mosaic: (rows, cols, 3) uint8 RGB, black where unknown.
         map_from_world: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     """
 
@@ -410,7 +408,7 @@ class ElevationMap:
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
 
     def to_world(self, points: Array) -> Array:
-        """Returns points (n, 3) of the map frame in the world [m]."""
+        """Returns the world coordinates (n, 3) of points (n, 3) of the map frame [m]."""
         return geometry.transform(geometry.inverse(self.map_from_world), points)
 
 

@@ -23,7 +23,7 @@ class EstimatorSettings:
         min_overlap: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's
             matched points that project into the earlier image. The link to the previous node is measured at any
             overlap.
-        max_links: largest number of links from a node to earlier nodes.
+        max_links: largest number of links from a node to earlier nodes with an overlap of at least `min_overlap`.
         use_f2m: whether to register keyframes with the mosaic (F2M).
         use_ga: whether to align the network globally (GA) at the end of each track and of the survey.
         points: largest number of matched points of a keyframe.
@@ -31,8 +31,8 @@ class EstimatorSettings:
             even value, it is one pixel larger.
         keyframe_overlap: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is
             expected to be below this fraction; used only if the caller does not choose the keyframes.
-        wide_search: whether a link that cannot be measured from the predicted poses is searched for in the whole
-            images, for large or unpredictable motions between keyframes; costs time only where links fail.
+        wide_search: whether features are matched over the whole images where a link cannot be measured from the
+            predicted poses; for large or unpredictable motions between keyframes. Costs time only where links fail.
 
     Raises:
         TwinError: a value is out of range.

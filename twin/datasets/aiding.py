@@ -74,7 +74,7 @@ class Aiding:
     Attributes:
         body_from_camera: (4, 4) pose of the rectified left camera in the body.
         noise: noise of the readings, for the estimators. The noise of the velocity is that of a frame: readings are
-            interpolated, so with fewer readings than frames the errors of consecutive frames are equal, and the
+            interpolated, so with fewer readings than frames the errors of consecutive frames are correlated, and the
             standard deviation is increased by the root of the number of frames per reading.
         notes: sentences on readings that are not used.
     """
@@ -110,7 +110,8 @@ class Aiding:
 
         The motion over the first frames is estimated from the images alone. Each reading of the attitude then gives a
         rotation of the first frame, of which the mean is taken, and each height an offset of the recorded heights,
-        which `at` adds from now on.
+        which `at` adds from now on. Readings that none of the first frames has cannot be related to the start: they are
+        not used from now on, and `notes` says so. Without an attitude, heights are not used either.
 
         Args:
             opening: the first frames.
@@ -126,7 +127,11 @@ class Aiding:
                 rotations.append(world_from_camera @ moved[:3, :3].T)
             if found.pressure_z_m is not None:
                 heights.append((found.pressure_z_m, moved[:3, 3]))
+        if not heights or (known is None and not rotations):
+            self._leave_out_height()
         if known is None and not rotations:
+            self._attitude = None
+            self.notes += (f"The attitude is not used: none of the first {_START_FRAMES} frames has one.",)
             return None
         mean = np.mean(rotations, axis=0) if known is None else known[:3, :3]
         rotation = geometry.nearest_rigid(geometry.pose(mean, np.zeros(3)))[:3, :3]
@@ -142,8 +147,17 @@ class Aiding:
             _prior_cov(rotation, bool(heights)),
         )
 
+    def _leave_out_height(self) -> None:
+        """Leaves out the heights from now on, whose offset from the start is unknown."""
+        if self._height is not None:
+            self._height = None
+            self.notes += (
+                f"The heights from pressure are not used: the first {_START_FRAMES} frames do not relate them to the "
+                "start.",
+            )
+
     def _first_motions(self, opening: Opening) -> list[tuple[Array, Readings]]:
-        """Returns the motion (4, 4) since the first frame and the readings of each of the first frames."""
+        """Returns the motion (4, 4) since the first frame and the readings, for the first frames with a motion."""
         found = []
         settings = replace(opening.settings, use_ga=False, use_f2m=False)
         with Navigator(opening.rig, settings, np.eye(4)) as navigator:
@@ -187,7 +201,7 @@ class Aiding:
 
 
 def _prior_cov(rotation: Array, has_height: bool) -> Array:
-    """Returns the covariance (6, 6) that holds the first node where the readings do not: position, without the height.
+    """Returns `Start.prior_cov`: small for the position, large for the rotation and for the height if it is recorded.
 
     Args:
         rotation: (3, 3) world_from_camera.

@@ -88,14 +88,23 @@ class Bag:
         Raises:
             TwinError: the bag is damaged.
         """
+        for _, message in self.timed_messages(topic):
+            yield message
+
+    def timed_messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yields the time of recording [ns] and the decoded message for each message of a topic, in their order.
+
+        Raises:
+            TwinError: the bag is damaged.
+        """
         with self._damage():
-            for _, _, data in self._reader.messages(self._connections([topic])):
-                yield _typestore().deserialize_cdr(data, self.topics[topic])
+            for _, logged_ns, data in self._reader.messages(self._connections([topic])):
+                yield logged_ns, _typestore().deserialize_cdr(data, self.topics[topic])
 
     def index(self, topics: Sequence[str]) -> dict[str, list[BagMessage]]:
-        """Returns the messages of topics whose type begins with a header, in the order in which they were recorded.
+        """Returns the positions of the messages of each topic, in the order in which they were recorded.
 
-        The whole bag is read once; only times are kept.
+        The messages are not decoded; their types must begin with a header.
 
         Raises:
             TwinError: the bag is damaged.
@@ -129,7 +138,7 @@ class Bag:
         return [one for one in self._reader.connections if one.topic in topics]
 
     def _check_sizes(self) -> None:
-        """Raises ValueError if an MCAP file has no index of its chunks, or a chunk or the bag is too large."""
+        """Raises ValueError if the index of chunks is missing, a chunk is too large, or there are too many messages."""
         if self._reader.message_count > _MOST_MESSAGES:
             raise ValueError(f"{self._reader.message_count} messages; at most {_MOST_MESSAGES}")
         storages = getattr(self._reader.storage, "storages", [self._reader.storage])

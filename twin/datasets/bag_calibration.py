@@ -34,7 +34,7 @@ def stereo_calibration(
         file: bag and topic, for messages.
 
     Raises:
-        TwinError: the messages have no baseline, or a value is impossible.
+        TwinError: the messages have no baseline, or a value is impossible or not supported.
     """
     cameras = [_camera(info, rectified, file) for info in (left, right)]
     turns = [np.eye(3) if rectified else _rotation(info, file) for info in (left, right)]
@@ -103,8 +103,8 @@ def _camera(info: Any, rectified: bool, file: Path) -> RecordedCamera:
     """Returns the camera of a message CameraInfo.
 
     Raises:
-        TwinError: the images are not rectified, and their lens model is not supported, or they are binned or show only
-            a region of interest.
+        TwinError: images that are not rectified have a lens model that is not supported, are binned, or show only a
+            region of interest.
     """
     size = (int(info.width), int(info.height)) if info.width and info.height else None
     if rectified:

@@ -38,7 +38,7 @@ class BagTopics(NamedTuple):
     """Topics of a bag that the user names.
 
     Args:
-        left, right: topics of the images; None: chosen by the reader.
+        left, right: topics of the images; if one is None, the reader chooses both.
         truth: topic of the true poses; None: no truth.
     """
 
@@ -68,8 +68,8 @@ class BagReader:
         """Returns the data set in a bag; images are decoded only when they are used.
 
         Raises:
-            TwinError: the bag, its transforms or its true poses are damaged, its image topics are ambiguous, or it
-                lacks a topic that the user names.
+            TwinError: the bag, its transforms or its true poses are damaged, the stereo pair is missing or ambiguous,
+                a topic that the user names is missing or of another type, or rosbags is not installed.
         """
         bag = Bag(folder)
         topics = self._stereo_topics(bag)
@@ -161,7 +161,8 @@ def _truth(bag: Bag, topic: str, camera: str, transforms: Transforms) -> tuple[T
         transforms: static transforms, for the pose of the camera in the body whose poses are recorded.
 
     Raises:
-        TwinError: the topic does not exist or has no poses, or the transforms do not join body and camera.
+        TwinError: the topic does not exist or has no poses, a pose is damaged, or the transforms do not join body and
+            camera.
     """
     kind = bag.topics.get(topic)
     if kind not in _POSES:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ from twin.datasets.readings import (
     RecordedReadings,
     SensorQuantity,
     SensorSeries,
+    UncheckedReadings,
     checked_series,
 )
 from twin.errors import TwinError
@@ -28,8 +30,9 @@ _TYPES = {
     "sensor_msgs/msg/Imu": ATTITUDE,
     "geometry_msgs/msg/TwistWithCovarianceStamped": VELOCITY,
 }
+_Converter = Callable[[Any, str], tuple[Array, Array]]  # of a message and its place to values and variances
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
-_SAME_PLACE_M = 0.01  # largest distance of two frames that count as one place
+_SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that count as one place
 
 
 class _Recorded(NamedTuple):
@@ -45,8 +48,10 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
 
     The body is the frame of the attitude or, if there is none, that of the velocity. If /tf_static does not join this
     frame to the left camera, neither attitude nor velocity is used. A sensor is also not used if there are several
-    topics of its type, if its messages state no covariance, or if it is not where it must be: the pressure sensor at
-    the left camera, the DVL at the origin of the body (within 1 cm). The notes of the result say what is not used.
+    topics of its type, if one of its messages states no covariance, or if it is not where it must be: the pressure
+    sensor at the left camera, the DVL at the origin of the body (within 1 cm). Readings with a value or a covariance
+    that is not finite are left out. The notes of the result name the readings that are not used. Readings whose headers
+    have no times have those of their recording.
 
     Args:
         bag: the bag.
@@ -97,8 +102,8 @@ def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[st
 def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _Recorded | None:
     """Returns the readings of the only topic of a type.
 
-    The result is None if there is no such topic or if it has no messages; also, with an entry in `notes`, if several
-    topics have this type or if a message has no covariance.
+    The result is None if there is no such topic; also, with an entry in `notes`, if several topics have this type, if a
+    message has no covariance, or if the topic has no finite reading.
 
     Raises:
         TwinError: a reading is impossible.
@@ -108,24 +113,68 @@ def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _
         notes.append(f"The {quantity.name} is not used: several topics have it ({', '.join(sorted(topics))[:200]}).")
     if len(topics) != 1:
         return None
-    topic, convert = topics[0], _CONVERT[kind]
-    times_ns, values, variances, places, frame = [], [], [], [], ""
-    for number, message in enumerate(bag.messages(topic), 1):
-        place = f"{bag.path}:{topic}: message {number}"
-        value, variance = convert(message, place)
-        if not np.any(variance > 0):
-            notes.append(f"The readings of {topic} are not used: they state no covariance.")
-            return None
-        times_ns.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
-        values.append(value)
-        variances.append(variance)
-        places.append(place)
-        frame = message.header.frame_id.lstrip("/")
-    if not values:
+    topic = topics[0]
+    messages = _messages(bag, topic, _CONVERT[kind], quantity.n)
+    if messages is None:
+        notes.append(f"The readings of {topic} are not used: they state no covariance.")
         return None
-    sigmas = np.sqrt(np.max(variances, axis=0))
-    series = checked_series(quantity, np.array(times_ns) * 1e-9, np.array(values), sigmas, places)
-    return _Recorded(topic, frame, series)
+    series = checked_series(quantity, messages.recorded, messages.sigmas, notes)
+    if series is not None and messages.unstamped:
+        notes.append(f"The readings of {topic} have no times in their headers; the times of recording were used.")
+    return None if series is None else _Recorded(topic, messages.frame, series)
+
+
+class _Messages(NamedTuple):
+    """Contents of the messages of a topic.
+
+    Args:
+        recorded: times and values; a value is NaN where value or variance of a message is not finite.
+        sigmas: (k,) largest standard deviations of the finite readings.
+        frame: frame of the last message; "" without messages.
+        unstamped: whether all headers have the time 0, so that the times of `recorded` are those of recording.
+    """
+
+    recorded: UncheckedReadings
+    sigmas: Array
+    frame: str
+    unstamped: bool
+
+
+def _messages(bag: Bag, topic: str, convert: _Converter, n: int) -> _Messages | None:
+    """Returns the contents of the messages of a topic; None if a finite reading has no covariance.
+
+    Args:
+        bag: the bag.
+        topic: the topic.
+        convert: function that returns values (n,) and variances (n,) of a message.
+        n: number of values of a message.
+
+    Raises:
+        TwinError: the bag is damaged, or a reading is impossible.
+    """
+    stamps_ns, logged_ns, values = array("q"), array("q"), array("d")  # compact, as a bag may have millions of messages
+    largest, frame = np.zeros(n), ""
+    for recorded_ns, message in bag.timed_messages(topic):
+        value, variance = convert(message, _place(bag, topic, len(stamps_ns)))
+        finite = bool(np.isfinite(value).all() and np.isfinite(variance).all())
+        if finite and not np.any(variance > 0):
+            return None
+        if finite:
+            largest = np.maximum(largest, variance)
+        stamps_ns.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        logged_ns.append(recorded_ns)
+        values.extend(value if finite else np.full(n, np.nan))
+        frame = message.header.frame_id.lstrip("/")
+    unstamped = not any(stamps_ns)
+    times_s: Array = np.array(logged_ns if unstamped else stamps_ns, np.float64) * 1e-9
+    table = np.array(values, np.float64).reshape(-1, n)
+    recorded = UncheckedReadings(topic, times_s, table, lambda k: _place(bag, topic, k))
+    return _Messages(recorded, np.asarray(np.sqrt(largest), np.float64), frame, unstamped)
+
+
+def _place(bag: Bag, topic: str, k: int) -> str:
+    """Returns the place of the message of this number, from 0, for messages."""
+    return f"{bag.path}:{topic}: message {k + 1}"
 
 
 def _height(message: Any, _: str) -> tuple[Array, Array]:
@@ -135,7 +184,9 @@ def _height(message: Any, _: str) -> tuple[Array, Array]:
 
 
 def _attitude(message: Any, place: str) -> tuple[Array, Array]:
-    """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) of a message Imu; zeros without an orientation.
+    """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) of a message Imu.
+
+    The result is zeros without an orientation, and NaN for an orientation that is not finite.
 
     Raises:
         TwinError: the orientation is not a unit quaternion.
@@ -145,7 +196,9 @@ def _attitude(message: Any, place: str) -> tuple[Array, Array]:
         return np.zeros(3), np.zeros(3)
     q = message.orientation
     quaternion = np.array([q.w, q.x, q.y, q.z])
-    if not abs(np.linalg.norm(quaternion) - 1) < _UNIT_QUATERNION:  # also for NaN
+    if not np.isfinite(quaternion).all():
+        return np.full(3, np.nan), variances
+    if abs(np.linalg.norm(quaternion) - 1) > _UNIT_QUATERNION:
         shown = ", ".join(f"{value:g}" for value in quaternion)
         raise TwinError(place, f"the orientation is {shown} (w, x, y, z)", "a unit quaternion")
     return geometry.rpy_from_rotation(geometry.rotation_from_wxyz(quaternion)), variances
@@ -158,7 +211,7 @@ def _velocity(message: Any, _: str) -> tuple[Array, Array]:
     return np.array([linear.x, linear.y, linear.z]), variances.copy()
 
 
-_CONVERT: dict[str, Callable[[Any, str], tuple[Array, Array]]] = {
+_CONVERT: dict[str, _Converter] = {
     "sensor_msgs/msg/FluidPressure": _height,
     "sensor_msgs/msg/Imu": _attitude,
     "geometry_msgs/msg/TwistWithCovarianceStamped": _velocity,

@@ -93,7 +93,8 @@ class Reader(Protocol):
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder or file; images are not decoded.
 
-        An error in the calibration or in the truth is returned in `Dataset`, not raised: the user may replace them.
+        An error in the calibration, the truth or the readings is returned in `Dataset`, not raised: the user may
+        replace the first two and replay without the readings.
 
         Raises:
             TwinError: another file of the data set is missing or damaged.

@@ -56,10 +56,10 @@ class EurocReader:
 
 
 def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
-    """Returns the poses of the left camera from true poses of the body: time [ns], x, y, z [m], qw, qx, qy, qz.
+    """Returns the poses of the left camera from a file of true poses of the body.
 
     Args:
-        file: data.csv of the truth.
+        file: data.csv of the truth with the columns time [ns], x, y, z [m], qw, qx, qy, qz.
         body_from_left: (4, 4) pose of the left camera in the body.
 
     Raises:
@@ -83,11 +83,11 @@ def _image_times(camera: Path) -> list[ImageTime]:
     """Returns the times and files of the images of a camera, in the order of data.csv.
 
     Raises:
-        TwinError: a line is not a time and a file name, or the file is not in the folder of the camera.
+        TwinError: a line is not a time and a file name, or the name leads out of the folder `data` of the camera.
     """
     images, source = [], camera / "data.csv"
     for number, parts in text_rows(source):
-        if len(parts) < 2 or not parts[0].strip().isdigit():
+        if len(parts) < 2 or not parts[0].strip().isdecimal():
             raise TwinError(f"{source}:{number}", "is not a time and a file name", "timestamp [ns],filename")
         images.append(ImageTime(int(parts[0]) * 1e-9, inside(camera / "data", parts[1].strip(), source)))
     return images

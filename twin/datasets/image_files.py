@@ -159,8 +159,15 @@ def _header(data: bytes) -> tuple[int, int, str]:
 
 
 def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16."""
-    return decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
+    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
+
+    Raises:
+        UnreadableImage: the image cannot be used; also if a stored image of another package has another size.
+    """
+    pixels = decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
+    if pixels.shape[1::-1] != size_px:
+        raise UnreadableImage("another size")
+    return pixels
 
 
 def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:

@@ -30,7 +30,8 @@ class KittiReader:
         """Returns the data set in a folder.
 
         Raises:
-            TwinError: the list of times is damaged, an image has no time in it, or an image lies elsewhere.
+            TwinError: the list of times is missing or damaged, an image has no time in it, or an image folder is not
+                valid (`image_files`).
         """
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))
@@ -38,7 +39,7 @@ class KittiReader:
         calibration, body_from_left = (found, None) if isinstance(found, TwinError) else found
         times_s = read_table(folder / "times.txt", 1)[:, 0]
         names = sorted(left.keys() | right.keys())
-        if not all(name.isdigit() and int(name) < len(times_s) for name in names):
+        if not all(name.isdecimal() and int(name) < len(times_s) for name in names):
             problem = f"has {len(times_s)} times, but an image is called {names[-1][:40]}"
             raise TwinError(str(folder / "times.txt"), problem, "images that are numbered from 000000, one time each")
         frames = [

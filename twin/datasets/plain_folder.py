@@ -29,7 +29,11 @@ class PlainFolderReader:
         return (folder / "left").is_dir() and (folder / "right").is_dir()
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if its times are damaged or an image lies elsewhere."""
+        """Returns the data set in a folder.
+
+        Raises:
+            TwinError: the list of times is damaged, or an image folder is not valid (`image_files`).
+        """
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
         times_s, notes = _times(folder / "times.txt", names)
@@ -72,14 +76,14 @@ def image_files(folder: Path) -> dict[str, Path]:
 
 def _natural_order(name: str) -> list[tuple[int, int | str]]:
     """Returns a key that sorts names by the numbers in them: img2 before img10."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name) if part]
 
 
 def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
     """Returns the times of the images [s], from times.txt or the names of the images, and notes on assumptions made.
 
     Raises:
-        TwinError: times.txt does not have one time per image.
+        TwinError: times.txt is damaged or does not have one time per image.
     """
     if file.is_file():
         times_s = read_table(file, 1)[:, 0].tolist()
@@ -88,8 +92,8 @@ def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
         return times_s, ()
     if all(re.fullmatch(r"\d{9,10}\.\d+|\d+\.\d+", name) for name in names):
         return [float(name) for name in names], ()
-    lengths = {len(name) for name in names if name.isdigit()}
-    if len(lengths) == 1 and all(name.isdigit() for name in names) and (unit := _UNITS.get(*lengths)):
+    lengths = {len(name) for name in names if name.isdecimal()}
+    if len(lengths) == 1 and all(name.isdecimal() for name in names) and (unit := _UNITS.get(*lengths)):
         return [int(name) * unit for name in names], ()
     note = f"The data set has no times (times.txt); {_ASSUMED_HZ:g} frame per second was assumed."
     return [k / _ASSUMED_HZ for k in range(len(names))], (note,) if len(names) > 1 else ()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.datasets.text_files import read_table, read_yaml, text_rows
+from twin.datasets.text_files import read_numbered_table, read_yaml
 from twin.errors import TwinError
 
 
@@ -20,7 +21,7 @@ class SensorQuantity(NamedTuple):
         folder: folder of its readings in an EuRoC-like data set.
         unit: unit of its values and standard deviations.
         n: number of its values.
-        largest: largest absolute value.
+        largest: largest allowed absolute value.
     """
 
     name: str
@@ -54,7 +55,7 @@ class RecordedReadings(NamedTuple):
 
     Args:
         body_from_left: (4, 4) pose of the left camera, before rectification, in the body that the sensors refer to.
-        height: heights of the left camera above any horizontal plane [m].
+        height: heights of the left camera above a horizontal plane, whose level may be unknown [m].
         attitude: roll, pitch and yaw of the body in a world whose z axis points up [rad].
         velocity: velocities of the origin of the body over ground, in body axes [m/s].
         notes: sentences on readings that are not used.
@@ -67,35 +68,63 @@ class RecordedReadings(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
+class UncheckedReadings(NamedTuple):
+    """Readings of one sensor as recorded.
+
+    Args:
+        source: topic or folder of the readings, for notes.
+        times_s: (n,) times [s].
+        values: (n, k) readings; not finite where the sensor had none, as a DVL without bottom lock.
+        place: function that returns the place of a reading (file and line, or topic and message) for its number from 0.
+    """
+
+    source: str
+    times_s: Array
+    values: Array
+    place: Callable[[int], str]
+
+
 def checked_series(
-    quantity: SensorQuantity, times_s: Array, values: Array, sigmas: Array, places: list[str]
-) -> SensorSeries:
-    """Returns the readings of a sensor after checking them.
+    quantity: SensorQuantity, recorded: UncheckedReadings, sigmas: Array, notes: list[str]
+) -> SensorSeries | None:
+    """Returns the finite readings of a sensor after checking them; None without any.
+
+    Readings that are not finite are left out; an entry in `notes` counts them.
 
     Args:
         quantity: the measured quantity.
-        times_s: (n,) times [s].
-        values: (n, k) readings.
+        recorded: the readings.
         sigmas: (k,) standard deviations.
-        places: place of each reading (file and line, or topic and message), for messages.
+        notes: sentences on readings that are not used, to which sentences are appended.
 
     Raises:
-        TwinError: a time is not after that before, a value is not finite or too large, or a standard deviation is not
-            positive.
+        TwinError: a time is not after the previous one, a value is too large, or a standard deviation is not positive.
     """
+    if not len(recorded.values):
+        notes.append(f"There are no readings in {recorded.source}.")
+        return None
+    kept = np.flatnonzero(np.isfinite(recorded.values).all(axis=1))
+    if not len(kept):
+        notes.append(f"The readings of {recorded.source} are not used: none of them is finite.")
+        return None
+    if lost := len(recorded.values) - len(kept):
+        notes.append(f"{lost} of {len(recorded.values)} readings of {recorded.source} are not used: not finite.")
+    times_s, values = recorded.times_s[kept], recorded.values[kept]
     late = np.flatnonzero(np.diff(times_s) <= 0)
     if len(late):
         k = int(late[0]) + 1
         problem = f"the time {times_s[k]:.9g} s is not after that of the reading before, {times_s[k - 1]:.9g} s"
-        raise TwinError(places[k], problem, "increasing times")
-    bad = np.argwhere(~(np.abs(values) <= quantity.largest))
-    if len(bad):
-        k, column = (int(index) for index in bad[0])
+        raise TwinError(recorded.place(int(kept[k])), problem, "increasing times")
+    large = np.argwhere(np.abs(values) > quantity.largest)
+    if len(large):
+        k, column = (int(index) for index in large[0])
         problem = f"the {quantity.name} is {values[k, column]:g} {quantity.unit}"
-        raise TwinError(places[k], problem, f"-{quantity.largest:g} to {quantity.largest:g} {quantity.unit}")
+        allowed = f"-{quantity.largest:g} to {quantity.largest:g} {quantity.unit}"
+        raise TwinError(recorded.place(int(kept[k])), problem, allowed)
     if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
         shown = ", ".join(f"{sigma:g}" for sigma in sigmas)
-        raise TwinError(places[0], f"the standard deviations of the {quantity.name} are {shown}", "positive numbers")
+        problem = f"the standard deviations of the {quantity.name} are {shown}"
+        raise TwinError(recorded.place(0), problem, "positive numbers")
     return SensorSeries(times_s, values, sigmas)
 
 
@@ -103,7 +132,8 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
     """Returns the readings in the folders pressure0, ahrs0 and dvl0 of an EuRoC-like data set; None without any.
 
     `data.csv` has the time [ns] and the values, `sensor.yaml` their standard deviations as `sigma` (one number or one
-    per value). Readings without a standard deviation are not used.
+    per value). Readings without a standard deviation are not used, nor are readings with an empty value or one that is
+    not finite.
 
     Args:
         root: folder of the sensors.
@@ -119,24 +149,29 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
         sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.is_file() else None
         if file.is_file() and sigmas is None:
             notes.append(f"The readings in {quantity.folder} are not used: sensor.yaml states no `sigma`.")
-        found.append(None if sigmas is None else _read_csv(file, quantity, sigmas))
+        found.append(None if sigmas is None else _read_csv(file, quantity, sigmas, notes))
     height, attitude, velocity = found
     if not notes and height is attitude is velocity is None:
         return None
     return RecordedReadings(body_from_left, height, attitude, velocity, tuple(notes))
 
 
-def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array) -> SensorSeries | None:
-    """Returns the readings in a file data.csv; None without any.
+def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
+    """Returns the finite readings in a file data.csv; None without any. Sentences on the others go to `notes`.
 
     Raises:
-        TwinError: a line is not a time and finite values, or a value is impossible.
+        TwinError: a line is not a time and numbers, or a value is impossible.
     """
-    rows, lines = read_table(file, 1 + quantity.n), [number for number, _ in text_rows(file)]
-    if not len(rows):
-        return None
-    places = [f"{file}:{number}" for number in lines]
-    return checked_series(quantity, rows[:, 0] * 1e-9, rows[:, 1:], sigmas, places)
+    columns = 1 + quantity.n
+    table = read_numbered_table(file, columns, 1, lambda parts: [_number(part) for part in parts[:columns]])
+    times_s, values = table.values[:, 0] * 1e-9, table.values[:, 1:]
+    recorded = UncheckedReadings(quantity.folder, times_s, values, lambda k: f"{file}:{table.lines[k]}")
+    return checked_series(quantity, recorded, sigmas, notes)
+
+
+def _number(text: str) -> float:
+    """Returns the number in a column; NaN for an empty column. Raises ValueError for another text."""
+    return float(text) if text.strip() else np.nan
 
 
 def _sigmas(file: Path, n: int) -> Array | None:

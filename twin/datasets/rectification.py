@@ -27,8 +27,8 @@ class Rectification(NamedTuple):
     Args:
         rig: calibration of the rectified pair.
         left_from_rectified: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation).
-        maps: for each camera, column and row (H, W) of every rectified pixel in the recorded image; None if the
-            recorded images are rectified.
+        maps: for each camera, column and row (H, W) of every rectified pixel in the recorded image; None if its
+            recorded images are used unchanged.
     """
 
     rig: StereoRig
@@ -52,8 +52,9 @@ class Rectification(NamedTuple):
 def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Rectification:
     """Returns the rectification for a calibration that states the size of the images.
 
-    The rotations and the common camera matrix are those of `cv2.stereoRectify` (Bouguet's method), or of
-    `cv2.fisheye.stereoRectify`; all pixels of a rectified image without fisheye distortion lie in the recorded image.
+    A pair that was recorded rectified keeps the camera matrix of its left camera. Otherwise the rotations and the
+    common camera matrix are those of `cv2.stereoRectify` (Bouguet's method, alpha = 0: all pixels of a rectified image
+    lie in the recorded image), or of `cv2.fisheye.stereoRectify` with balance = 0.
 
     Raises:
         TwinError: the cameras have different lens models, or their views do not overlap.

@@ -64,13 +64,13 @@ class ReplayOptions:
         bayer: pattern of raw images; None: grey or colour images.
         settings: settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the
             defaults.
-        start: (4, 4) pose world_from_camera of the left camera at the first frame; None: the plane z = 0 of the world
-            is fitted to the floor in the first pair.
+        start: (4, 4) pose world_from_camera of the rectified left camera at the first frame; None: z is up by the
+            recorded attitude or, without one, the plane z = 0 of the world is fitted to the floor in the first pair.
         outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
         topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
-        aiding: whether recorded readings of pressure, attitude and DVL are used.
         estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
             whose poses the map is built; None: the estimators of `twin.estimate`.
+        aiding: whether recorded readings of pressure, attitude and DVL are used.
     """
 
     calibration: Path | None = None
@@ -200,7 +200,7 @@ class _Prepared(NamedTuple):
 
 
 def _prepared(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> _Prepared:
-    """Returns rig, start and sensor noise; the start is found from the readings where they have an attitude."""
+    """Returns rig, start and sensor noise; a start in the options precedes one from the readings."""
     rig, over_plane, aiding = opened.frames.rectification.rig, opened.plane.world_from_camera, opened.aiding
     start = Start(over_plane if options.start is None else options.start)
     if aiding is None:

@@ -6,10 +6,11 @@ import csv
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.paths import is_file, resolved
@@ -28,7 +29,7 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows.
 
     Raises:
-        YAMLError: the number of values is not rows times columns, or is too large.
+        YAMLError: the matrix is empty or too large, or the number of values is not rows times columns.
     """
     assert isinstance(node, yaml.MappingNode)
     matrix = loader.construct_mapping(node, deep=True)
@@ -89,7 +90,7 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 
 def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[float]] | None = None) -> Array:
-    """Returns the numbers (n, columns) of a text file; columns are separated by commas or spaces.
+    """Returns the numbers (n, columns) of a text file; columns are separated by commas or white space.
 
     Lines that are empty or begin with # are ignored; further columns are ignored as well.
 
@@ -101,16 +102,47 @@ def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[flo
     Raises:
         TwinError: the file cannot be read, or a line has too few columns or a value that is not a finite number.
     """
-    rows = []
+    return read_numbered_table(file, columns, columns, convert).values
+
+
+class NumberedTable(NamedTuple):
+    """Numbers of a text file with their lines.
+
+    Args:
+        lines: (n,) numbers of the lines, from 1.
+        values: (n, columns) numbers.
+    """
+
+    lines: NDArray[np.int64]
+    values: Array
+
+
+def read_numbered_table(
+    file: Path, columns: int, n_finite: int, convert: Callable[[list[str]], list[float]] | None = None
+) -> NumberedTable:
+    """Returns the numbers of a text file and the numbers of their lines, as `read_table` does.
+
+    Args:
+        file: the file.
+        columns: number of columns to read.
+        n_finite: number of columns, from the first one on, whose values must be finite.
+        convert: function that converts the texts of one line to numbers; by default, float.
+
+    Raises:
+        TwinError: the file cannot be read, a line has too few columns, or one of its values is not a number or, in the
+            first `n_finite` columns, not finite.
+    """
+    lines, rows = [], []
     for number, parts in text_rows(file):
         try:
             values = [float(part) for part in parts[:columns]] if convert is None else convert(parts)
         except ValueError:
             values = []
-        if len(values) != columns or not np.isfinite(values).all():
+        if len(values) != columns or not np.isfinite(values[:n_finite]).all():
             raise TwinError(f"{file}:{number}", "is not a line of numbers", f"{columns} finite numbers")
+        lines.append(number)
         rows.append(values)
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+    return NumberedTable(np.array(lines, np.int64), np.array(rows, dtype=np.float64).reshape(-1, columns))
 
 
 def text_rows(file: Path) -> list[tuple[int, list[str]]]:

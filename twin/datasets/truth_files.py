@@ -39,7 +39,7 @@ def read_truth(file: Path, dataset: Dataset) -> Trajectory:
         if times_s is None:
             times_s = np.array([frame.time_s for frame in dataset.images])
         return camera_poses(file, times_s, dataset.body_from_left)
-    if columns >= 8 and first.isdigit() and len(first) >= 16:
+    if columns >= 8 and first.isdecimal() and len(first) >= 16:
         return camera_truth(file, np.eye(4) if dataset.body_from_left is None else dataset.body_from_left)
     if columns == 8:
         return _tum(file)

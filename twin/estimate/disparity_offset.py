@@ -5,7 +5,7 @@ the rows of points. A small yaw of one camera has nearly the same effect. Depths
 motions, are then wrong. Over a floor with relief the offset is observable: image motions of near and far points must be
 proportional to their disparities, and are not if there is an offset. Over a level floor the offset is not observable:
 errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the scatter of
-the links does not show them.
+the links does not reveal these errors.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def combine(
 def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> float:
     """Returns the mean number of nodes that see a floor point in the image of a node, this node included.
 
-    The overlap of two images is that of their rectangles on a plane at the depth of the first one, parallel to it;
-    rotations about the optical axis are neglected.
+    The overlap of two images is that of their rectangles on a plane parallel to the first image, at the median depth of
+    its floor. Rotations are neglected.
 
     Args:
         world_from_camera: (n, 4, 4) poses of the nodes.

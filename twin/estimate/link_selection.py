@@ -113,7 +113,7 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     Suppose that the shift of a patch is the same in all links of the path while the patch is in view. With the overlap
     q of consecutive nodes, links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in
     common. The variance of the summed error is then that of independent errors times
-    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), summed over 1 <= l < m. In fact the shifts are only partly the same,
+    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), summed over 1 <= l < m. Real shifts are only partly the same,
     because not all corners are selected again and M changes with the viewing direction. The covariance is therefore
     also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because
     one such link starts at every node.
@@ -136,9 +136,9 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    With r the standard deviation of the residuals divided by the expected one, it is 1 - 1 / r^2, or 0 if r does not
-    exceed 1 by two standard errors. For n normally distributed residuals with three coordinates, r is the median of n
-    chi-distributed values divided by its expectation, and has a standard error of 0.56 / sqrt(n).
+    With r the standard deviation of the residuals divided by the expected one, the fraction is 1 - 1 / r^2, or 0 if r
+    does not exceed 1 by two standard errors. For n normally distributed residuals with three coordinates, r is the
+    median of n chi-distributed values divided by its expectation, and has a standard error of 0.56 / sqrt(n).
 
     Args:
         motion: motion from `two_view_motion.pair_motion`.

@@ -27,7 +27,7 @@ from twin.estimate.vision_interface import Vision
 
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
 _FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are practically fixed
-_START_NODES = 4  # number of first nodes; candidates for every link, because loops return to the reference position
+_START_NODES = 4  # the first nodes are candidates for every link, because loops return to the reference position
 _MOST_PENDING = 8  # largest number of nodes with link measurements in progress
 
 
@@ -51,12 +51,13 @@ class LinkQueue:
         """Yields the links of one node at a time, oldest first, until at most `all_but` nodes are pending.
 
         Raises:
-            OSError: images could not be read or written; all pending measurements are dropped.
+            OSError: images could not be read or written.
+            Exception: a measurement failed otherwise. After any error, all pending measurements are dropped.
         """
         while len(self._pending) > all_but:
             try:
                 links = self._pending[0]()
-            except OSError:
+            except Exception:
                 self._pending.clear()
                 raise
             self._pending.popleft()
@@ -113,8 +114,8 @@ class KeyframeNetwork:
         stopwatch: returns the context manager that times the stage of a given name.
 
     Attributes:
-        reference_cov: (6, 6) prior covariance of the first node [rotation, translation] (rad, m), by default that of an
-            exact pose, which defines the world frame.
+        reference_cov: (6, 6) prior covariance of the first node [rotation, translation] (rad, m); by default it is
+            negligible, because the first pose defines the world frame.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class KeyframeNetwork:
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
 
     def link_to_last_node(self, node: Keyframe) -> Link | None:
-        """Returns the measured link from the last node to a new one; None for the first node or if matching fails.
+        """Returns the measured link from the last node to a new one; None for the first node or a failed measurement.
 
         Raises:
             OSError: images could not be read or written.
@@ -217,7 +218,7 @@ class KeyframeNetwork:
         first = track - self.settings.window_tracks
         if not self.settings.use_ga or len(self.nodes) < 2 or self.nodes[-1].track < first:
             return None
-        self.history.before_ga.append(self.poses[:, :3, 3].copy())
+        before = self.poses[:, :3, 3].copy()
         self._collect_links()
         with self.stopwatch("ga"):
             aligned = self._align([k for k in self.nodes if k.track >= first], track, marginals=[self.nodes[-1].number])
@@ -225,6 +226,7 @@ class KeyframeNetwork:
         left = bisect_left(self.nodes, first, key=lambda k: k.track)
         if left > _START_NODES:
             self.vision.discard(range(self.nodes[_START_NODES - 1].number + 1, self.nodes[left].number))
+        self.history.before_ga.append(before)
         self.history.after_ga.append(self.poses[:, :3, 3].copy())
         return aligned.covs[-1]
 
@@ -290,12 +292,14 @@ class KeyframeNetwork:
         """Adds the links of pending nodes to the network, oldest first, until at most `all_but` nodes are pending.
 
         Raises:
-            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
+            OSError: images could not be read or written.
+            Exception: a measurement failed otherwise. After any error, the network is incomplete and `align_all`
+                returns None.
         """
         try:
             for links in self._queue.collect(all_but):
                 self.links.add(links)
-        except OSError:
+        except Exception:
             self._alignable = False
             raise
 

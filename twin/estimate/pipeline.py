@@ -120,7 +120,7 @@ class Navigator:
         self._resources.close()
 
     def set_start_cov(self, cov: Array, prior_cov: Array) -> None:
-        """States how well the start is known; by default it is exact. Call it before the first frame.
+        """Sets how well the start is known; by default it is nearly exact. Call it before the first frame.
 
         Args:
             cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
@@ -143,7 +143,8 @@ class Navigator:
             track: number of the track, from 1; `align_track` aligns a window of tracks.
 
         Raises:
-            ValueError: the frame is not later than the last one; it is ignored.
+            ValueError: the frame is not later than the last one, or an image is not of the size that the calibration
+                states; the frame is ignored.
             OSError: images could not be read or written.
         """
         interval_s = self._interval_s(frame.time_s)
@@ -345,9 +346,8 @@ class Navigator:
         """Returns whether a frame becomes a keyframe, as far as this does not depend on its matched points.
 
         The next stereo pair is expected after the same motion as that since the last pair. If it overlapped with the
-        last keyframe by less than `settings.keyframe_overlap`, the present pair becomes a keyframe. The overlap of
-        consecutive keyframes therefore stays above this fraction, also where pairs are so rare that the motion between
-        two of them uses up most of 1 - `keyframe_overlap`.
+        last keyframe by less than `settings.keyframe_overlap`, the present pair becomes a keyframe. Without this
+        prediction, consecutive keyframes would overlap by less than this fraction where pairs are far apart.
         """
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
@@ -450,7 +450,7 @@ class Navigator:
 
         Args:
             before: (4, 4) pose of the last keyframe before the alignment.
-            node_cov: (6, 6) covariance of the pose of the last keyframe's node [rotation, translation] (rad, m).
+            node_cov: (6, 6) covariance of the pose of the last node [rotation, translation] (rad, m).
         """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera

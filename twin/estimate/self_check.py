@@ -84,7 +84,7 @@ def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
     offset = _median(pair.row_offset_px for pair in result.stereo_observations)
     if offset is not None and abs(offset) > MAX_ROW_OFFSET_PX:
         text = f"the rows of the right image are offset by {offset:+.2f} px"
-        yield Finding("row_offset", offset, MAX_ROW_OFFSET_PX, text)
+        yield Finding("row_offset", abs(offset), MAX_ROW_OFFSET_PX, text)
     epipolar = result.quality.epipolar
     if epipolar is not None:
         yaw, sigma = float(epipolar.estimate[1]), float(epipolar.sigma[1])

@@ -24,7 +24,7 @@ from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
-from twin.estimate.vision.light_pattern import LightPattern, light_pattern
+from twin.estimate.vision.light_pattern import LightPattern, light_pattern, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.repetition import repetition
@@ -76,7 +76,7 @@ class StereoVision:
         stopwatch: StageTimer | None = None,
     ):
         self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()
-        self._row_scale = rig.fx_px / rig.fy_px
+        self._row_scale, self._size_px = rig.fx_px / rig.fy_px, (rig.width_px, rig.height_px)
         self._cell_m, self._folder = cell_m, folder
         self._last_s = np.nan  # time of the last frame
         self._plane_from_world: Array | None = None
@@ -101,6 +101,7 @@ class StereoVision:
         """Creates the image spool, the tracker and the matcher for images of this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
+        self._pattern_fits: dict[int, Array] = {}  # by frame index
         self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
         self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
         self.search_range = disparity.SearchRange(self.rig)
@@ -145,6 +146,7 @@ class StereoVision:
         self._image = matching.normalise(self._gray)
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
+        _check_size(frame, self._size_px)
         with self.stopwatch("f2f"):
             self._set_image(self._square(frame.left))
             return self.f2f.step(self._image, self._interval_s(frame.time_s))
@@ -165,6 +167,7 @@ class StereoVision:
             return None
         self._points, self._depth_m = pair.points, _depth(pair.dense_px, self.rig)
         self.spool.put(row, left_image, pair.right_image, (self._gray, pair.right))
+        self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left_image, pair.right_image)))
         return pair.points
 
     def _match_pair(self, right_image: Image) -> _MatchedPair:
@@ -271,13 +274,15 @@ class StereoVision:
     def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
         """Returns the light pattern of keyframes at these frame indices, from at most `_PATTERN_PAIRS` of them."""
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
-        return light_pattern(gray_levels(self._pair(int(row))) for row in chosen)
+        return light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
 
     def left_image(self, row: int) -> Image | None:
         return self.spool.left(row)
 
     def _pair(self, row: int) -> KeyframeImages:
-        left, right = self.spool.pair(row)
+        return self._binned(*self.spool.pair(row))
+
+    def _binned(self, left: Image, right: Image) -> KeyframeImages:
         return KeyframeImages(matching.binned(left, self.binning), matching.binned(right, self.binning))
 
 
@@ -294,3 +299,11 @@ def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.floa
     """Returns the depth (H, W) [m]; NaN where the disparity is unknown or not above one pixel."""
     usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
     return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)
+
+
+def _check_size(frame: Frame, size_px: tuple[int, int]) -> None:
+    """Raises ValueError if an image of a frame is not of the size (width, height) that the calibration states [px]."""
+    for side, image in (("left", frame.left), ("right", frame.right)):
+        if image is not None and image.shape[1::-1] != size_px:
+            found, expected = (" x ".join(str(n) for n in size) for size in (image.shape[1::-1], size_px))
+            raise ValueError(f"{side}: the image has {found} px, but the calibration is of {expected} px")

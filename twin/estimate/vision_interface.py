@@ -32,7 +32,11 @@ class Vision(Protocol):
     stereo_observations: list[StereoObservation]
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        """Returns the frame-to-frame motion (F2F) since the last frame, and "ok" or the reason why tracking failed."""
+        """Returns the frame-to-frame motion (F2F) since the last frame, and "ok" or the reason why tracking failed.
+
+        Raises:
+            ValueError: an image is not of the size that the calibration states; the frame is ignored.
+        """
         ...
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:

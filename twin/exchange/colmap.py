@@ -47,6 +47,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     by 0.5 than in OpenCV. If no keyframe has a stereo pair, all stereo pairs are written.
 
     Raises:
+        TwinError: an image is truncated or not a PNG image.
         OSError: a file cannot be read or written.
     """
     rig = contents.true or contents.believed
@@ -67,7 +68,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
-    """Returns points (n, 3) in the world [m] at about `MOST_POINTS` mapped cells, and their colours (n, 3)."""
+    """Returns points (n, 3) in the world [m] at mapped cells, at most about `MOST_POINTS`, and their colours (n, 3)."""
     if elevation is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     stride = max(1, int(np.ceil(np.sqrt(np.isfinite(elevation.height_m).sum() / MOST_POINTS))))

@@ -55,6 +55,7 @@ class EurocWriter:
         """Adds the image files of a recorded frame; the right one may be missing.
 
         Raises:
+            TwinError: an image is truncated or not a PNG image.
             OSError: an image cannot be read or written.
         """
         for camera, file in (("cam0", frame.left), ("cam1", frame.right)):
@@ -114,7 +115,7 @@ def _write_readings(root: Path, contents: RunContents) -> None:
     """Writes the readings of each sensor that was recorded: pressure0, ahrs0, dvl0, usbl0, each with data.csv.
 
     `sensor.yaml` has the standard deviations of the readings (`sigma`) from the section [navigation] of the scenario;
-    it is left out if the scenario states none.
+    it is left out if the scenario states none or if one of them is 0.
     """
     navigation = contents.scenario.get("navigation", {})
     level_rad, heading_rad = (

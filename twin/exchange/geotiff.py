@@ -135,7 +135,7 @@ def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     otherwise 0.
 
     Raises:
-        ValueError: the raster is rotated or its cells are not square.
+        ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
     """
     t, tags = source.transform, source.tags()
     if t.b or t.d or t.a <= 0 or not np.isclose(t.a, -t.e, rtol=1e-6):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import uuid
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ _UNKNOWN = "unknown"
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes the images and ifdo.json, with position, attitude, calibration and hash of each image.
 
-    Positions and attitudes are those of the final trajectory, as in the report of a real survey; without one, they are
-    the true ones. Latitude and longitude (EPSG:4326), which iFDO requires, are written if the export has a CRS;
-    otherwise, the file has only poses in local coordinates. Times count from 1970-01-01, because a run has no date.
+    Positions and attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude
+    (EPSG:4326), which iFDO requires, are written if the export has a CRS; otherwise, the file has only poses in local
+    coordinates. Times count from 1970-01-01, because a run has no date.
 
     The file calls the images of a replay recorded; their platform, sensor, licence and copyright are "unknown".
     """
@@ -63,13 +64,19 @@ def _header(contents: RunContents) -> dict[str, Any]:
         "image-camera-calibration-model": _calibration(contents.believed.left),
     }
     header |= {key: {"name": name} for key, name in named.items()}
-    header |= _recorded() if "replay" in contents.scenario else _simulated(bool(contents.scenario.get("lamps")))
+    header |= _recorded() if "replay" in contents.scenario else _simulated(_illumination(contents.scenario))
     crs = "EPSG:4326" if origin is not None and origin.crs_wkt is not None else "local metres, x east, y north, z up"
     return header | {"image-coordinate-reference-system": crs}
 
 
-def _simulated(lamps: bool) -> dict[str, Any]:
-    """Returns the fields on the origin of simulated images, with or without lamps."""
+def _illumination(scenario: Mapping[str, Any]) -> str:
+    """Returns the kind of light of a scenario in the words of iFDO."""
+    lamps, sun = bool(scenario.get("lamps")), scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
+    return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
+
+
+def _simulated(illumination: str) -> dict[str, Any]:
+    """Returns the fields on the origin of simulated images, whose light is of the kind `illumination`."""
     return {
         "image-context": {"name": "simulated survey"},
         "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
@@ -78,14 +85,15 @@ def _simulated(lamps: bool) -> dict[str, Any]:
         "image-platform": {"name": "BlueROV2 Heavy, simulated"},
         "image-sensor": {"name": "stereo camera, simulated"},
         "image-quality": "raw",
-        "image-illumination": "artificial light" if lamps else "sunlight",
+        "image-illumination": illumination,
     }
 
 
 def _recorded() -> dict[str, Any]:
-    """Returns the fields on the origin of the images of a replay, of which the run knows only that they were recorded.
+    """Returns the iFDO fields that describe the origin of the images of a replay.
 
-    They are rectified copies of the recorded images. The light is an optional field and is missing.
+    The images are rectified copies of recorded images; a run folder contains nothing else about their origin. The
+    optional field on the light is left out.
     """
     return {
         "image-context": {"name": "replay of a recorded survey"},

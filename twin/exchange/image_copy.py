@@ -41,7 +41,7 @@ def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> 
         left_from_right: (4, 4) pose of the right camera in the axes of the left camera [m].
 
     Raises:
-        TwinError: an image is truncated or no PNG image.
+        TwinError: an image is truncated or not a PNG image.
         OSError: an image cannot be read or written.
     """
     folder.mkdir(exist_ok=True)
@@ -62,7 +62,7 @@ def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Pat
         jpeg_quality: quality of the JPEG, 1 to 100; None: the bytes of the file are copied.
 
     Raises:
-        TwinError: the source is truncated or no PNG image.
+        TwinError: the source is truncated or not a PNG image.
         OSError: the source cannot be read, or the new file cannot be written.
     """
     kind, data = encoded_image(source, jpeg_quality)
@@ -72,20 +72,20 @@ def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Pat
 
 
 def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, bytes]:
-    """Returns the format ("png" or "jpeg") and the bytes of an image file.
+    """Returns the format ("png" or "jpeg") and the encoded bytes of an image.
 
     Args:
         source: PNG file.
         jpeg_quality: quality with which the image is encoded as JPEG, 1 to 100; None: the bytes of the file.
 
     Raises:
-        TwinError: the file is truncated or no PNG image.
+        TwinError: the file is truncated or not a PNG image.
         OSError: the file cannot be read.
     """
     data = source.read_bytes()
     image = None if jpeg_quality is None else cv2.imread(str(source), cv2.IMREAD_COLOR)
     if not data.endswith(_PNG_END) or (image is None and jpeg_quality is not None):
-        raise TwinError(str(source), "is truncated or no PNG image", "an undamaged image of the run")
+        raise TwinError(str(source), "is truncated or not a PNG image", "an undamaged image of the run")
     if image is None:
         return "png", data
     return "jpeg", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality or 0])[1].tobytes()

@@ -73,7 +73,7 @@ def _truth(contents: RunContents, folder: Path) -> list[Path]:
 
 IMAGE_FORMATS: dict[str, ExportFormat] = {
     "euroc": ExportFormat(
-        "EuRoC/ASL folder: stereo images, calibration, truth, pressure, attitude", frozenset({"images"}), _euroc
+        "EuRoC/ASL folder: stereo images, calibration, truth, sensor readings", frozenset({"images"}), _euroc
     ),
     "kitti": ExportFormat(
         "KITTI odometry sequence: stereo pairs, calib.txt, times.txt, true poses", frozenset({"pairs"}), _kitti

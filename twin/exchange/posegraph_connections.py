@@ -18,7 +18,7 @@ def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tupl
 
     There is one warning for all vertices without an edge, one for all nodes that edges name but no vertex defines, and
     one for each component that is not connected to the first edge; from the sixth such component on, they are counted
-    in one warning.
+    in one warning. In a file without any vertex, the missing vertices are not reported.
 
     Args:
         path: file of the graph.

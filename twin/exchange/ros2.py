@@ -40,7 +40,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     All times are those of `euroc.timestamp_ns`.
 
     Raises:
-        TwinError: the package rosbags is not installed, or the bag exists already.
+        TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or no PNG.
         OSError: the folder cannot be written.
     """
     rosbag2 = optional("rosbags.rosbag2", "exchange", "--to mcap")
@@ -60,12 +60,12 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def pressure_pa(height_m: float, surface_m: float) -> float:
-    """Returns the absolute pressure [Pa] at a height above z = 0: p = p_air + rho g (surface - height).
+    """Returns the pressure [Pa] at a height above z = 0: p = p_air + rho g (surface - height).
 
     Args:
         height_m: height of the sensor above the plane z = 0 [m].
-        surface_m: height of the water surface above this plane [m]; 0: not known, so the result is the pressure
-            relative to that at the plane z = 0.
+        surface_m: height of the water surface above this plane [m]; 0: not known, and the result is the pressure
+            relative to that at the plane z = 0, otherwise the absolute pressure.
     """
     air_pa = _AIR_PA if surface_m > 0 else 0.0
     return air_pa + PASCAL_PER_METRE * (surface_m - height_m)

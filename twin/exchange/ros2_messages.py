@@ -53,7 +53,7 @@ class MessageFactory:
             time_ns: time of the image.
             frame: name of the coordinate frame of the camera.
             camera: camera model.
-            baseline_m: distance to the left camera; 0 for the left camera itself. P[0, 3] = -fx baseline.
+            baseline_m: distance to the left camera [m]; 0 for the left camera itself. P[0, 3] = -fx baseline.
         """
         projection = np.column_stack([camera.matrix, [-camera.matrix[0, 0] * baseline_m, 0.0, 0.0]])
         region = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
@@ -100,8 +100,8 @@ class MessageFactory:
 
         Args:
             time_ns: time of the reading.
-            rpy_rad: (3,) roll, pitch and yaw of the body in the world.
-            sigmas_rad: (3,) their standard deviations.
+            rpy_rad: (3,) roll, pitch and yaw of the body in the world [rad].
+            sigmas_rad: (3,) their standard deviations [rad].
         """
         unknown, zero = np.zeros(9), self._vector(np.zeros(3))
         unknown[0] = _NOT_MEASURED
@@ -122,9 +122,14 @@ class MessageFactory:
         return self._make("sensor_msgs/msg/FluidPressure", self._header(time_ns, LEFT), pressure_pa, sigma_pa**2)
 
     def velocity(self, time_ns: int, velocity_mps: Array, sigma_mps: float) -> Any:
-        """Returns geometry_msgs/TwistWithCovarianceStamped with a velocity (3,) over ground in the axes of the body.
+        """Returns geometry_msgs/TwistWithCovarianceStamped with a velocity over ground.
 
         The angular velocity is not measured; its variances are -1.
+
+        Args:
+            time_ns: time of the reading.
+            velocity_mps: (3,) velocity in the axes of the body [m/s].
+            sigma_mps: standard deviation of each of its components [m/s].
         """
         covariance = np.diag([sigma_mps**2] * 3 + [_NOT_MEASURED] * 3).ravel()
         twist = self._twist(np.concatenate([np.zeros(3), velocity_mps]), covariance)

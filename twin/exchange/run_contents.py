@@ -24,7 +24,7 @@ class RecordedFrame:
     Args:
         index: number of the frame, which is its row in the trajectories.
         time_s: time of the exposure after the start of the survey [s].
-        left: file of the left image, a PNG of 8-bit RGB without loss.
+        left: file of the left image, an 8-bit RGB PNG.
         right: file of the right image; None if the right camera took none.
         keyframe: whether the frame is a keyframe of the estimators.
         readings: readings of the navigation sensors at the frame.
@@ -188,6 +188,6 @@ class RunContents:
         """Returns the best poses of the run: the truth if it is known, otherwise the final trajectory.
 
         Raises:
-            KeyError: the run has neither, as that of a killed process (`formats.check_needs`).
+            KeyError: the run has neither, for example because its process was killed.
         """
         return self.trajectories[next((name for name in POSES if name in self.trajectories), POSES[-1])]

@@ -101,7 +101,7 @@ def _uv(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 
 def _texture(file: Path) -> tuple[NDArray[np.uint8], MapGrid]:
-    """Returns the orthomosaic (H, W, 3), averaged to 1 to `_MOST_TEXTURE_PX` px per side, and its grid."""
+    """Returns the orthomosaic (H, W, 3), averaged to at most `_MOST_TEXTURE_PX` pixels per side, and its grid."""
     with rasterio.open(file) as source:
         grid, _ = geotiff.scene_placement(source)
         step = int(np.ceil(max(source.width, source.height) / _MOST_TEXTURE_PX))

@@ -43,7 +43,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _write_trajectory(file: Path, path: Trajectory) -> Path:
-    """Writes a trajectory with 12 significant digits, and returns the file."""
+    """Writes a trajectory in the TUM format, and returns the file."""
     rows = np.column_stack([path.positions, geometry.quaternions_xyzw(path.world_from_camera[:, :3, :3])])
     lines = ["# time x y z qx qy qz qw"] + [
         f"{time_s:.6f} " + " ".join(f"{value:.12g}" for value in row)

@@ -2,8 +2,8 @@
 
 The light of a lamp, softened by scattering (`lamp_light`), is scattered into a ray of the camera with the coefficient
 b p(angle). On its way to the camera it is blurred like the light of the floor (`spread.camera_mixture`); the blur is
-computed on the coarse grid of the table, separately for each range. With single scattering, there is no blur, and all
-paths are attenuated by c = a + b.
+computed on the coarse grid of the table, separately for each range. With single scattering, there is no blur, and the
+light of the lamps is attenuated by c = a + b.
 """
 
 from __future__ import annotations

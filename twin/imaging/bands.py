@@ -1,9 +1,10 @@
 """Bands R, G, B of the cameras: sensitivities, weights under a light, and coefficients of a band.
 
 The sensitivity of a band, in electrons per photon relative to its largest value, is a Gaussian of the width of usual
-colour filters, cut at 400 and 700 nm as by an infrared filter; it is not the measured curve of one camera. A
-coefficient of a band is weighted with sensitivity times photons of the light. Absorption changes so steeply in red that
-the light of a band does not decay as one exponential. The effective coefficient over a path L is
+colour filters, cut at 400 and 700 nm as by filters for ultraviolet and infrared light; it is not the measured curve of
+one camera. A coefficient of a band is the mean over the wavelengths, weighted with the sensitivity times the photons of
+the light. Absorption in the red band changes so steeply with wavelength that the light of this band does not decay as
+one exponential. The effective coefficient over a path L is
 
     -ln(sum w exp(-a L)) / L,    w: normalised weights,
 

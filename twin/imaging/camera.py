@@ -55,8 +55,8 @@ class DecomposedImage(NamedTuple):
         components: direct signal, backscatter and other components of the radiance.
         setting: exposure, metered on this image.
         noise_free: (H, W, 3) image without noise.
-        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (H, W) with a
-            Bayer filter, otherwise (H, W, 3); None for the plain sensor.
+        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a
+            Bayer filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor.
         linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
         objects: normals and labels (H, W) of the objects in the image; None without objects.
     """
@@ -77,9 +77,9 @@ class DecomposedImage(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and its objects, None without objects.
+    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and the objects in it.
 
-    `pose` is that of the left camera, with the time.
+    `pose` is that of the left camera, with the time; `objects` is None for a scene without objects.
     """
 
     pose: StampedPose
@@ -225,7 +225,10 @@ class StereoCamera:
     def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
         """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels.
 
-        The arguments are those of `_through_lens` and `capture`.
+        Args:
+            view: rendered view of this camera.
+            twist_body: see `capture`.
+            setting: exposure of this frame.
         """
         pose, camera, albedo, depth, objects = view
         motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))

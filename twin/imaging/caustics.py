@@ -5,8 +5,8 @@ surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the ref
 floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
 side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
 
-- waves that the cells do not resolve: the mean over their phases is a Gaussian blur with the variance of their slopes,
-  as they focus far above the floor;
+- waves that the cells do not resolve: they focus far above the floor, so the deflections that they cause are modelled
+  as normally distributed, with (1 - 1/n)^2 times the variance of their slopes;
 - the angular size of the sun;
 - scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
   `scattering_blur`).
@@ -19,10 +19,10 @@ from __future__ import annotations
 
 import threading
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import fft
 from scipy.special import j0
 
 from twin.imaging.illumination import Illumination
@@ -70,13 +70,14 @@ class Caustics:
         downwind = (k <= shortest) & ((kx > 0) | (ky > 0))
         variance = np.where(downwind, 2 * slope_density(kx, ky, wind_mps) * (2 * np.pi / self.tile_m) ** 2, 0.0)
         waves = np.sqrt(2 * variance) * np.exp(2j * np.pi * rng.random(k.shape))
-        # the spectrum of a real surface is Hermitian, and only one half of it is stored; column 0 holds both halves
+        # the inverse transform counts the columns kx > 0 twice (Hermitian spectrum), and the real part of column 0 once
         waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
         self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
         self._turns_per_s = angular_frequency(k) / (2 * np.pi)
         self._cells_per_slope = np.float32((1 - 1 / SEA_WATER_INDEX) * depth_m * self.cells_per_m)
-        self._blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest)).astype(np.float32)
-        self._share = np.float32(daylight.focused_share)
+        blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest))
+        self._blur = (_packed(blur) * daylight.focused_share / CELLS**2).astype(np.float32)
+        self._diffuse_share = np.float32(1 - daylight.focused_share)
         self._cached: tuple[float, NDArray[np.float32]] | None = None
         self._computing = threading.Lock()
 
@@ -96,27 +97,37 @@ class Caustics:
         """
         with self._computing:
             if self._cached is None or self._cached[0] != time_s:
-                self._cached = time_s, np.pad(self._compute(time_s), (0, 1), mode="wrap")
+                self._cached = time_s, self._compute(time_s)
             return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS).
 
-        They are defined up to their common sign, which does not affect the statistics of the pattern.
+        Their common sign is arbitrary: because the phases of the waves are random, it does not affect the statistics of
+        the pattern.
         """
         turns = self._turns_per_s * time_s
-        angle = (2 * np.pi * (turns - np.floor(turns))).astype(np.float32)
-        phase = np.cos(angle) - 1j * np.sin(angle)
-        size = CELLS, CELLS
-        east, north = (np.asarray(fft.irfft2(slope * phase, s=size, norm="forward")) for slope in self._slope)
-        return east, north
+        turns -= np.floor(turns)
+        turns *= 2 * np.pi
+        angle = turns.astype(np.float32)
+        spectrum = np.zeros((CELLS, CELLS, 2), np.float32)
+        east, north = self._slope
+        _add_waves(east, north, np.cos(angle), np.sin(angle), spectrum)
+        both = np.asarray(cv2.dft(spectrum, flags=cv2.DFT_INVERSE), np.float32)
+        return both[..., 0], both[..., 1]
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the illuminance (CELLS, CELLS) divided by its mean, see `pattern`."""
+        """Returns `closed_pattern`."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
-        blurred = np.asarray(fft.irfft2(np.asarray(fft.rfft2(light)) * self._blur, s=light.shape))
-        return 1 + self._share * (blurred - 1)
+        spectrum = np.asarray(cv2.dft(light), np.float32)
+        spectrum *= self._blur
+        closed = np.empty((CELLS + 1, CELLS + 1), np.float32)
+        focused = np.asarray(cv2.dft(spectrum, flags=cv2.DFT_INVERSE), np.float32)
+        np.add(focused, self._diffuse_share, out=closed[:-1, :-1])
+        closed[-1, :-1] = closed[0, :-1]
+        closed[:, -1] = closed[:, 0]
+        return closed
 
     def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
         """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves.
@@ -124,7 +135,7 @@ class Caustics:
         Args:
             depth_m: depth of the plane below the surface.
             water: optical properties of the water, of which those of the green band are used.
-            unresolved: variance of the slopes along and across the wind due to waves that the cells do not resolve.
+            unresolved: variances of the slopes along and across the wind due to waves that the cells do not resolve.
         """
         kx, ky = _wave_numbers(self.tile_m)
         along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
@@ -167,6 +178,48 @@ def _wave_numbers(tile_m: float) -> tuple[Array, Array]:
     """Returns the wave numbers towards east (1, CELLS / 2 + 1) and north (CELLS, 1) of one half plane [rad/m]."""
     step, index = 2 * np.pi / tile_m, np.arange(CELLS, dtype=np.float64)
     return step * index[None, : CELLS // 2 + 1], step * np.where(index < CELLS / 2, index, index - CELLS)[:, None]
+
+
+def _packed(transfer: Array) -> Array:
+    """Returns the factors (CELLS, CELLS) of the numbers in a spectrum of `cv2.dft` of a real image.
+
+    OpenCV stores the real and the imaginary part of a coefficient in consecutive columns 2 k - 1 and 2 k, or in such
+    rows in the first and the last column, whose coefficients are symmetric.
+
+    Args:
+        transfer: (CELLS, CELLS / 2 + 1) real and symmetric transfer function.
+    """
+    index = np.arange(CELLS)
+    half = (index + 1) // 2
+    rows = np.where((half == 0) | (half == CELLS // 2), half[:, None], index[:, None])
+    return transfer[rows, half]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_waves(east, north, cosine, sine, spectrum):
+    """Adds waves to the spectrum whose inverse transform has the slopes towards east and north as its two parts.
+
+    The slopes are real: each coefficient of a half plane of wave numbers determines that of the opposite wave number.
+
+    Args:
+        east, north: (n, n / 2 + 1) complex amplitudes of the slopes at time 0.
+        cosine, sine: (n, n / 2 + 1) of the phase by which the waves have advanced.
+        spectrum: (n, n, 2) real and imaginary part of the sum of the spectrum of the slopes towards east and of i times
+            that of the slopes towards north.
+    """
+    n, half = spectrum.shape[0], spectrum.shape[1] // 2
+    for i in range(n):
+        opposite = spectrum[(n - i) % n]
+        for j in range(half + 1):
+            # the columns 0 and n / 2 hold both halves of their wave numbers
+            share = np.float32(0.5 if j == 0 or j == half else 1.0)
+            turn = np.complex64(complex(share * cosine[i, j], -share * sine[i, j]))
+            a, b = east[i, j] * turn, north[i, j] * turn
+            spectrum[i, j, 0] += a.real - b.imag
+            spectrum[i, j, 1] += a.imag + b.real
+            k = (n - j) % n
+            opposite[k, 0] += a.real + b.imag
+            opposite[k, 1] += b.real - a.imag
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -24,8 +24,8 @@ from twin.imaging.water import Medium
 Array = NDArray[np.float64]
 
 MODES = 8  # terms of the azimuth series of the upwelling light; the mean error of the series is below 1 %
-VIEW_STEPS, LARGEST_VIEW_DEG = 24, 86.0  # angles of the lines of sight from straight down, and their limit
-FLOOR_STEPS, FLOOR_SCALE_M = 96, 2.0  # table of vertical distances h of the floor, even in h / (h + scale)
+VIEW_STEPS, LARGEST_VIEW_DEG = 24, 86.0  # number of angles between line of sight and straight down, and the largest one
+FLOOR_STEPS, FLOOR_SCALE_M = 96, 2.0  # steps of h / (h + scale), with h the vertical distance of the floor; scale
 FIT_DEPTHS = 9  # number of depths, from the cameras to below the reference plane, at which light is computed
 LEAST_LX = 1e-12  # lower limit of the illuminance by all light but the beam, per lux at the surface
 
@@ -114,13 +114,16 @@ class DaylightVeil:
 
     def __init__(self, daylight: Daylight, range_m: Array):
         self._depth_m, self._source, water = daylight.camera_depth_m, daylight.source, daylight.water
-        terms = _veil_terms(self._depth_m, water, self._source, range_m)
-        self._terms = np.ascontiguousarray(terms * daylight.surface_lx)
+        terms = _veil_terms(self._depth_m, water, self._source, range_m) * daylight.surface_lx
+        padded = np.concatenate([terms, np.zeros((*terms.shape[:-1], 1))], axis=-1).swapaxes(0, 1)
+        self._terms = np.ascontiguousarray(padded.reshape(*padded.shape[:2], -1), np.float32)
+        azimuth = np.arctan2(self._source.to_sun[1], self._source.to_sun[0])
+        self._towards_sun = np.array([np.cos(azimuth), np.sin(azimuth)])
         fields = [_field(band, self._source, 1) for band in water.bands]
         loss = np.array([_local_attenuation(field, self._depth_m) for field in fields])
         self._loss = loss if daylight.reference_depth_m else np.zeros(3)
 
-    def radiance(self, ray: Array, depth_m: float) -> Array:
+    def radiance(self, ray: Array, depth_m: float) -> NDArray[np.float32]:
         """Returns the radiance (..., ranges, 3) [cd/m2] along lines of sight, in front of a black floor at each range.
 
         Args:
@@ -129,33 +132,57 @@ class DaylightVeil:
             depth_m: depth of the camera below the surface; the radiance tabulated at the planned depth is scaled with
                 the attenuation of the illuminance there.
         """
-        flat = ray.reshape(-1, 3)
-        modes, views = self._terms.shape[:2]
-        at = np.rad2deg(np.arccos(np.clip(-flat[:, 2], -1.0, 1.0))) * ((views - 1) / LARGEST_VIEW_DEG)
-        at = np.clip(at, 0.0, views - 1 - 1e-9)
-        sun = np.arctan2(self._source.to_sun[1], self._source.to_sun[0])
-        turn = np.cos(np.arange(modes) * (np.arctan2(flat[:, 1], flat[:, 0]) - sun)[:, None])
-        light = np.zeros((len(flat), self._terms[0, 0].size))
-        _interpolate_terms(self._terms.reshape(modes, views, -1), at, turn, light)
-        light = light.reshape(*ray.shape[:-1], -1, 3)
-        return np.maximum(light, 0.0) * np.exp(-self._loss * (depth_m - self._depth_m))
+        dark = np.zeros((*ray.shape[:-1], self._terms.shape[-1] // 4, 4), np.float32)
+        return self.added_to(dark, ray, depth_m)[..., :3]
+
+    def added_to(self, light: NDArray[np.float32], ray: Array, depth_m: float) -> NDArray[np.float32]:
+        """Returns the sum (..., ranges, 4) of other light and of the radiance of the veil for R, G, B, and a zero.
+
+        Args:
+            light: (..., ranges, 4) other light for R, G, B, and a zero [cd/m2].
+            ray, depth_m: see `radiance`.
+        """
+        out, size = np.empty_like(light), self._terms.shape[-1]
+        fade = np.zeros(4, np.float32)
+        fade[:3] = np.exp(-self._loss * (depth_m - self._depth_m))
+        flat = np.ascontiguousarray(ray.reshape(-1, 3))
+        _add_veil(self._terms, flat, self._towards_sun, fade, light.reshape(-1, size), out.reshape(-1, size))
+        return out
 
 
-@njit(cache=True, nogil=True)
-def _interpolate_terms(terms, at, turn, out):
-    """Adds the azimuth series `terms` (modes, views, k), at interpolated views, to `out` (n, k).
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _add_veil(terms, ray, towards_sun, fade, light, out):
+    """Fills `out` with the sum of `light` and the radiance of the veil, see `DaylightVeil.added_to`.
 
     Args:
-        at: (n,) fractional index of the view of each line of sight.
-        turn: (n, modes) factor cos(m azimuth) of term m of the series, for each line of sight.
+        terms: (views, modes, k) azimuth series of the radiance; k is four times the number of ranges.
+        ray: (n, 3) unit directions of sight, east, north, up.
+        towards_sun: (2,) cosine and sine of the azimuth of the sun from east towards north.
+        fade: (4,) factors of the radiance for R, G, B, and a zero.
+        light: (n, k) other light.
+        out: (n, k) array to fill.
     """
-    for i in range(at.size):
-        view = int(at[i])
-        part = at[i] - view
-        for m in range(terms.shape[0]):
-            near, far = turn[i, m] * (1 - part), turn[i, m] * part
-            for k in range(out.shape[1]):
-                out[i, k] += near * terms[m, view, k] + far * terms[m, view + 1, k]
+    views, modes, size = terms.shape
+    per_rad = np.rad2deg(1.0) * (views - 1) / LARGEST_VIEW_DEG
+    faded = np.empty(size, np.float32)
+    for k in range(size):
+        faded[k] = fade[k % 4]
+    for i in range(ray.shape[0]):
+        x, y, z = ray[i, 0], ray[i, 1], ray[i, 2]
+        at = min(np.arccos(min(max(-z, -1.0), 1.0)) * per_rad, views - 1 - 1e-9)
+        view, across = int(at), np.sqrt(x * x + y * y)
+        part = at - view
+        cosine = (x * towards_sun[0] + y * towards_sun[1]) / across if across > 0 else towards_sun[0]
+        before, turn, row = cosine, 1.0, out[i]
+        row[:] = np.float32(0.0)
+        for m in range(modes):
+            near, far = np.float32(turn * (1 - part)), np.float32(turn * part)
+            this, following = terms[view, m], terms[view + 1, m]
+            for k in range(size):
+                row[k] += near * this[k] + far * following[k]
+            before, turn = turn, 2 * cosine * turn - before  # cos((m + 1) azimuth) from the two terms before it
+        for k in range(size):
+            row[k] = light[i, k] + max(row[k], np.float32(0.0)) * faded[k]
 
 
 def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -> Array:

@@ -2,13 +2,13 @@
 
 Of the light that is not absorbed, the fraction exp(-b r) arrives unscattered; the scattered light is blurred by a
 kernel with a sharp core and a long tail (`spread.camera_mixture`). The kernel is a mixture of Gaussians, the levels of
-an image pyramid: each level is twice as wide as the one before, and its weight depends on band and range. The weights
-of a pixel are those of its own range: its ray receives light from the floor around it. The kernel is a function of
-angle. At the angle theta from the optical axis, a small angle covers more pixels by the factor k = 1 / cos(theta)^1.5,
-the geometric mean of 1 / cos^2 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of the light of each
-level moves to the next, wider level, except for the widest levels (`WIDENED_TAN`). Much of the tail lies outside the
-image. There the floor is taken to be the plane that fits the depth of the image, with the mean albedo of the image; the
-coarse levels of the pyramid cover it. The fine levels are mirrored at the borders of the image.
+an image pyramid: each level is about twice as wide as the one before, and its weight depends on band and range. The
+weights of a pixel are those of its own range: its ray receives light from the floor around it. The kernel is a function
+of angle. At the angle theta from the optical axis, a small angle covers more pixels by the factor k = 1 /
+cos(theta)^1.5, the geometric mean of 1 / cos^2 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of
+the light of each level moves to the next, wider level, except for the widest levels (`WIDENED_TAN`). Much of the tail
+lies outside the image. There the floor is taken to be the plane that fits the depth of the image, with the mean albedo
+of the image; the coarse levels of the pyramid cover it. The fine levels are mirrored at the borders of the image.
 """
 
 from __future__ import annotations
@@ -94,14 +94,18 @@ class ForwardScatter:
         self.range_per_depth = np.sqrt((self._terms**2).sum(1)).reshape(self.surroundings.shape).astype(np.float32)
         self._widening = _widening(rig, self.surroundings, self.range_per_depth, levels)
 
-    def plane(self, depth: Depth) -> Depth:
-        """Returns the depth [m] of the plane fitted to the floor in an image, on the grid `surroundings`.
+    def plane(self, depth: Depth) -> tuple[Depth, Place]:
+        """Returns the plane fitted to the floor in an image, on the grid `surroundings`.
 
-        In an image of a plane, 1 / depth is linear in column and row. The depth is inf beyond `FAR_M`.
+        In an image of a plane, 1 / depth is linear in column and row.
+
+        Returns:
+            Depth [m], inf beyond `FAR_M`, and the fractional row index into `kept`.
         """
-        per_m = 1 / depth[::PLANE_STEP_PX, ::PLANE_STEP_PX].astype(np.float64)
-        found = np.maximum(self._terms @ (self._fit @ per_m.ravel()), 1e-9)
-        return np.where(found > 1 / FAR_M, 1 / found, np.inf).reshape(self.surroundings.shape).astype(np.float32)
+        shape = self.surroundings.shape
+        plane, place = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        _fit_plane(depth, self._fit, self._terms, self.range_per_depth, plane, place)
+        return plane, place
 
     def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
         """Adds the blurred light of the floor to `light` in place.
@@ -275,6 +279,34 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
     return [np.ascontiguousarray(np.clip(WIDENING * np.log2(one), 0.0, 1.0), np.float32) for one in secants]
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
+    """Fills `plane` and `place` with the results of `ForwardScatter.plane`.
+
+    Args:
+        depth: (H, W) depth of the floor [m], of which every `PLANE_STEP_PX`-th pixel in both directions is used.
+        fit: (3, n) map from 1 / depth of those pixels to the coefficients of 1 / depth of the plane.
+        terms: (rows cols, 3) factors of the coefficients for each pixel of the grid.
+        range_per_depth: (rows, cols) range divided by depth of each pixel of the grid.
+        plane, place: (rows, cols) arrays to fill.
+    """
+    one, two, three, k = 0.0, 0.0, 0.0, 0
+    for v in range(0, depth.shape[0], PLANE_STEP_PX):
+        for u in range(0, depth.shape[1], PLANE_STEP_PX):
+            per_m = 1 / np.float64(depth[v, u])
+            one, two, three = one + fit[0, k] * per_m, two + fit[1, k] * per_m, three + fit[2, k] * per_m
+            k += 1
+    steps, scale, far = np.float32(SHARE_STEPS), np.float32(RANGE_SCALE_M), np.float32(FAR_M)
+    cols = plane.shape[1]
+    for v in range(plane.shape[0]):
+        for u in range(cols):
+            i = v * cols + u
+            per_m = max(terms[i, 0] * one + terms[i, 1] * two + terms[i, 2] * three, 1e-9)
+            z = np.float32(1 / per_m if per_m > 1 / FAR_M else np.inf)
+            near = min(z * range_per_depth[v, u], far)
+            plane[v, u], place[v, u] = z, steps * near / (near + scale)
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _weigh(image, place, table, widening, wider):
     """Multiplies one level by its weights and adds the wider levels, in place.
@@ -310,7 +342,7 @@ def _add_upsampled(small, light, first, end):
     """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` of `light` (H, 3 W).
 
     Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
-    the first one are mirrored, and the last row is repeated; so are columns.
+    the first one are mirrored, and the last row is repeated. The same holds for columns.
 
     Args:
         small: (rows, 3 cols) image with rows = ceil(H / 2) and cols = ceil(W / 2).

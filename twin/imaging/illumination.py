@@ -27,7 +27,7 @@ class Daylight(NamedTuple):
         focused_share: fraction of the daylight that the surface waves focus into caustics.
         source: direction to the sun under water, and share of the sky in the illuminance.
         water: optical properties of the water, for daylight on the path from the surface and for its backscatter.
-        camera_loss_per_m: (3,) loss of daylight between floor and camera [1/m].
+        camera_loss_per_m: (3,) attenuation coefficient of daylight on the way from the floor to the camera [1/m].
     """
 
     surface_lx: Array
@@ -51,11 +51,11 @@ class Illumination(NamedTuple):
 def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
-    The absorption of a band is the effective one over the path of the light, with its spectrum. For lamps (and, for the
-    blur on the path to the camera, for all light) the path is twice the planned altitude: to the floor and back. For
-    daylight it is the slant path from the surface to the reference plane (the planned altitude where there is no
-    surface). The loss of daylight between floor and camera is chosen so that the light is exact for the whole path from
-    the surface to the floor and up to the camera.
+    The absorption of a band is the effective one (`bands`) for the spectrum of the light and the length of its path.
+    For lamps, and for the blur of all light on the path to the camera, the path is twice the planned altitude: to the
+    floor and back. For daylight it is the slant path from the surface to the reference plane (the planned altitude
+    where there is no surface). The loss of daylight between floor and camera is chosen so that the transmission of a
+    band is exact for the whole path from the surface to the floor and up to the camera.
 
     Raises:
         TwinError: the water is invalid (see `medium`), the planned altitude is not below the surface, or caustics are

@@ -33,11 +33,13 @@ class StampedPose(NamedTuple):
 
 
 class RadianceComponents(NamedTuple):
-    """Components of the light that reaches a camera, per colour band in photometric units; (H, W, 3) float32 each.
+    """Illuminance of the floor, and components of the light that reaches a camera; (H, W, 3) float32 each.
+
+    All are given per colour band in photometric units.
 
     Args:
-        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where the water transmits too little light
-            from the floor to the camera to compute it.
+        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where there is no floor, and where the water
+            transmits too little light from the floor to the camera to compute it.
         direct: light from the floor that was not scattered on its path to the camera [cd/m2].
         forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless the water
             scatters and `imaging.scattering` is full.

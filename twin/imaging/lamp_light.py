@@ -167,7 +167,7 @@ def _on_rings(beam: Beam) -> Array:
     return mean @ ring_shares(edges, LAMP_SIGMA_RAD)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"arcp", "contract"})
 def _from_table(points, position, axis, strength, table, lux, from_lamp):
     """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
 

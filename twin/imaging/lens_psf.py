@@ -2,20 +2,20 @@
 
 The image of a point is described by the modulation transfer function (MTF), the contrast at a spatial frequency nu
 relative to that at frequency 0. A lens of f-number N without aberrations has, in light of wavelength l (Goodman,
-Introduction to Fourier Optics, section 6.3; Hopkins 1955), with s = nu l N,
+Introduction to Fourier Optics, section 6.3; Hopkins 1955), with x = nu l N,
 
-    MTF = 2 / pi (arccos(s) - s sqrt(1 - s^2)),    0 for s > 1
+    MTF = 2 / pi (arccos(x) - x sqrt(1 - x^2)),    0 for x > 1
 
-Aberrations are described by a Gaussian of standard deviation sigma in the image, MTF = exp(-2 pi^2 sigma^2 nu^2). Both
-may differ between the colour bands, as may the scale of the image (lateral colour).
+Aberrations are described by a Gaussian of standard deviation sigma in the image, MTF = exp(-2 pi^2 sigma^2 nu^2).
+Diffraction and aberrations may differ between the colour bands, as may the scale of the image (lateral colour).
 
 A point at depth z is imaged as a disc of the diameter (circle of confusion)
 
     c = A f |1/z - 1/s|
 
 for a lens with an aperture of diameter A, focused at depth s, with f the focal length in water [px] (thin lens; the
-focal length is neglected against s). Light is gathered with the disc of the receiving pixel, so the blur of a near
-object does not spread over the background.
+focal length is negligible compared with s). Light is gathered with the disc of the receiving pixel, so the blur of a
+near object does not spread over the background.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Depth = NDArray[np.float32]
 
 REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; REACH_PX must be even
 TAPS = 4  # taps of cubic interpolation
-GRID = 64  # samples of the MTF from which the kernel is computed
+GRID = 64  # samples of the MTF along each axis, from which the kernel is computed
 MTF_ERROR = 5e-3  # separable terms are added until their transform is within this of that of the kernel
 NEAREST_FOCUS_M = 0.05  # nearest depth in focus
 SMALL_PX = 3.0  # largest circle of confusion for the 3 x 3 kernel

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 ORDERS = 32  # number L of Legendre moments
 NODES = 11, 9  # quadrature nodes outside the cone of the sky, and within it
-SLOPE_MODES, SLOPE_ORDERS = 8, 14  # light on slopes: terms of the series in azimuth, end of the even moments
+SLOPE_MODES, SLOPE_ORDERS = 8, 14  # light on slopes: terms of the series in azimuth; even moments below this order
 STEEPEST_DEG, LEVEL_WEIGHT = 75.0, 100.0  # steepest slope to which the light is fitted, and weight of the level floor
 LEAST_PEAK = 1e-9  # with a smaller moment L, a phase function has no forward peak
 LEAST_ABSORPTION = 1e-6  # per unit of scattering: without absorption two eigenvalues coincide
@@ -52,7 +52,7 @@ class BandOptics(NamedTuple):
 
 
 class _Scaled(NamedTuple):
-    """Water without the forward peak: c' and b' [1/m], and the moments (ORDERS,) of the rest of the phase function."""
+    """Water without the forward peak: attenuation and scattering coefficients, and the remaining moments (ORDERS,)."""
 
     attenuation_per_m: float
     scattering_per_m: float
@@ -138,7 +138,7 @@ class LightField:
         """Returns the light without the beam on a slope as a quadratic form (4, 4) of its normal [lx].
 
         With the unit normal n in the axes x horizontally towards the sun, y to the left of x, and z up, the illuminance
-        is (n, 1) Q (n, 1)'. It is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
+        is (n, 1) Q (n, 1)'. Q is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
         of the radiance and of Lambert's cosine (Ramamoorthi & Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); the
         illuminance of a level floor, which has the weight `LEVEL_WEIGHT`, is almost exact.
         """
@@ -201,7 +201,8 @@ class LightField:
     def _coefficients(self, mode: _Mode, floor_m: Array) -> Array:
         """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions.
 
-        These are the radiance of the sky just below the surface, and a black floor at each of the depths `floor_m`.
+        At the surface, the downwelling radiance is that of the sky. At each of the depths `floor_m`, the upwelling
+        radiance is 0.
         """
         n, fade = mode.decay_per_m.size, np.exp(-mode.decay_per_m * floor_m[:, None])
         system = np.empty((floor_m.size, 2 * n, 2 * n))
@@ -249,7 +250,9 @@ class LightField:
         return (light + source * along / cosine).T
 
     def _exact_once(self, m: int, cosine: Array) -> Array:
-        """Returns term m of the azimuth series of sunlight scattered once into lines of sight, per metre, at depth 0.
+        """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0.
+
+        The light is given per metre of the line of sight.
 
         Args:
             m: number of the term, from 0.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from terrains.objects.texture_pyramid import Textures
 from twin.imaging.mesh_raster import Projection, Target
 
-LEAST_COSINE = 0.1  #: of the angle between ray and normal; a more oblique surface is sampled as at this angle
+LEAST_COSINE = 0.1  #: smallest cosine of the angle between ray and normal; smaller ones count as this value
 
 
 class TexturedSurface(NamedTuple):
@@ -34,7 +34,7 @@ def paint_textures(target: Target, projection: Projection, surface: TexturedSurf
     """Draws the textures into `target.albedo` wherever `target.label` names a mesh with a texture.
 
     Args:
-        target: images of the meshes, all of them drawn by `draw_mesh`.
+        target: images that `draw_mesh` has drawn into; none of them is None.
         projection: projection of the camera.
         surface: the textures.
     """

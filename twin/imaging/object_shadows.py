@@ -68,7 +68,7 @@ class ObjectShadows:
         world_from_camera: Array,
         moment: tuple[int, float],
     ) -> None:
-        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun.
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun, or faces away from it.
 
         The last mask is that of the sun if it casts shadows.
 
@@ -100,7 +100,7 @@ class ObjectShadows:
             _darken(lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection)
 
     def _sampled_points(self, depth: Depth) -> Array:
-        """Returns points (n, 3) [m] of floor and objects in camera axes, for every STRIDE_PX-th row and column."""
+        """Returns points (n, 3) [m] of floor and objects in camera axes, on a grid of pixels with spacing STRIDE_PX."""
         height, width = depth.shape
         rows = np.unique(np.append(np.arange(0, height, STRIDE_PX), height - 1))
         cols = np.unique(np.append(np.arange(0, width, STRIDE_PX), width - 1))
@@ -196,9 +196,9 @@ def _looking(rotation: Array, position_m: Array) -> Array:
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection):
     """Sets `lit` (H, W) to 0 where the map `nearest` shows an object that occludes the light.
 
-    A point is occluded if the depth in the map is less than that of the point minus a bias. On an object, the bias is
-    BIAS_PX pixels of the map times 1 + the tangent of the angle of incidence, at most STEEPEST; on the floor, it is one
-    pixel of the map. Surfaces of objects that face away from the light are not lit either.
+    A point is occluded if the depth in the map is less than that of the point minus a bias. On the floor, the bias is
+    one pixel of the map. On an object, it is BIAS_PX (1 + t) pixels, where t is the tangent of the angle of
+    incidence or, if smaller, STEEPEST. Surfaces of objects that face away from the light are not lit either.
     """
     scale, cx, cy, _, perspective = projection
     height, width = depth.shape

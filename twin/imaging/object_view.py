@@ -24,9 +24,9 @@ LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image 
 
 
 class DrawnMesh(NamedTuple):
-    """A mesh to draw: triangles, pose (4, 4) times scale relative to the camera, number of the object, whether closed.
+    """A mesh to draw: triangles, transform (4, 4) to the axes of the camera, number of the object, whether closed.
 
-    The number of an object is its index in `Objects.placed`.
+    The transform includes the scale. The number of an object is its index in `Objects.placed`.
     """
 
     mesh: Mesh
@@ -93,11 +93,11 @@ def draw_objects(
     objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
     time_s: float = 0.0,
 ) -> None:  # fmt: skip
-    """Draws the objects in view into images, with their numbers + 1 as labels; their textures need all images.
+    """Draws the objects in view into images, with their numbers + 1 as labels, and the textures of a mesh floor.
 
     Args:
         objects: the objects.
-        target: images to draw into; all of them are given, but `uv` only if there are textures.
+        target: images to draw into; with textures, none of them is None.
         camera_from_world, limits, projection, time_s: see `Objects.in_view`.
     """
     for item in objects.in_view(camera_from_world, limits, projection, time_s):
@@ -147,6 +147,6 @@ def frustum(rig: StereoRig) -> Array:
 
 
 def _level(item: PlacedObject, cell_m: float) -> Mesh:
-    """Returns the coarsest level of detail of an object whose cells have sides of at most `cell_m` in the world."""
+    """Returns the coarsest level of detail of an object with cells of at most `cell_m` in the world."""
     fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
     return fine_enough[-1].mesh

@@ -27,16 +27,17 @@ from numpy.typing import NDArray
 
 from twin.core.records import Image, StereoRig
 from twin.imaging.backscatter import backscatter_table, grid_of, grid_rays, table_range_m
-from twin.imaging.daylight import DaylightVeil, FloorDaylight, floor_daylight
+from twin.imaging.daylight import DaylightVeil, floor_daylight
 from twin.imaging.facets import FacetView
-from twin.imaging.forward_scatter import ForwardScatter, Place, place_of
+from twin.imaging.forward_scatter import ForwardScatter, Place
 from twin.imaging.illumination import Illumination
 from twin.imaging.lamp_light import LampLight, floor_tables, with_a_zero
-from twin.imaging.lamps import beam_share, light_sources_in_camera
+from twin.imaging.lamps import LightSources, beam_share, light_sources_in_camera
 from twin.imaging.materials import Material
 from twin.imaging.mesh_raster import ObjectView
 from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import shade
+from twin.imaging.sky import Sky, world_axes
 from twin.imaging.water import Medium
 from twin.scenario.model import LampConfig
 
@@ -53,9 +54,7 @@ _NO_BACKSCATTER, _NO_SOFT_LAMPS = np.zeros((0, 0, 0, 4), np.float32), np.zeros((
 _NO_FACETS = FacetView(
     np.zeros((0, 0, 2), np.int32), np.zeros(2, np.int32), np.zeros((2, 4), np.float32), np.zeros((3, 3), np.float32)
 )
-_NO_SHADOWS, _NO_CAUSTICS = np.zeros((0, 0, 0), np.uint8), np.zeros((0, 0), np.float32)
-#: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.
-_FIRST, _SECOND = np.array([[0, 1, 2, 0, 0, 1, 0, 1, 2, 3], [0, 1, 2, 1, 2, 2, 3, 3, 3, 3]])
+_NO_SHADOWS = np.zeros((0, 0, 0), np.uint8)
 _NO_OBJECTS = ObjectView(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.uint16))
 BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which are nearly even in the angle
 
@@ -157,7 +156,7 @@ class _Tables(NamedTuple):
 
 
 class _Output(NamedTuple):
-    """Arrays that the shading kernel fills; the arguments of `shading.shade` with the same names."""
+    """Arrays that the shading kernel fills, and `kept`: the arguments of `shading.shade` with the same names."""
 
     out: Radiance
     other: Radiance = np.zeros((0, 0, 3), np.float32)
@@ -195,7 +194,10 @@ class Optics:
         # working memory of each camera, as both images may be computed at the same time
         self._memory = cache(lambda camera: _working_memory(rig))
         self._lamp_loss_per_m = self._medium.attenuation_per_m.astype(np.float32)
-        self._floor_daylight, self._daylight_loss_per_m = floor_daylight(daylight), daylight.camera_loss_per_m
+        loss_per_m = np.stack([self._medium.camera_loss_per_m, daylight.camera_loss_per_m])
+        self._sky = Sky(floor_daylight(daylight), loss_per_m)
+        self._lamps = [_lamp_rows(sources) for sources in self.light_sources]
+        self._grid_rays = [grid_rays(rig, grid_of(sources.beam)) for sources in self.light_sources]
         level = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, daylight.camera_depth_m]])
         self._calm_surface = WaterSurface(None, level)
 
@@ -247,17 +249,18 @@ class Optics:
     def floor_lx(
         self, depth: Depth, camera: int, floor: FloorView | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the illuminance of the floor (H, W, 3) [lx]; NaN where the transmission to the camera is too small.
+        """Returns the illuminance of the floor (H, W, 3) [lx].
 
-        It is computed from the light of a white Lambertian floor, divided by the transmission from floor to camera. The
-        arguments are those of `radiance`.
+        It is NaN where there is no floor, and where the transmission to the camera is too small. It is computed from
+        the light of a white Lambertian floor, divided by the transmission from floor to camera. The arguments are those
+        of `radiance`.
         """
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
         light, loss = np.empty(shape, np.float32), self._medium.camera_loss_per_m
         self._run((white, depth), camera, matt, surface, _Output(light, np.empty(shape, np.float32)), None, loss)
-        back = np.exp(-loss * range_of(depth, self._rig)[..., None])
         with np.errstate(divide="ignore", invalid="ignore"):
+            back = np.exp(-loss * range_of(depth, self._rig)[..., None])
             return np.where(back > LEAST_TRANSMISSION, np.pi * light / back, np.nan).astype(np.float32)
 
     def white_floor(
@@ -283,13 +286,13 @@ class Optics:
     ) -> tuple[Radiance, Place]:
         """Returns the argument `around` of `ForwardScatter.add`, the light of the floor around the image."""
         assert self._forward is not None
-        grid, plane = self._forward.surroundings, self._forward.plane(depth)
-        light = np.empty((*grid.shape, 3), np.float32)
+        grid, (plane, place) = self._forward.surroundings, self._forward.plane(depth)
+        light, uniform = np.empty((*grid.shape, 3), np.float32), np.empty((*grid.shape, 3), np.uint8)
         some = np.ascontiguousarray(albedo[::ALBEDO_STEP_PX, ::ALBEDO_STEP_PX])
         mean = np.round(cv2.mean(some)[:3]).astype(np.uint8)
-        uniform = np.broadcast_to(mean, light.shape)
+        uniform.reshape(len(uniform), -1)[:] = np.tile(mean, grid.shape[1])
         self._run((uniform, plane), camera, None, surface, _Output(light, np.empty_like(light)), grid.focal_px)
-        return light, place_of(plane * self._forward.range_per_depth)
+        return light, place
 
     def _floor_and_backscatter(
         self, albedo: Image, depth: Depth, camera: int, floor: FloorView | None, surface: WaterSurface | None
@@ -319,12 +322,10 @@ class Optics:
             day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
         """
         albedo, depth = image
-        sources, focal = self.light_sources[camera], np.float32(focal_px or self._rig.focal_px)
+        focal = np.float32(focal_px or self._rig.focal_px)
         above = self._calm_surface if surface is None else surface
-        day_loss = self._daylight_loss_per_m if day_loss_per_m is None else day_loss_per_m
-        sky = _sky(self._floor_daylight, np.stack([self._medium.camera_loss_per_m, day_loss]), above)
-        lamps = np.column_stack([sources.position_m, sources.axis, sources.intensity_cd, sources.colour])
-        lamps, tables = lamps.astype(np.float32), self._tables_of(camera)
+        sky = self._sky.in_camera(above.from_camera, above.caustics, day_loss_per_m)
+        lamps, tables = self._lamps[camera], self._tables_of(camera)
         backscatter = _NO_BACKSCATTER if focal_px else self._backscatter(camera, above)
         seen = FloorView() if floor is None else floor
         light = lamps, tables.beams, tables.soft, self._lamp_loss_per_m, backscatter, sky
@@ -338,8 +339,8 @@ class Optics:
         of_lamps = self._tables_of(camera).backscatter
         if self._veil is None:
             return of_lamps
-        rays = grid_rays(self._rig, grid_of(self.light_sources[camera].beam)) @ _world_axes(surface)
-        return of_lamps + with_a_zero(self._veil.radiance(rays, float(surface.from_camera[2, 3])))
+        rays = self._grid_rays[camera] @ world_axes(surface.from_camera)
+        return self._veil.added_to(of_lamps, rays, float(surface.from_camera[2, 3]))
 
 
 def _or(value: Value | None, substitute: Value) -> Value:
@@ -360,24 +361,10 @@ def range_of(depth: Depth, rig: StereoRig) -> Array:
     return depth.astype(np.float64) * np.sqrt(1 + x**2 + y[:, None] ** 2)
 
 
-def _world_axes(surface: WaterSurface) -> Array:
-    """Returns the unit vectors east, north and up in the axes of the camera, as columns (3, 3)."""
-    rows = surface.from_camera[:, :3] / np.linalg.norm(surface.from_camera[:, :3], axis=1, keepdims=True)
-    return np.column_stack([rows[0], rows[1], -rows[2]])
-
-
-def _sky(daylight: FloorDaylight, loss_per_m: Array, surface: WaterSurface) -> tuple:
-    """Returns the daylight as the argument `sky` of `shading.shade`."""
-    axes = _world_axes(surface)
-    turn = np.eye(4)
-    turn[:3, :3] = axes
-    q = turn @ daylight.rest_lx @ turn.T
-    form = q[:, _FIRST, _SECOND] * np.where(_FIRST == _SECOND, 1, 2)
-    beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1)
-    fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m])
-    given = axes @ daylight.to_sun, beam, form, daylight.rest_per_m, fitted, loss_per_m
-    arrays = [np.ascontiguousarray(value, np.float32) for value in given]
-    return *arrays, _or(surface.caustics, _NO_CAUSTICS), np.asarray(surface.from_camera, np.float32)
+def _lamp_rows(sources: LightSources) -> NDArray[np.float32]:
+    """Returns the lamps (n, 10) as the argument `lamps` of `shading.shade`."""
+    rows = np.column_stack([sources.position_m, sources.axis, sources.intensity_cd, sources.colour])
+    return np.ascontiguousarray(rows, np.float32)
 
 
 def _tables(rig: StereoRig, water: Medium, lamps: LampLight) -> _Tables:

@@ -116,7 +116,8 @@ def molecular_scattering_per_m(wavelength_nm: Array) -> Array:
 def petzold(angle: Array) -> Array:
     """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`.
 
-    Below the first angle of the table, the function is extrapolated with its first slope.
+    The function is normalised to 1 over the sphere. Below the first angle of the table, it is extrapolated with the
+    slope of the first interval.
 
     Args:
         angle: scattering angles of any shape [rad].
@@ -144,7 +145,7 @@ def fournier_forand(index: float, slope: float) -> PhaseFunction:
 
     Args:
         index: refractive index of the particles relative to water, above 1.
-        slope: exponent of the hyperbolic (Junge) size distribution, 3 to 5.
+        slope: exponent of the hyperbolic (Junge) size distribution, above 3 and below 5.
     """
     nu = (3 - slope) / 2
 
@@ -195,7 +196,7 @@ def phase_of(scatterer: Scatterer) -> PhaseFunction:
 
 @lru_cache(maxsize=64)
 def table_of(scatterer: Scatterer) -> PhaseTable:
-    """Returns the table of the phase function of the mixture of molecules and particles in one band."""
+    """Returns the table of the phase function of the mixture of molecules and particles in one band, from a cache."""
     return tabulate(phase_of(scatterer))
 
 

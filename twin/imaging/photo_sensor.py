@@ -67,7 +67,7 @@ class PhotoSensor:
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
         rig = scenario.believed_rig()
-        self._sensor, self._focal_px = sensor, rig.focal_px
+        self._sensor = sensor
         self._vignetting = vignetting(rig if raw_rig is None else raw_rig, sensor.vignetting_power)
         self._electrons_per_cd_s = electrons_per_cd(sensor, scenario.port.water_index)
         top, self._black_dn = float((1 << sensor.bits) - 1), float(round(BLACK_SHARE * (1 << sensor.bits)))

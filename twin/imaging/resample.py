@@ -156,7 +156,7 @@ def _filter_columns(image, first, end):
 def _filter_block(image, first, end):
     """Filters columns `first` to `end` of an image, see `_filter_columns`.
 
-    Applies 6 times the filter 1 / (1 - p z^-1), then the filter -p / (1 - p z), with p the pole (Unser et al. 1993).
+    The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
     """
     pole, rows = np.float32(POLE), image.shape[0]
     for k in range(first, end):

@@ -24,7 +24,7 @@ _state = threading.local()  # `whole` is set while this thread processes one ima
 
 
 def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left, Right]:
-    """Returns the results of `left` and `right`, computed at the same time if there are `THREADS` processors.
+    """Returns the results of `left` and `right`, computed at the same time if there are enough processors.
 
     Meanwhile, `in_row_bands` does not split images.
 

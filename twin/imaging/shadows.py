@@ -135,7 +135,16 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
-    """Computes for a row of pixels whether each shows the floor, and the position of that point in the world [m]."""
+    """Fills the positions in the world of the points that the pixels of a row show.
+
+    Args:
+        here: (W,) depths of the pixels [m]; infinite where a pixel shows no floor.
+        y: row coordinate of the pixels on the image plane at depth 1.
+        focal: focal length [px].
+        pose: (4, 4) world_from_camera.
+        there: (W,) filled with whether each pixel shows the floor.
+        east, north, up: (W,) filled with the positions [m].
+    """
     a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
     d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
     g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
@@ -314,8 +323,9 @@ def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _above_in_cell(height, r, c, x, y, z, dx, dy, dz, t, leave):
-    """Returns whether the floor of a cell is above the ray between t and `leave`; x and y are 0 to 1 in the cell.
+    """Returns whether the floor of a cell is above the ray between t and `leave`.
 
+    (x, y) is the start of the ray relative to the cell's south-west node, in cells.
     Over a triangle, the height of the ray above the floor is linear in t, so it is tested where the ray leaves it.
     """
     south_west, south_east = height[r, c], height[r, c + 1]

@@ -92,6 +92,8 @@ class MarineSnow:
         self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, water
         self._lamp_light = lamp_light
         self._defocus = Defocus(APERTURE_M, 0.0) if defocus is None else defocus
+        largest = float(self._diameter_m.max(initial=0.0))
+        self._margin_px = float(_width_px(rig.focal_px, largest, NEAREST_M, self._defocus))
 
     def positions(self, centre_m: Array, time_s: float) -> Array:
         """Returns the particle positions (n, 3) in the world [m], in the box around a centre (3,)."""
@@ -115,15 +117,13 @@ class MarineSnow:
         low = world_from_left[:3, 3] - BOX_M / 2
         middle = np.array([rig.cx_px, rig.cy_px])
         size = np.array([rig.width_px, rig.height_px])
-        largest = float(self._diameter_m.max(initial=0.0))
-        margin_px = float(np.max(_width_px(rig.focal_px, largest, NEAREST_M, self._defocus)))
-        view = rig.focal_px, middle, size, margin_px, rig.focal_px * reach_m, farthest_m
-        found, points = _in_view(
+        view = rig.focals_px, middle, size, self._margin_px, rig.focal_px * reach_m, farthest_m
+        found, points, pixel = _in_view(
             self._start_m, self._current_mps * time_s - low, low, geometry.inverse(world_from_camera), *view
         )
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
-            rig.project(points),
+            pixel,
             points,
             self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])),
             diameter_m,
@@ -156,53 +156,35 @@ class MarineSnow:
         z = seen.depth_m
         width_px = _width_px(rig.focal_px, seen.diameter_m, z, defocus)
         cover_px2 = np.pi / 4 * (rig.focal_px * seen.diameter_m / z) ** 2
-        centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
-        if not still:
-            flow = self._flow(seen.points_m, world_from_left, camera, motion.twist)
-            delay_s = _delay_s(centre_px, flow, motion.readout_s, len(light))[:, None]
-            at_floor = self._floor_flow(centre_px + flow * delay_s, depth, motion.twist) if motion.rolls_later else 0.0
-            centre_px = centre_px + (flow - at_floor) * delay_s
-            path_px = flow * motion.exposure_s
+        if still:
+            centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
+        else:
+            centre_px, path_px = self._paths(seen, depth, world_from_left, camera, motion)
         scene = light, depth, centre_px, path_px, z, seen.radiance, width_px, cover_px2
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
 
     def _reach_m(self, motion: ExposureMotion) -> float:
         """Returns an upper limit of the distance that a particle moves relative to the camera [m].
 
-        The time is half the exposure time plus half the read-out time.
+        The limit holds for the motion during half the exposure time plus half the read-out time.
         """
         speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
         speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
 
-    def _flow(self, points: Array, world_from_left: Array, camera: int, twist: Array) -> Array:
-        """Returns the velocities (n, 2) of particles in the image of a moving camera [px/s].
+    def _paths(
+        self, seen: VisibleParticles, depth: Depth, world_from_left: Array, camera: int, motion: ExposureMotion
+    ) -> tuple[Array, Array]:
+        """Returns the middle (n, 2) and the extent (n, 2) of the path of each particle in the image [px].
 
-        Args:
-            points: (n, 3) positions of the particles in the axes of the camera [m].
-            world_from_left: (4, 4) pose of the left camera.
-            camera: 0 left, 1 right.
-            twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        The arguments are those of `draw`.
         """
         left_from_camera = self._rig.left_from_right if camera else np.eye(4)
         drift = (world_from_left @ left_from_camera)[:3, :3].T @ self._current_mps
-        return self._image_velocity(points, drift, twist)
-
-    def _floor_flow(self, pixel: Array, depth: Depth, twist: Array) -> Array:
-        """Returns the velocities (n, 2) of the floor at positions (n, 2) in the image of a moving camera [px/s]."""
-        last, middle = np.array(depth.shape[::-1]) - 1, np.array([self._rig.cx_px, self._rig.cy_px])
-        u, v = np.clip(np.rint(pixel), 0, last).astype(np.int64).T
-        z = np.minimum(depth[v, u], FAR_M)[:, None].astype(np.float64)
-        return self._image_velocity(np.hstack([(pixel - middle) / self._rig.focal_px * z, z]), np.zeros(3), twist)
-
-    def _image_velocity(self, points: Array, drift: Array, twist: Array) -> Array:
-        """Returns the image velocities (n, 2) [px/s] of points (n, 3) that drift at `drift` (3,) [m/s].
-
-        Points and drift are in the axes of the camera.
-        """
-        velocity = drift - twist[3:] + points @ geometry.skew(twist[:3])  # row vectors: -(w x p) = p @ skew(w)
-        along = points[:, :2] / points[:, 2:]
-        return self._rig.focal_px * (velocity[:, :2] - along * velocity[:, 2:]) / points[:, 2:]
+        rig, centre, path = self._rig, np.empty_like(seen.pixel), np.empty_like(seen.pixel)
+        lens, moves = (rig.focal_px, rig.cx_px, rig.cy_px), (motion.exposure_s, motion.readout_s, motion.rolls_later)
+        _trace_paths(seen.points_m, seen.pixel, depth, lens, drift, np.asarray(motion.twist), moves, centre, path)
+        return centre, path
 
     def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
         """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
@@ -210,13 +192,17 @@ class MarineSnow:
         Light that is scattered between a particle and the camera is lost. At the camera, daylight has its value at the
         height `height_m` of the camera above the reference plane z = 0; it decreases along the optical axis.
         """
-        range_m = np.linalg.norm(points, axis=1)[:, None]
-        day = lamps.sources.daylight
+        day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
-        lux = day.illuminance_lx * np.exp(-day.attenuation_per_m * (points[:, 2:] + below_plan_m))
+        fading, path_loss = np.empty_like(points), np.empty_like(points)
+        _exponents(points, day.attenuation_per_m, below_plan_m, loss_per_m, fading, path_loss)
+        lux = np.exp(fading, out=fading)
+        lux *= day.illuminance_lx
         for lamp in range(len(lamps.sources.intensity_cd)):
-            lux = lux + lamps.lux(lamp, points)[0]
-        return self._snow.albedo / np.pi * lux * np.exp(-self._water.attenuation_per_m * range_m)
+            lux += lamps.lux(lamp, points)[0]
+        lux *= self._snow.albedo / np.pi
+        lux *= np.exp(path_loss, out=path_loss)
+        return lux
 
 
 def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
@@ -240,36 +226,85 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
 
 
-def _delay_s(pixel: Array, flow: Array, readout_s: float, n_rows: int) -> Array:
-    """Returns the times (n,) after mid-exposure at which a rolling shutter records particles [s].
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
+    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`.
 
-    The row v is read t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row v_0 at mid-exposure
-    and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the divisor
-    1 - v' readout / (n_rows - 1) limited to 0.1 or more.
+    Args:
+        points: (n, 3) positions of the particles in the axes of the camera [m].
+        day_per_m, loss_per_m: (3,) attenuation of daylight with depth, and of light on the path [1/m].
+        below_m: depth of the camera relative to the planned depth [m].
+        fading, path_loss: (n, 3) arrays to fill.
     """
-    row_s = readout_s / (n_rows - 1)
-    return (pixel[:, 1] * row_s - readout_s / 2) / np.maximum(1 - flow[:, 1] * row_s, 0.1)
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        range_m = np.sqrt(x * x + y * y + z * z)
+        for c in range(3):
+            fading[k, c], path_loss[k, c] = -day_per_m[c] * (z + below_m), -loss_per_m[c] * range_m
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
+    """Fills `centre` (n, 2) and `path` (n, 2), the middle and the extent of the paths of particles [px].
+
+    A rolling shutter reads the row v at t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row
+    v_0 at mid-exposure and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the
+    divisor 1 - v' readout / (n_rows - 1) limited to 0.1 or more.
+
+    Args:
+        points: (n, 3) positions in the axes of the camera [m].
+        pixel: (n, 2) positions in the image at mid-exposure [px].
+        depth: (H, W) depth of the floor [m].
+        lens: focal length, and column and row of the principal point [px].
+        drift: (3,) velocity of the particles, in the axes of the camera [m/s].
+        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        moves: exposure time and read-out time [s], and whether the rolling shutter is applied to the image later.
+    """
+    (focal, cx, cy), (exposure_s, readout_s, rolls_later) = lens, moves
+    row_s, bottom, right, still = readout_s / (depth.shape[0] - 1), depth.shape[0] - 1, depth.shape[1] - 1, np.zeros(3)
+    for k in range(points.shape[0]):
+        along, down = _image_velocity(points[k, 0], points[k, 1], points[k, 2], focal, drift, twist)
+        path[k, 0], path[k, 1] = along * exposure_s, down * exposure_s
+        delay_s = (pixel[k, 1] * row_s - readout_s / 2) / max(1 - down * row_s, 0.1)
+        if rolls_later:
+            u, v = pixel[k, 0] + along * delay_s, pixel[k, 1] + down * delay_s
+            z = min(np.float64(depth[int(min(max(np.rint(v), 0), bottom)), int(min(max(np.rint(u), 0), right))]), FAR_M)
+            of_floor = _image_velocity((u - cx) / focal * z, (v - cy) / focal * z, z, focal, still, twist)
+            along, down = along - of_floor[0], down - of_floor[1]
+        centre[k, 0], centre[k, 1] = pixel[k, 0] + along * delay_s, pixel[k, 1] + down * delay_s
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _image_velocity(x, y, z, focal, drift, twist):
+    """Returns the image velocity [px/s] of a point (x, y, z) that drifts at `drift` (3,) in the axes of the camera."""
+    forward = drift[2] - twist[5] + x * twist[1] - y * twist[0]
+    across = drift[0] - twist[3] + y * twist[2] - z * twist[1] - x / z * forward
+    down = drift[1] - twist[4] + z * twist[0] - x * twist[2] - y / z * forward
+    return focal * across / z, focal * down / z
 
 
 @njit(cache=True, nogil=True)
-def _in_view(start, shift, low, camera_from_world, focal, middle, size, margin_px, reach_px_m, farthest_m):
-    """Returns the indices (n,) of the particles in view and their positions (n, 3) in the axes of the camera.
+def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_px, reach_px_m, farthest_m):
+    """Returns the indices (n,) of the particles in view, their positions in the axes of the camera, and their pixels.
 
-    A particle is in view if its depth is between NEAREST_M and `farthest_m`, and its projection is less than
-    `margin_px` + `reach_px_m` / depth outside the image. `start` (m, 3) are the positions in the box at time 0, to
-    which `shift` (3,) is added before they are wrapped into the box whose lower corner is `low` (3,) [m].
+    The positions are (n, 3), the pixels (n, 2). A particle is in view if its depth is between NEAREST_M and
+    `farthest_m`, and its projection is less than `margin_px` + `reach_px_m` / depth outside the image. `start` (m, 3)
+    are the positions in the box at time 0, to which `shift` (3,) is added before they are wrapped into the box whose
+    lower corner is `low` (3,) [m].
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
+    pixel, focal, (cx, cy) = np.empty((len(start), 2)), focals[0], (middle[0], middle[1])
     xs, ys, zs, seen = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.uint8)
     for begin in range(0, len(start), BLOCK):
         block = start[begin : begin + BLOCK]
         _into_camera(block.reshape(-1), shift, low, camera_from_world, xs, ys, zs)
-        _test_view(xs, ys, zs, focal, middle[0], middle[1], size[0], size[1], margin_px, reach_px_m, farthest_m, seen)
+        _test_view(xs, ys, zs, focal, cx, cy, size[0], size[1], margin_px, reach_px_m, farthest_m, seen)
         for k in range(len(block)):
             if seen[k]:
                 found[n], points[n, 0], points[n, 1], points[n, 2] = begin + k, xs[k], ys[k], zs[k]
+                pixel[n, 0], pixel[n, 1] = xs[k] / zs[k] * focals[0] + cx, ys[k] / zs[k] * focals[1] + cy
                 n += 1
-    return found[:n], points[:n]
+    return found[:n], points[:n], pixel[:n]
 
 
 @njit(cache=True, nogil=True)
@@ -351,7 +386,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
 @njit(cache=True, nogil=True, inline="always")
 def _swept(radius, du, dv, step_u, step_v, steps):
-    """Returns the mean coverage (0 to 1) of a pixel by a disc of `radius` [px] at `steps` evenly spaced positions.
+    """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`.
 
     (du, dv) is the offset of the pixel from the middle position, (step_u, step_v) the step between positions [px].
     """
@@ -363,5 +398,8 @@ def _swept(radius, du, dv, step_u, step_v, steps):
 
 @njit(cache=True, nogil=True, inline="always")
 def _rim(radius, du, dv):
-    """Returns the coverage (0 to 1) of a pixel by a disc with antialiased edge whose centre is (du, dv) px away."""
+    """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px].
+
+    The edge of the disc is antialiased: the coverage decreases to 0 at the distance `radius` [px].
+    """
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

@@ -69,7 +69,7 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
     Args:
         water: one band of the water.
         distances_m: (n,) distances from the lamp.
-        receiver: kind of surface at which the light arrives: the floor, or a particle in the water.
+        receiver: where the light arrives, on a floor or on a particle in the water.
 
     Returns:
         (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.

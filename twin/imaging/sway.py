@@ -59,7 +59,9 @@ def largest_displacement_m(item: PlacedObject, current_mps: Array) -> float:
     if not item.model.sways:
         return 0.0
     aside = _lean(float(np.hypot(*current_mps[:2]))) * (1 + OSCILLATION)  # deflection of the tip / height
-    return float(item.scale * item.model.high_m[2] * np.hypot(aside, aside**2 / 2))
+    down = aside**2 / 2  # along the axis of the plant, whose horizontal part may have the direction of the current
+    tilt = float(np.hypot(*item.world_from_object[:2, 2])) / item.scale  # sine
+    return float(item.scale * item.model.high_m[2] * np.sqrt(aside**2 + down**2 + 2 * aside * down * tilt))
 
 
 def _lean(speed_mps: float) -> float:

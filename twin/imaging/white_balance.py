@@ -2,7 +2,7 @@
 
 The factors of a preset are inversely proportional to the electrons that a white surface yields in the expected light:
 white light, a black body of a colour temperature, or white light after the path from the planned altitude to the floor
-and back, exp(-2 Kd altitude), with the diffuse attenuation Kd of `illumination.water_to_floor_and_back`. Grey world
+and back, exp(-2 Kd altitude), with Kd the diffuse attenuation in `illumination.water_to_floor_and_back`. Grey world
 makes the means of the three bands equal (Buchsbaum 1980, A spatial processor model for object colour perception); the
 factors of a frame are computed from the previous frames with the lag of the auto-exposure. Factors are at least 1, so
 that a saturated pixel is white, and at most `MOST` except those for white light, as amplified bands are noisy.
@@ -49,8 +49,8 @@ class WhiteBalance:
     def factors(self, mean: Array, share: float) -> Array:
         """Returns the factors (3,) of this frame.
 
-        With grey world, they are measured on the previous frames (those of the first frame on itself), and this frame
-        is measured for the later ones.
+        With grey world, the factors are measured on the previous frames (those of the first frame on this frame), and
+        this frame is measured for the later ones.
 
         Args:
             mean: (3,) mean radiance of this frame in photometric units.

@@ -71,7 +71,7 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """Returns the RMSE [m] of estimated positions (n, 3) of the last n keyframes in `frames`; None if there are none.
+    """Returns the RMSE [m] of estimated positions (n, 3) of the first n keyframes in `frames`; None if there are none.
 
     Arguments as for `keyframe_errors_m`.
     """
@@ -79,13 +79,13 @@ def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyRe
 
 
 def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> Array:
-    """Returns the position errors (n,) [m] of the last n keyframes in `frames`.
+    """Returns the position errors (n,) [m] of the first n keyframes in `frames`.
 
     The positions are anchored at the first true pose before they are compared.
 
     Args:
         positions: (n, 3) estimated positions, not yet anchored [m].
-        frames: (m,) frame numbers of the keyframes.
+        frames: (m,) frame numbers of the keyframes; those after the first n have no position yet.
         result: output of the estimators, of which the first online pose is used.
         truth: source of the true trajectory.
     """
@@ -93,5 +93,5 @@ def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: Surve
     if n == 0:
         return np.zeros(0)
     true_from_estimated = anchor(result.online.world_from_camera[0], truth.trajectory.world_from_camera[0])
-    anchored = geometry.transform(true_from_estimated, positions[-n:])
-    return np.linalg.norm(anchored - truth.trajectory.positions[frames[-n:]], axis=1)
+    anchored = geometry.transform(true_from_estimated, positions[:n])
+    return np.linalg.norm(anchored - truth.trajectory.positions[frames[:n]], axis=1)

@@ -68,7 +68,7 @@ class OrthomosaicJudge:
         self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
 
     def _match(self, shown: NDArray[np.float32], true: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Measures the displacement and the spectra of all patches whose surroundings have a colour."""
+        """Adds the displacement and the spectra of each patch whose surroundings have a colour and a true albedo."""
         n, m = PATCH_PX, SEARCH_PX
         for row in range(m, len(shown) - n - m + 1, n):
             for col in range(m, shown.shape[1] - n - m + 1, n):

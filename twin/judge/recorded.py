@@ -221,9 +221,10 @@ def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
 
     `links` is the number of links with matched points, `loops` the number of those whose nodes are more than two nodes
     apart. The residual of a link is log(M^-1 T), with M its measured motion and T the motion between the final poses.
-    `loop_translation_m` and `loop_rotation_deg` are medians of the residuals of the loops. `loop_chi2` is the mean of
-    r' C^-1 r / 6 over their residuals r, with C the covariance of the measurement; it is below about 1 for consistent
-    covariances. These numbers are not errors: an error that all links have in common does not appear in them.
+    `loop_translation_m` and `loop_rotation_deg` are the medians over the loops of the norms of the translation and of
+    the rotation in their residuals. `loop_chi2` is the mean of r' C^-1 r / 6 over their residuals r, with C the
+    covariance of the measurement; it is below about 1 for consistent covariances. These three values are None without
+    loops. They are not errors: an error that all links have in common does not appear in them.
     """
     measured = result.links.select(result.links.n_points > 0)
     loops = measured.select(node_distance(measured, linked_nodes(result.links)) > ALONG_NODES)

@@ -13,7 +13,7 @@ def stereo_quality(result: SurveyResult) -> dict[str, Any]:
 
     points_median and points_p10 are the median and the 10th percentile of the number of matched points.
     contrast_median and saturated_median are the medians of the contrast and of the saturated fraction of the pixel
-    values; both are None if no images are rendered. blind_looks is the number of stereo observations that did not give
+    values; both are None without images. blind_looks is the number of stereo observations that did not give
     a keyframe because they had too few matched points.
     """
     points = [observation.n_points for observation in result.stereo_observations]

@@ -32,7 +32,7 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _out_of_bounds(value: float | None, bounds: tuple[float, float], sentence: str) -> str:
-    """Returns the sentence with its verdict, the value and the bounds filled in; "" if the value is within bounds."""
+    """Returns the sentence with "too small" or "too large", the value and the bounds; "" for a value within bounds."""
     if value is None or bounds[0] <= value <= bounds[1]:
         return ""
     return sentence.format("too small" if value > bounds[1] else "too large", value, *bounds)

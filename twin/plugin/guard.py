@@ -1,4 +1,4 @@
-"""Calls of a plug-in: exceptions in it and unusable values from it end the survey with a reason that names it."""
+"""Checked calls of plug-ins: an exception or an unusable value ends the survey with a reason that names the plug-in."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOST_POSITION_M = 1e6  # largest absolute coordinate of a pose
 
 
 class PluginFailed(SurveyAborted):
-    """A plug-in raised an exception or returned an unusable value; the message names it."""
+    """A plug-in raised an exception or returned an unusable value; the message names the plug-in."""
 
 
 class GuardedPlugin:
@@ -49,9 +49,10 @@ class GuardedPlugin:
             PluginFailed: the class or the method raised an exception, or a method is missing.
         """
         if self._plugin is None:
-            self._plugin = self._attempt("its class", self._create, self._arguments)
-            if missing := [name for name in self._methods if not callable(getattr(self._plugin, name, None))]:
+            plugin = self._attempt("its class", self._create, self._arguments)
+            if missing := [name for name in self._methods if not callable(getattr(plugin, name, None))]:
                 raise PluginFailed(f"{self.label}: has no method {missing[0]}")
+            self._plugin = plugin
         return self._attempt(method, getattr(self._plugin, method), arguments)
 
     def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
@@ -115,7 +116,7 @@ class GuardedPlugin:
         """Returns the result of a function of the plug-in; an exception in it becomes PluginFailed."""
         try:
             return function(*copy.deepcopy(arguments))
-        except (Exception, SystemExit) as error:  # any error of code that is not ours
+        except (Exception, SystemExit) as error:  # a plug-in may raise any exception
             raise PluginFailed(f"{self.label}: {what} raised {loading.described(error)}") from None
 
 

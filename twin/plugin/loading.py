@@ -80,7 +80,7 @@ def attempt(key: str, name: str, function: Callable[[], T]) -> T:
     """
     try:
         return function()
-    except (Exception, SystemExit) as error:  # any error of code that is not ours
+    except (Exception, SystemExit) as error:  # a plug-in may raise any exception
         raise TwinError(key, f"{name}: {described(error)}", "a plug-in that can be loaded") from None
 
 

@@ -36,8 +36,8 @@ class PluginNavigator(Navigator):
     Args:
         name: "module:Class", or the name of an entry point.
         setup: believed calibration, start and sensor noise, which the plug-in gets.
-        settings: settings of the stereo matching, and of the choice of keyframes where the frames leave it open.
-        vision: images of the keyframes, for the map; closed by the caller.
+        settings: settings of the stereo matching, and of the choice of keyframes where `Frame.keyframe` is None.
+        vision: stereo matching and images of the keyframes, for the map; closed by the caller.
         stopwatch: timer of the stages; the time of the plug-in is that of the stage "f2f".
         key: key or option that names the plug-in, for messages.
 
@@ -66,6 +66,7 @@ class PluginNavigator(Navigator):
 
         Raises:
             PluginFailed: the plug-in raised an exception or returned an unusable value.
+            ValueError: the frame is not later than the last one.
             OSError: images could not be written.
         """
         interval_s = self._interval_s(frame.time_s)
@@ -96,7 +97,9 @@ class PluginNavigator(Navigator):
         self._finishes = False
 
     def finish(self) -> SurveyResult:
-        """Returns the trajectories of the plug-in and the keyframes.
+        """Returns the result of the survey, with the trajectories and covariances that the plug-in gave.
+
+        The final trajectory is the online one if the plug-in gives none.
 
         Raises:
             PluginFailed: `finish` of the plug-in raised an exception or returned an unusable value.
@@ -111,7 +114,7 @@ class PluginNavigator(Navigator):
         return replace(result, node_cov=covs)
 
     def _stereo_keyframe(self, frame: Frame, track: int) -> Keyframe | None:
-        """Matches the stereo pair of a keyframe; None if the frame is not one, or has too few matched points."""
+        """Returns the keyframe of a frame; None if the frame is not one, or if it has too few matched points."""
         if not self._is_keyframe(frame, "ok"):
             return None
         self._images.track_frame(frame)

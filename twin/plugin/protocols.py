@@ -39,7 +39,7 @@ class Controller(Protocol):
     """
 
     def command(self, estimate: Estimate, reference: Reference) -> Array:
-        """Returns the command until the next frame.
+        """Returns the command that applies until the next frame.
 
         Args:
             estimate: online estimate of the pose and the velocity of the left camera. If neither the images nor the DVL
@@ -55,11 +55,11 @@ class Controller(Protocol):
 
 
 class EstimatorSetup(NamedTuple):
-    """Argument of the class of an estimator: calibration and start, no truth.
+    """Constructor argument of an estimator plug-in: calibration, start pose and sensor noise as believed; no truth.
 
     Args:
         rig: believed calibration of the rectified images.
-        start: (4, 4) planned pose world_from_camera of the left camera at the first frame.
+        start: (4, 4) pose world_from_camera of the left camera at the first frame, planned or assumed (replay).
         noise: believed noise of the navigation sensors.
     """
 
@@ -71,8 +71,9 @@ class EstimatorSetup(NamedTuple):
 class Estimator(Protocol):
     """Estimator of the trajectory: key `estimate.plugin`, entry points `twin.estimators`.
 
-    The class is called once per survey with an `EstimatorSetup`. Poses are rigid, world_from_camera (4, 4) of the left
-    camera. The twin builds the elevation map along the final trajectory from the stereo pairs of the keyframes.
+    The class is called once per survey or replay with an `EstimatorSetup`. Poses are rigid, world_from_camera (4, 4) of
+    the left camera. The twin builds the elevation map along the final trajectory from the stereo pairs of the
+    keyframes.
     """
 
     def update(self, frame: Frame) -> Array | None:

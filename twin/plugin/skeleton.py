@@ -1,4 +1,4 @@
-"""Skeleton of a package with a plug-in: pyproject, module and test, written by `twin new-plugin`."""
+"""Skeleton of a package with a plug-in, written by `twin new-plugin`: pyproject.toml, README.md, module and test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Kind = Literal["controller", "estimator", "terrain", "reader"]
 
 
 class _Flown(NamedTuple):
-    """Survey with which the test of a skeleton flies its plug-in.
+    """Settings of the survey in which the test of a skeleton uses the plug-in.
 
     Args:
         section: section of the scenario with the key `plugin`.

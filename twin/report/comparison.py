@@ -19,13 +19,13 @@ MOST_RUNS = 8
 
 
 class ComparedQuantity(NamedTuple):
-    """A row of the table.
+    """Metric that the comparison of runs shows in one row of its table.
 
     Args:
         name: dotted name in metrics.json.
         label: name on the page.
         text: function that returns a value as text, with its unit unless the label has it.
-        better: "less" or "more" if smaller or larger values are better; "" if neither.
+        better: "less" or "more": whether smaller or larger values are better; "" if neither.
     """
 
     name: str
@@ -138,7 +138,7 @@ def notes(differences: Mapping[str, Sequence[str]]) -> list[str]:
         differences: keys in which the scenarios differ (`scenario_differences`).
     """
     survey = [key for key in differences if key.split(".")[0] in ("seed", "terrain", "objects", "plan")]
-    sentences = ["A difference between two surveys contains chance; twin study compares many seeds."]
+    sentences = ["A difference between two surveys is partly due to chance; twin study compares many seeds."]
     if survey:
         sentences.insert(0, f"The runs are surveys of different floors or plans: {', '.join(survey)}.")
     return sentences
@@ -216,7 +216,7 @@ def _cell(quantity: ComparedQuantity, value: float | None, first: float | None, 
 
 
 def _relative(factor: float) -> str:
-    """Returns the ratio of two values as text: below three as change in percent, e.g. "+10 %", otherwise as factor."""
+    """Returns the ratio of two values as text: a change in percent below three, e.g. "+10 %", otherwise a factor."""
     return f"{100 * (factor - 1):+.0f} %" if factor < 3 else wording.ratio(factor)
 
 

@@ -11,8 +11,8 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.judge.trajectory import path_errors
 from twin.report.figures import WIDTH_IN, log_scale, to_data_uri
+from twin.report.run_errors import run_errors
 from twin.report.run_folder import Run
 from twin.report.style import COLOURS, FIGURE_STYLE
 
@@ -46,7 +46,7 @@ def error_curves(runs: Sequence[Run], names: Sequence[str]) -> Figure | None:
     for axes, estimate in zip(panels, ("online", "final"), strict=True):
         for k, (run, name) in enumerate(zip(runs, names, strict=True)):
             if "truth" in run.trajectories and estimate in run.trajectories:
-                errors = path_errors(run.trajectories[estimate], run.trajectories["truth"])
+                errors = run_errors(run, estimate)
                 axes.plot(
                     errors.travelled_m, errors.distance_m, _RUN_STYLES[k], color=_RUN_COLOURS[k], label=name
                 )  # fmt: skip

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from twin.judge.budget import stage_times
-from twin.judge.trajectory import path_errors
+from twin.report.run_errors import run_errors
 from twin.report.run_folder import Raster, Run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
@@ -104,7 +104,7 @@ def path_error_curves(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 5.6))
     position, height, heading = figure.subplots(3, 1, sharex=True)
     for name in names:
-        errors = path_errors(run.trajectories[name], run.trajectories["truth"])
+        errors = run_errors(run, name)
         style: dict[str, Any] = {"color": COLOURS[name], "label": LABELS[name]}
         position.plot(errors.travelled_m, errors.distance_m, **style)
         height.plot(errors.travelled_m, errors.position_m[:, 2], **style)

@@ -21,7 +21,7 @@ READING_COLUMNS = ("pressure_z_m", "roll_rad", "pitch_rad", "yaw_rad", "forward_
 #: Columns between index, time_s, stereo and the readings: `Frame.exposure`, empty if the cameras do not report it.
 EXPOSURE_COLUMNS = ("exposure_r", "exposure_g", "exposure_b")
 _MOST_WAITING = 8  # frames whose images wait to be written; a survey waits for the disk beyond this number
-#: PNG without loss in half the time of the default filters and strategy; the files are 6 % larger.
+#: PNG in half the time of the default filters and strategy; the files are 6 % larger.
 _PNG = [
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
@@ -32,11 +32,11 @@ _PNG = [
 class FrameRecorder:
     """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
-    `frames.csv` has index, time, exposure and sensor readings of every frame, and whether it has a stereo pair.
-    `truth.npz` has the true poses and velocities in double precision; the text files of trajectories are rounded. With
-    "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images only at frames
-    that are to become keyframes. With "keyframes", the images are those that the estimators store in the folder
-    `keyframes`.
+    `frames.csv` has index, time, exposure and sensor readings (without beacons) of every frame, and whether it has a
+    stereo pair. `truth.npz` has the true poses and velocities in double precision; the text files of trajectories are
+    rounded. With "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images
+    only at frames that are to become keyframes. With "keyframes", the images are those that the estimators store in the
+    folder `keyframes`.
 
     Args:
         folder: run folder.

@@ -12,12 +12,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from twin.core import geometry
-from twin.core.records import Array, Estimate, Frame, Image, StereoRig, Trajectory
-from twin.judge.trajectory import path_errors
+from twin.core.records import Array, Estimate, Frame, Image, StereoRig
 from twin.report import recording_surfaces, wording
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.replay_description import replayed_rig
+from twin.report.run_errors import run_errors
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.report.verdict import badge, first_lines
@@ -105,7 +105,7 @@ def _overview(run: Run) -> rrb.EyeControls3D | None:
 
 
 def log_scene(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the static entities: axes, true floor, planned path, mosaic and the summary."""
+    """Logs the static entities: axes, summary and, where the run has them, true floor, planned path and orthomosaic."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     summary = "\n".join(
         [f"# {run.scenario.get('name', run.folder.name)}: {badge(run.metrics).text}", ""]
@@ -208,16 +208,16 @@ def log_curves(recording: rr.RecordingStream, run: Run) -> None:
     if "truth" in run.trajectories:
         for name in ESTIMATES:
             if name in run.trajectories:
-                _log_errors(recording, name, run.trajectories[name], run.trajectories["truth"])
+                _log_errors(recording, run, name)
     for stage, (times, values) in stage_durations(run).items():
         log_curve(recording, f"timing/{stage}", times, values)
         if len(values) == 1:
             recording.log(f"timing/{stage}", rr.SeriesPoints(marker_sizes=4), static=True)
 
 
-def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, truth: Trajectory) -> None:
+def _log_errors(recording: rr.RecordingStream, run: Run, name: str) -> None:
     """Logs position, height and heading error of one estimate."""
-    errors = path_errors(estimate, truth)
+    errors, truth = run_errors(run, name), run.trajectories["truth"]
     rows = subsampled_rows(len(errors.travelled_m))
     times = FrameTimes(rows, truth.times_s[rows])
     log_curve(recording, f"error/position/{name}", times, errors.distance_m[rows], name)
@@ -228,7 +228,7 @@ def _log_errors(recording: rr.RecordingStream, name: str, estimate: Trajectory, 
 def log_curve(
     recording: rr.RecordingStream, entity: str, times: FrameTimes, values: Array, role: str | None = None
 ) -> None:
-    """Logs one curve on both timelines (frame number and simulated time).
+    """Logs one curve on both timelines (frame number and time).
 
     Args:
         recording: recording to log to.
@@ -301,7 +301,7 @@ def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
 
 
 def time_columns(times: FrameTimes) -> list[rr.TimeColumn]:
-    """Returns the frame numbers and simulated times as the two timelines of the recording."""
+    """Returns the frame numbers and times as the two timelines of the recording."""
     return [rr.TimeColumn("frame", sequence=times.frames), rr.TimeColumn("sim_time", duration=times.times_s)]
 
 

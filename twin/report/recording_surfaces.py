@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.grid_triangles import raster_triangles
+from twin.core.map_slopes import map_slopes
 from twin.core.records import Array, Image, MapGrid, StereoRig
 from twin.report.run_folder import Raster
 
@@ -98,7 +99,7 @@ def _surface(raster: Raster, colours: Image) -> Surface:
     x, y = raster.grid.centres()
     height = raster.values[::step, ::step]
     points = np.stack([*np.meshgrid(x[::step], y[::step]), height], axis=-1)
-    north, east = np.gradient(height, -step * raster.grid.cell_m, step * raster.grid.cell_m)
+    east, north = map_slopes(height, step * raster.grid.cell_m)
     normals = np.nan_to_num(np.stack([-east, -north, np.ones_like(height)], axis=-1))
     unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     flat = points.reshape(-1, 3), unit.reshape(-1, 3), colours[::step, ::step].reshape(-1, 3)
@@ -134,9 +135,7 @@ def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArra
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles that are complete with a given group, with their vertices.
-
-    A triangle is complete when the last of its three vertices is first observed.
+    """Returns the triangles whose last vertex is first observed by a given camera group, with their vertices.
 
     Args:
         surface: the whole surface.

@@ -6,7 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -121,7 +121,8 @@ class RunFolder:
 
     def __exit__(self, *_: object) -> None:
         self._reserve.unlink(missing_ok=True)
-        self._log.close()
+        with suppress(OSError):  # on a full disk, closing repeats a write that failed
+            self._log.close()
 
     def log(self, event: str, **fields: Any) -> None:
         """Adds a line to the log. Write errors (full disk) are ignored, so the survey continues."""
@@ -145,8 +146,16 @@ class RunFolder:
             guard: limits an interrupt to a single stage, and records why the survey ended early, if it did.
 
         Raises:
-            OSError: metrics.json cannot be written.
+            TwinError: metrics.json cannot be written.
         """
+        try:
+            return self._finish(record, guard)
+        except OSError as error:
+            problem = f"{self.path / 'metrics.json'} cannot be written: {error.strerror or error}"
+            raise TwinError("--out", problem, "a writable folder with space") from None
+
+    def _finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
+        """Writes the files of `finish`; raises OSError if metrics.json cannot be written."""
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
         temporary = ".metrics.json.part"

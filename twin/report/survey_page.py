@@ -17,6 +17,7 @@ from twin.report.figures import draw_all
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.mesh_picture import surface_picture
+from twin.report.run_errors import run_alignment
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, LABELS
@@ -67,6 +68,7 @@ def context(run: Run) -> dict[str, Any]:
         "mosaic": mosaic_image(run),
         "surface": surface_image(run),
         "samples": sample_images(run),
+        "alignment": wording.REPLAY_ALIGNMENTS[run_alignment(run) or "first"],
         "scenario": (run.folder / SCENARIO_FILE).read_text(encoding="utf-8"),
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,

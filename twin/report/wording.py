@@ -139,12 +139,15 @@ def plain(value: Any) -> str:
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
     """Returns the summary of a survey as text: status, conditions, final position error and map quality.
 
-    The limitations of these results are not included; `verdict.first_lines` returns them.
+    The summary of a replay is that of `replay_summary`, with the status. The limitations of these results are not
+    included; `verdict.first_lines` returns them.
 
     Args:
         metrics: contents of metrics.json; None for an unfinished survey.
         scenario: contents of the scenario file.
     """
+    if metrics is None and "replay" in scenario:
+        return "This replay is unfinished: it has no metrics.json."
     if metrics is None:
         return f"This survey is unfinished: it has no metrics.json. The survey is planned {conditions(scenario)}."
     verb = "was" if metrics["status"] == "aborted" else "is"
@@ -186,7 +189,8 @@ def conditions(scenario: Mapping[str, Any]) -> str:
     if jerlov == "clear" and not custom:
         kind, turbidity = "clear water", 1.0
     scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
-    return f"{plan.get('altitude_m', 0):g} m above the reference plane in {kind}{scattering}"
+    below = "smoothed floor" if plan.get("height") == "floor" else "reference plane"
+    return f"{plan.get('altitude_m', 0):g} m above the {below} in {kind}{scattering}"
 
 
 def _results(metrics: Mapping[str, Any]) -> str:
@@ -216,15 +220,20 @@ def area_le90(elevation: Mapping[str, Any]) -> str:
 
 
 def closed_form_comparison(links: Mapping[str, Any]) -> str:
-    """Returns sentences that compare the translation errors of the links with those of the closed form, eq. (2)."""
+    """Returns sentences that compare the translation errors of the links with those of the closed form, eq. (2).
+
+    If there are no such errors, it returns a sentence that states the reason.
+    """
     changes = []
     for direction in ("along", "across"):
         error = links[direction]["translation_rmse_m"]
         closed_form_error = links[direction]["closed_form_translation_rmse_m"]
         if error and closed_form_error is not None:
             changes.append(f"from {length(closed_form_error)} to {length(error)} {direction}")
-    if not changes:
+    if not any(links[direction]["count"] for direction in ("along", "across")):
         return "No motion between keyframes was measured."
+    if not changes:
+        return "The motions between keyframes were not computed by eq. (2)."
     return (
         "Eq. (2) treats the depth of one stereo pair as exact. Two-view structure and motion weights both stereo pairs "
         f"by their noise, which changes the RMS translation error of the links {' and '.join(changes)}."
@@ -270,7 +279,7 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     mapped = f"over the mapped {completeness} of the observed floor"
     figures = [
         KeyFigure("Completeness", area, f"of the asked area; {completeness} of the observed floor; cell size {cell}"),
-        KeyFigure("Map LE90, asked area", area_le90(elevation), f"a hole counts as infinite; {area} has a height"),
+        KeyFigure("Map LE90, asked area", area_le90(elevation), _holes(elevation)),
         KeyFigure("Map LE90, mapped floor", le90, f"{mapped}; NMAD {nmad}"),
         KeyFigure("Map bias", bias, f"{mapped}; RMSE {rmse}"),
         KeyFigure("Sigma calibration", plain(elevation["sigma_ratio"]), f"RMS of error / sigma, 1 is right; {mapped}"),
@@ -278,6 +287,14 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     if elevation.get("objects_le90_m") is not None:
         figures += [_surface_figure(elevation, "floor", "bare floor"), _surface_figure(elevation, "objects", "objects")]
     return figures
+
+
+def _holes(elevation: Mapping[str, Any]) -> str:
+    """Returns a phrase on the holes of the map in the asked area."""
+    if elevation.get("completeness_area") is not None:
+        return f"a hole counts as infinite; {percent(elevation['completeness_area'])} has a height"
+    evaluated = "completeness_area" in elevation and elevation["completeness"] is not None
+    return "the asked area contains no cell centre" if evaluated else "a hole counts as infinite"
 
 
 def _surface_figure(elevation: Mapping[str, Any], key: str, name: str) -> KeyFigure:

@@ -69,9 +69,9 @@ class DaylightCell(NamedTuple):
 
     Args:
         water: Jerlov type.
-        elevation_deg: elevation of the sun, in air.
-        depth_m: depth of the camera below the surface.
-        range_m: range of the floor, straight below.
+        elevation_deg: elevation of the sun, in air [deg].
+        depth_m: depth of the camera below the surface [m].
+        range_m: range of the floor, straight below [m].
         model_lx: illuminance, by the model, of a level plane at the camera, and of two slopes of `SLOPE_DEG` on the
             floor: one that faces the sun and one that faces away from it.
         truth_lx: the same illuminances by the reference, over a black floor.
@@ -179,7 +179,7 @@ def reference_scene(daylight: Daylight, water: Medium, surface_m: float) -> Refe
     Args:
         daylight: direction and shares of sun and sky.
         water: optical properties of the water.
-        surface_m: height of the water surface above the floor.
+        surface_m: height of the water surface above the floor [m].
     """
     source = daylight.source
     sky = source.sky_share * sky_radiance(np.linspace(0.0, 1.0, SKY_STEPS + 1))

@@ -81,7 +81,12 @@ def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Ex
 
 
 def scenarios(quick: bool, settings: tuple[str, ...] = ()) -> tuple[Scenario, Scenario]:
-    """Returns the scenario with the coarse texture and the one at full resolution."""
+    """Returns the scenarios of the mission: coarse texture and small images; fine texture and full-size images.
+
+    Args:
+        quick: whether to use the quick plan.
+        settings: further settings of both scenarios, each "key=value".
+    """
     plan = (*(QUICK if quick else ()), *settings)
     return load_scenario("paper_coarse", [*COARSE, *plan]), load_scenario("paper", [*FINE, *plan])
 
@@ -195,7 +200,7 @@ def path_table(flights: Flights) -> Table:
 def map_table(flights: Flights) -> Table:
     """Returns a table of the share of the asked area without a height, with and without alignment (Fig. 7).
 
-    For the flight without alignment, it also has an error of the map and the distance from the planned path.
+    For the flight without alignment, the table also has an error of the map and the distance from the planned path.
     """
     rows: list[Row] = [("", "paper", "coarse texture", "full resolution")]
     rows += [

@@ -54,7 +54,7 @@ class F2fNavigator(Navigator):
 
 
 def fly_aligned(scenario: Scenario) -> Flown:
-    """Flies a mission with all corrections; after each track, the window of tracks is aligned globally.
+    """Flies a mission with all corrections; the network is aligned after each track.
 
     Raises:
         TwinError: the mission cannot be prepared, or no stereo pair became a keyframe.

@@ -1,4 +1,4 @@
-"""Figure of a tank experiment: network, paths, true and estimated height, predicted and real error."""
+"""Figure of a tank experiment: network, paths, true and estimated height, predicted and actual error."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from twin.reproduce.tank_scene import TankObject
 
 Array = NDArray[np.floating]
 
-MARGIN_M = 0.04  # the window of an object extends beyond it by this much; its outer half shows the floor
+MARGIN_M = 0.04  # margin of the window around an object; the outer half of the margin shows the floor
 PLATEAU = 0.75  # cells above this fraction of the 90th percentile of height belong to the top of a box or a disc
 CENTRAL = 0.5  # extents are medians over lines through the central part of a box or a pipe, a fraction of its size
 CENTRAL_ROUND = 0.15  # the same for a disc or a dome
@@ -124,9 +124,9 @@ def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
     the profile is not above the level near 0, or does not fall to it on both sides.
 
     Args:
-        at_m: (n,) places along the profile, relative to the centre of the object, in ascending or descending order.
-        height_m: (n,) heights; points without a height are ignored.
-        level_m: the level.
+        at_m: (n,) places along the profile, relative to the centre of the object [m].
+        height_m: (n,) heights [m]; points without a height are ignored.
+        level_m: the level [m].
     """
     known = np.isfinite(height_m)
     order = np.argsort(at_m[known])

@@ -44,7 +44,7 @@ class TankSurvey:
         result: output of the estimators.
         elevation: map along the final trajectory.
         truth: true trajectory and floor.
-        ended: why the final alignment is missing; "" if it is not.
+        ended: why the final alignment is missing; "" if it was done.
     """
 
     mission: Mission
@@ -74,7 +74,8 @@ class Closure(NamedTuple):
 def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: int = N_PAIRS) -> TankSurvey:
     """Returns the survey of a tank experiment.
 
-    The estimators start at the planned pose of the first frame; the rig is off it by the bend and jitter of the track.
+    The estimators start at the planned pose of the first frame; the true pose differs from it by the bend
+    and the jitter of the track.
 
     Args:
         name: "tank1", parallel legs, or "tank2", two loops that touch at the start.
@@ -83,7 +84,7 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
         n_pairs: number of stereo pairs of tank1.
 
     Raises:
-        TwinError: no stereo pair became a keyframe, so that there is no map.
+        TwinError: a setting is invalid, or no stereo pair became a keyframe, so that there is no map.
     """
     path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(n_pairs, SEED)
     mission = _mission(settings)

@@ -46,7 +46,7 @@ def render_levels(
     Args:
         turbidities: values of `water.turbidity`.
         settings: further overrides of the scenario, each "key=value".
-        ranges_m: (n,) ranges at which the contrast is computed.
+        ranges_m: (n,) ranges at which the contrast is computed [m].
     """
     levels, floor = [], block_on_sand(seed=1)
     for turbidity in turbidities:

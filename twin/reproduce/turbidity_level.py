@@ -25,7 +25,7 @@ class TurbidityLevel(NamedTuple):
         water: optical properties of the water.
         image: (H, W, 3) image of the left camera.
         quality: measures of the quality of `image`, see `twin.app.look.image_quality`.
-        ranges_m: (n,) ranges at which `contrast` is given.
+        ranges_m: (n,) ranges at which `contrast` is given [m].
         contrast: (n, 3) contrast of fine detail relative to clear water for R, G, B.
     """
 

@@ -61,7 +61,7 @@ def _vehicle(scenario: Scenario) -> list[str]:
 
 
 def _restoration(scenario: Scenario) -> list[str]:
-    """Returns the names of the errors that the restoration of real images has and that of this scenario does not have.
+    """Returns the names of the errors of a restoration of real images that the scenario leaves out.
 
     Simulated images are restored with the true values of water, lamps, vignetting and exposure.
     """

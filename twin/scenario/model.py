@@ -624,7 +624,8 @@ class PlanConfig(Section):
     polygon: str | tuple[Vector2, ...] | None = Field(
         default=None,
         description="area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file "
-        "with one polygon in the CRS of the DEM; ${TWIN_DATA} is expanded",
+        "with one polygon in a CRS that it names, in longitude and latitude, or in the CRS of the DEM; ${TWIN_DATA} is "
+        "expanded",
     )
     turns: Literal["reverse", "bow_first"] = Field(
         default="reverse",

@@ -54,13 +54,13 @@ class FlownSurvey(NamedTuple):
 
 
 def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
-    """Aligns all keyframes, builds the map, compares trajectories and map with the truth, and writes the run folder.
+    """Aligns all keyframes, builds the map and the orthomosaic, compares with the truth, and writes the run folder.
 
     An interrupt ends only the current stage; the survey then has the status "aborted" with a reason that names the
     stage.
 
     Raises:
-        OSError: metrics.json cannot be written.
+        TwinError: metrics.json cannot be written.
     """
     mission, world, navigator, stopwatch, guard = flight
     result = finish_in_stage(navigator, guard)
@@ -118,7 +118,7 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
 
 
 def plugin_notes(scenario: Scenario) -> list[str]:
-    """Returns one sentence on each plug-in of the survey."""
+    """Returns one note on each plug-in of the survey."""
     notes = (
         (scenario.terrain.plugin, "The heights of the floor are those of the plug-in {}."),
         (scenario.control.plugin, "The vehicle was steered by the plug-in {}."),

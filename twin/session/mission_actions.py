@@ -1,4 +1,7 @@
-"""Actions of a mission in poor visibility: the vehicle slows down if frames are lost, and stops without vision."""
+"""Actions of a mission in poor visibility.
+
+The vehicle slows down if many frames have no measured motion, and stops if no motion has been measured for `BLIND_S`.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ class MissionActions:
         self._lost: deque[bool] = deque([False] * n_window, n_window)
 
     def __call__(self, estimate: Estimate) -> Pace:
-        """Returns the pace of the next frame, after the estimate of the last one."""
+        """Returns the pace from the current frame to the next, given the estimate of the current frame."""
         lost = estimate.status != "ok"
         self._n_blind = self._n_blind + 1 if lost else 0
         self._lost.append(lost)
@@ -65,7 +68,7 @@ class MissionActions:
         return self._pace_towards(target)
 
     def add_measured_frames(self, n: int) -> None:
-        """Counts n frames with measured motion from the compiled loop, which does not report them one by one."""
+        """Registers n consecutive frames with measured motion, which the compiled loop does not report one by one."""
         if n:
             self._n_blind, self._n_recovered = 0, self._n_recovered + n
             self._lost.extend([False] * min(n, len(self._lost)))

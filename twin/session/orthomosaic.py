@@ -99,7 +99,7 @@ def make_orthomosaic(
 
 
 def _restoration(mission: Mission, elevation: ElevationMap) -> Restore:
-    """Returns the restoration, which removes the effects of lamps and water from the colours of images."""
+    """Returns the restoration, which removes the effects of lamps, daylight and water from the colours of images."""
     from twin.imaging.restoration import Restoration  # imported here: a survey without it does not need its tables
 
     return Restoration(mission.scenario, mission.illumination, mission.rig, elevation)

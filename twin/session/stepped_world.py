@@ -136,6 +136,9 @@ class SteppedWorld:
         """Returns the controller of the scenario: a function from the estimate of a frame and this frame to a command.
 
         The function steers to the planned reference of the current frame.
+
+        Raises:
+            TwinError: the plug-in that the scenario names cannot be loaded.
         """
         steer, flight = make_pilot(self._mission), self.flight
 

@@ -20,7 +20,7 @@ _OFF_COURSE_S = 1.0  # shorter departures from the path are ignored
 def survey_findings(
     mission: Mission, result: SurveyResult, elevation: ElevationMap | None, reference_m: Array
 ) -> list[Finding]:
-    """Returns the findings of all checks: reasons why a survey must not be trusted as it stands; empty if it passes.
+    """Returns the findings of all checks, each a reason not to trust the survey; empty if the survey passes.
 
     Args:
         mission: the survey as planned.
@@ -32,7 +32,7 @@ def survey_findings(
 
 
 def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
-    """Returns one sentence on the rectification errors that were estimated and removed; empty if none were removed."""
+    """Returns a list with one sentence on the rectification errors that were removed; empty if none were removed."""
     epipolar = result.quality.epipolar
     if epipolar is None or not epipolar.removed.any():
         return []

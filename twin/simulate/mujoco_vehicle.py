@@ -105,8 +105,9 @@ class MujocoVehicle:
     def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
         """Raises SurveyAborted, listing the last states, if the physics has diverged.
 
-        It has if a component of the acceleration (6,) is not finite, or if one of the velocity (6,) is NaN or reaches
-        SPEED_LIMIT_MPS (linear) or RATE_LIMIT_RADPS (angular). Both are in the coordinates of the free joint.
+        It has diverged if a component of the acceleration (6,) is not finite, or if a component of the velocity (6,) is
+        NaN or reaches SPEED_LIMIT_MPS (linear) or RATE_LIMIT_RADPS (angular). Both are in the coordinates of the free
+        joint.
         """
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:

@@ -40,7 +40,8 @@ class MetricSummary(NamedTuple):
 class Sensitivity(NamedTuple):
     """Dependence of a metric on a key: rank correlation (NaN unless the key is a number), explained rank variance.
 
-    `explained` is the fraction of the variance of the metric's ranks; see `statistics.explained_variance`.
+    `explained` is the fraction of the variance of the metric's ranks that the key explains
+    (`statistics.explained_variance`).
     """
 
     key: str
@@ -127,7 +128,7 @@ class StudyAnalysis:
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the table has the metric, required or with a value (surrogate surveys have no contrast)."""
+        """Returns whether the metric is in the table, and is required or has a value (surrogates have no contrast)."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 

@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri
 
-from twin.scenario.model import Section
+from twin.scenario.model import Number, Section
 
 Array = NDArray[np.float64]
-Pair = tuple[float, float]
+Pair = tuple[Number, Number]
 Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 
 
@@ -23,7 +23,7 @@ class Distribution(Section):
     uniform: Pair | None = Field(default=None, description="[low, high]")
     log_uniform: Pair | None = Field(default=None, description="[low, high]; the logarithm is uniformly distributed")
     normal: Pair | None = Field(default=None, description="[mean, standard deviation]")
-    truncated_normal: tuple[float, float, float, float] | None = Field(
+    truncated_normal: tuple[Number, Number, Number, Number] | None = Field(
         default=None, description="[mean, standard deviation, low, high]"
     )
     choice: Values | None = Field(default=None, description="one of these values, with equal probability")

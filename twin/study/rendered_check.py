@@ -166,7 +166,7 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
 def _excess(values: Array, limit: float) -> Array:
     """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit.
 
-    Of the values equal to it, half are counted.
+    Of the values that are equal to the value itself, half are counted.
     """
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2

@@ -19,7 +19,7 @@ from twin.judge.require import more_is_better
 from twin.study.distribution import Distribution
 from twin.study.study_file import Study, TuningConfig
 
-NAME = "twin"  #: name of the Optuna study in the journal
+NAME = "twin"  #: name of the Optuna study of the first round in the journal
 ROUND_NUMBERS = 1_000_000  #: offset between the candidate numbers of successive rounds
 _EARLIER = "earlier_round"  # marks the trials that were added from earlier rounds
 

@@ -31,6 +31,8 @@ def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interva
 
     (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n)
 
+    Without trials, the proportion is NaN and the interval is 0 to 1.
+
     Args:
         successes: number of successes.
         n: number of trials, or effective number of trials.

@@ -84,8 +84,8 @@ class TuningConfig(Section):
         default=3,
         ge=0,
         le=1000,
-        description="rendered surveys of a plan, all of which must pass before it is recommended, if the search uses "
-        "the surrogate; 0: the recommended plan is not verified",
+        description="rendered surveys of a plan in each cell of the grids, all of which must pass before the plan is "
+        "recommended, if the search uses the surrogate; 0: the recommended plan is not verified",
     )
     plans: int = Field(
         default=3,

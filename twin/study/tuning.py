@@ -217,7 +217,7 @@ class Tuning:
         """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
 
         Repeats this until the cheapest confirmed plan has already passed verification, until no plan is confirmed, or
-        `config.plans` times.
+        `config.plans` times. If plans are not verified, it only determines the cheapest confirmed plan.
         """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()

@@ -161,7 +161,7 @@ def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[st
 
 
 def _rendered(verification: Verification) -> dict[str, Any]:
-    """Returns the rendered surveys of a plan as JSON values."""
+    """Returns the verdict and figures of the rendered surveys of a plan, with those of the surrogate, as JSON."""
     medians = {
         name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
         for name, (surrogate, rendered) in verification.medians.items()

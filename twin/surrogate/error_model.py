@@ -52,8 +52,10 @@ class DepthLaw(NamedTuple):
 
     One keyframe gives a depth from stereo, with the standard deviation of `sigma_px`. Each further one adds a depth
     from stereo and one from the motion between the keyframes. The shorter the distance B between consecutive keyframes,
-    the less each adds. With n keyframes, the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
-    g = gain B^2 / (B^2 + half_step^2).
+    the less each adds, except that the image noise of two keyframes is independent at any distance. With n keyframes,
+    the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
+    g = gain B^2 / (B^2 + half_step^2) + noise_gain s, and s is the fraction of the variance that the image noise
+    causes: (slope c)^2 / (floor_px^2 + (slope c)^2) at the Cramér-Rao bound c.
 
     Args:
         floor_px: standard deviation from one keyframe in noise-free images [px of disparity].
@@ -63,6 +65,8 @@ class DepthLaw(NamedTuple):
         common: fraction of the variance that all keyframes share.
         gain: information that each further keyframe adds, relative to the first one, if keyframes are far apart.
         half_step: distance between consecutive keyframes at which each adds half of `gain` [stereo baselines].
+        noise_gain: information that each further keyframe adds at any distance, relative to the first one, if image
+            noise causes the whole variance.
     """
 
     floor_px: float
@@ -71,6 +75,7 @@ class DepthLaw(NamedTuple):
     common: float
     gain: float
     half_step: float
+    noise_gain: float = 0.0
 
     def sigma_px(self, bound_px: Array | float, lamp_share: Array | float) -> Array:
         """Returns the standard deviation from one keyframe [px of disparity].
@@ -82,47 +87,59 @@ class DepthLaw(NamedTuple):
         lamp_factor = np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
         return np.hypot(self.floor_px, self.slope * np.asarray(bound_px)) * lamp_factor
 
-    def relative_variance(self, n_views: Array | float, step_baselines: Array | float) -> Array:
+    def noise_share(self, bound_px: Array | float) -> Array:
+        """Returns the fraction of the variance that the image noise causes, at a Cramér-Rao bound [px]."""
+        noise_px2 = np.square(self.slope * np.asarray(bound_px))
+        return noise_px2 / np.maximum(self.floor_px**2 + noise_px2, 1e-24)
+
+    def relative_variance(
+        self, n_views: Array | float, step_baselines: Array | float, bound_px: Array | float
+    ) -> Array:
         """Returns the variance after n keyframes, divided by that of one keyframe.
 
         Args:
             n_views: number of keyframes.
             step_baselines: distance between consecutive keyframes [stereo baselines].
+            bound_px: Cramér-Rao bound [px].
         """
         squared = np.square(step_baselines)
         gain = self.gain * squared / np.maximum(squared + self.half_step**2, 1e-12)
+        gain = gain + self.noise_gain * self.noise_share(bound_px)
         return self.common + (1 - self.common) / (1 + gain * (np.asarray(n_views) - 1))
 
 
 class ScatterLaw(NamedTuple):
-    """Standard deviation of a logarithm as a function of the Cramér-Rao bound c [px]: limit c / (c + half_px).
+    """Standard deviation of the logarithm of a precision: gain t c / (c + half_px).
+
+    c is the Cramér-Rao bound [px], t the standard deviation of its logarithm over the windows of dense matching
+    (`window_texture.WindowTexture.scatter`).
 
     Args:
-        limit: standard deviation for large bounds.
-        half_px: bound at which it is half the limit [px].
+        gain: standard deviation for large bounds, divided by t.
+        half_px: bound at which it is half of that [px].
     """
 
-    limit: float
+    gain: float
     half_px: float
 
-    def __call__(self, bound_px: Array | float) -> Array:
-        """Returns the standard deviation at a Cramér-Rao bound [px]."""
+    def __call__(self, bound_px: Array | float, texture_scatter: Array | float) -> Array:
+        """Returns the standard deviation at a Cramér-Rao bound c [px] and a scatter t of the texture."""
         bound = np.asarray(bound_px)
-        return self.limit * bound / np.maximum(bound + self.half_px, 1e-12)
+        return self.gain * np.asarray(texture_scatter) * bound / np.maximum(bound + self.half_px, 1e-12)
 
 
 class BinningFactors(NamedTuple):
-    """Factor on a standard deviation, or value of a scatter, where the estimators bin the images.
+    """Factor on a standard deviation where the estimators bin the images.
 
     Args:
-        by_2, by_4: factor or value for images that are binned by 2 and by 4.
+        by_2, by_4: factor for images that are binned by 2 and by 4.
     """
 
     by_2: float
     by_4: float
 
     def __call__(self, binning: int) -> float:
-        """Returns the factor or value for a binning of 2 or 4; 1 without binning."""
+        """Returns the factor for a binning of 2 or 4; 1 without binning."""
         return {1: 1.0, 2: self.by_2, 4: self.by_4}[binning]
 
 
@@ -198,8 +215,8 @@ class ErrorModel(NamedTuple):
             half of the points that could be matched between two keyframes are matched. The fraction is
             1 / (1 + (parallax / match_parallax_px)^2), because the patch then looks different from the two keyframes.
             Not fitted, because the surveys of the fit give contradictory values.
-        match_covariance_inflation: factor on the reported covariance of a link, in addition to the factor for
-            overlapping patches (`vision.overlap_inflation`).
+        match_covariance_inflation: factor on the reported covariance of a link, without the part due to the bias that
+            all points share, in addition to the factor for overlapping patches (`vision.overlap_inflation`).
         match_bias_fraction: correlation parameter r of the match error in the earlier stereo pair of a link. In units
             of its standard deviation, the error is r b + sqrt(1 - r^2) e, where b and e have unit variance, b is common
             to all links to that pair, and e is independent from link to link; `distance_growth` increases e only.
@@ -224,17 +241,17 @@ class ErrorModel(NamedTuple):
             deviation of one flow vector if the registration were estimated from c times as many flow vectors as a
             frame-to-frame motion, where c is the fraction of the field of view that the mosaic covers.
         mosaic_error_ratio: ratio of the true to the reported standard deviation of a registration.
-        depth_error: true standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
-        depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter, median over cells.
-        depth_cell_scatter: standard deviation, over the cells of a map with equal conditions, of the logarithm of the
-            reported standard deviation of depth: the depth filter measures how well each pixel is matched. The errors
+        depth_error: true standard deviation of a pixel's depth from the Kalman depth filter, median over cells, at the
+            bound of the median window (`Matchability.window_bounds_px`).
+        depth_sigma: reported standard deviation of a pixel's depth from the Kalman depth filter, likewise.
+        depth_texture_scatter: standard deviation, over the cells of a map with equal conditions, of the logarithm of
+            the reported standard deviation of depth: the depth filter measures how well each pixel is matched. Errors
             of a map are therefore a scale mixture: normal with the standard deviation of their cell, but with heavy
             tails over the whole map.
         error_scatter_share: ratio of the scatter over cells of the logarithm of the true standard deviation of depth to
-            that of the reported one (`depth_cell_scatter`); both vary together.
+            that of the reported one (`depth_texture_scatter`); both vary together.
         depth_binned_error: factor on the true standard deviation of depth [px of the binned images] due to binning.
         depth_binned_sigma: factor on the reported standard deviation of depth [px of the binned images] due to binning.
-        depth_binned_scatter: value of `depth_cell_scatter` for binned images; it hardly depends on the bound.
         depth_survey_scatter: standard deviation, over surveys, of the logarithm of the true and the reported standard
             deviation of depth about their laws, due to properties of floor and images that the model does not contain.
         depth_ratio_scatter: standard deviation, over surveys, of the logarithm of the ratio of the true to the reported
@@ -279,11 +296,10 @@ class ErrorModel(NamedTuple):
     mosaic_error_ratio: float = 2.0
     depth_error: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 4.0, 1.5)
     depth_sigma: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 3.0, 1.0)
-    depth_cell_scatter: ScatterLaw = ScatterLaw(0.0, 1.0)
+    depth_texture_scatter: ScatterLaw = ScatterLaw(0.0, 1.0)
     error_scatter_share: float = 1.0
     depth_binned_error: BinningFactors = BinningFactors(1.0, 1.0)
     depth_binned_sigma: BinningFactors = BinningFactors(1.0, 1.0)
-    depth_binned_scatter: BinningFactors = BinningFactors(0.0, 0.0)
     depth_survey_scatter: float = 0.0
     depth_ratio_scatter: float = 0.0
     border_error: BorderErrorLaw = BorderErrorLaw(0.0, 3.0)

@@ -48,6 +48,8 @@ _RENAMED = {
     "depth_excess": "depth_error",
     "depth_error_ratio": "depth_error",
     "depth_error_scatter": "depth_ratio_scatter",
+    "depth_cell_scatter": "depth_texture_scatter",
+    "depth_binned_scatter": "depth_texture_scatter",
     "lateral_px": "lateral_sigma_px",
     "complete": "map_completeness",
     "floor": "floor_px",
@@ -67,8 +69,9 @@ class FittedErrorModel:
         misfit: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted
             parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
         fitted_range: smallest and largest value of each quantity in these surveys, by name (names of
-            `coverage.QUANTITIES`). The largest Cramér-Rao bound is infinite if surveys with larger bounds were lost;
-            without an entry, the range of the bound is `ErrorModel.bound_range_px`.
+            `coverage.QUANTITIES`). The upper end of the Cramér-Rao bound is infinite if a survey with a larger
+            bound than all fitted ones lost too many frames or links to be fitted: surveys with still larger bounds are
+            expected to fail as well. Without an entry for the bound, its range is `ErrorModel.bound_range_px`.
     """
 
     model: ErrorModel
@@ -168,10 +171,11 @@ def _invalid(path: Path, problem: str) -> TwinError:
 
 
 def _value(name: str, given: Any) -> Any:
-    """Converts a TOML value to the type of the parameter `name`."""
+    """Converts a TOML value to the type of the parameter `name`; keys with a default may be missing."""
     kind = type(ErrorModel._field_defaults[name])
     if kind in _LAWS:
-        return kind(**{key: float(given[key]) for key in kind._fields})
+        keys = [key for key in kind._fields if key in given or key not in kind._field_defaults]
+        return kind(**{key: float(given[key]) for key in keys})
     return tuple(map(float, given)) if kind is tuple else float(given)
 
 

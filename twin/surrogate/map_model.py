@@ -20,6 +20,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from twin.core import geometry
 from twin.core.floor_rays import HeightField, cast_camera_ray
 from twin.core.geometry import Array
+from twin.core.map_slopes import map_slopes
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
@@ -35,8 +36,8 @@ _CORRELATED_WINDOWS = 1.5
 WALL_SLOPE = 1.0  #: rise over run of the least steep wall
 #: Errors near walls decrease with the number of keyframes to the power of minus this.
 EDGE_VIEWS_EXPONENT = 0.2
-#: Errors near walls are larger at the border of the images by this share, which decreases by 1 / e over 1 / 6 of their
-#: height. Measured over the horseshoe reef and fractal floors; see `edge_border_factor`.
+#: Errors near walls are larger at the border of the images by this share, which decreases by the factor 1 / e over
+#: 1 / 6 of the image height. Measured over the horseshoe reef and fractal floors; see `edge_border_factor`.
 EDGE_BORDER_SHARE, EDGE_BORDER_DECAY = 1.2, 6.0
 _LEAST_SLOPE = 0.1  # slope below which errors near walls do not decrease
 #: Law of a depth that more keyframes do not improve.
@@ -54,12 +55,13 @@ class CellErrors(NamedTuple):
             by all views of a cell; see `window_noise`.
         edge_noise: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of
             a cell; see `heavy_tailed`.
-        cell_noise: (rows, cols) standard normal samples of the precision of depth, shared by all views of a cell and
-            correlated over a window; see `cell_scatter`.
+        cell_noise: (rows, cols) standard normal samples of the logarithm of the standard deviation of depth, shared by
+            all views of a cell and correlated over a window; see `cell_scatter`.
         dropout: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which
             is multiplied by factors for the roughness and for the image border.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next four fields and `border_width_px` are tabulated [m].
+        depths_m: (m,) ascending depths at which the next four fields, `edge_error`, `border_width_px`,
+            `error_noise_share` and `sigma_noise_share` are tabulated [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
         cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
@@ -75,10 +77,14 @@ class CellErrors(NamedTuple):
         border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
         border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
         error_scatter_share: `ErrorModel.error_scatter_share`.
-        border_distances_px: (r,) ascending distances from the image border at which the next fields are tabulated.
+        border_distances_px: (r,) ascending distances from the image border at which the next three fields are
+            tabulated.
         border_error: (r,) factor on the true standard deviation of depth.
         border_sigma: (r,) factor on the reported standard deviation of depth.
         border_edge: (r,) factor on the error near walls; see `edge_border_factor`.
+        error_noise_share: (m,) fraction of the true variance of depth that image noise causes
+            (`DepthLaw.noise_share`).
+        sigma_noise_share: (m,) fraction of the reported variance of depth that image noise causes.
     """
 
     lateral_noise: Map
@@ -106,6 +112,8 @@ class CellErrors(NamedTuple):
     border_error: Array = np.ones(2)
     border_sigma: Array = np.ones(2)
     border_edge: Array = np.ones(2)
+    error_noise_share: Array = np.zeros(2)
+    sigma_noise_share: Array = np.zeros(2)
 
 
 class ObservedCells(NamedTuple):
@@ -163,8 +171,7 @@ class MapModel:
         view: ViewTable = IDEAL_TABLE,
     ):
         self.grid, self.height_m, self.seen, self._rig = grid, height_m, np.zeros(height_m.shape, np.bool_), rig
-        down, east = np.gradient(np.asarray(height_m, np.float64), grid.cell_m)
-        self._slope = np.stack([east, -down], axis=-1).astype(np.float32)
+        self._slope = np.stack(map_slopes(np.asarray(height_m, np.float64), grid.cell_m), axis=-1).astype(np.float32)
         self._lowest_m = float(np.nanmin(height_m))
         self.depth_m = depth_m
         self._floor, self._may_be_hidden = floor, _may_be_hidden(height_m, grid.cell_m)
@@ -428,11 +435,12 @@ def step_slope(height_m: Map, cell_m: float) -> Map:
 def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
 
-    It is the square root of r s, where no matching window shows a wall 0. The slope s of the cell counts because a
-    lateral displacement of the matched edge causes a height error on the face of the wall, and hardly any on level
-    floor beside it. r is the geometric mean of the roughness of the cell and of the largest roughness of the windows
-    that contain the cell: the error is large if the window of the cell shows two surfaces, or if the cell is matched as
-    its neighbours are. Dense matching resolves large structures better, hence the square root.
+    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell
+    counts because a lateral displacement of the matched edge causes a height error on the face of the wall, and hardly
+    any on the level floor next to the wall. r is the geometric mean of the roughness of the cell and of the largest
+    roughness of the windows that contain the cell: the error is large if the window of the cell shows two surfaces, or
+    if the cell is matched as its neighbours are. The square root is taken because dense matching resolves large
+    structures better.
 
     Args:
         roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
@@ -573,8 +581,10 @@ def _sample_patch(
             complete *= 1 - errors.border_share * np.exp(-border / _interpolate(errors.border_width_px, k, fraction))
             if errors.dropout[i, j] > complete:
                 continue
-            error_share = _relative_variance(errors.error_law, n_views, mean_step)
-            sigma_share = _relative_variance(errors.sigma_law, n_views, mean_step)
+            error_noise = _interpolate(errors.error_noise_share, k, fraction)
+            sigma_noise = _interpolate(errors.sigma_noise_share, k, fraction)
+            error_share = _relative_variance(errors.error_law, n_views, mean_step, error_noise)
+            sigma_share = _relative_variance(errors.sigma_law, n_views, mean_step, sigma_noise)
             # estimated position of the floor at this cell, and the height of its tangent plane at the cell's centre
             sx, sy = np.float64(slope[i, j, 0]), np.float64(slope[i, j, 1])
             x, z = west + (j + 0.5) * cell, np.float64(height[i, j])
@@ -625,10 +635,11 @@ def relief_error_px(rough_px, gain, limit_px):
 
 
 @njit(cache=True, nogil=True)
-def _relative_variance(law, n_views, step_baselines):
-    """Compiled form of `DepthLaw.relative_variance`."""
+def _relative_variance(law, n_views, step_baselines, noise_share):
+    """Compiled form of `DepthLaw.relative_variance`, with the result of `DepthLaw.noise_share`."""
     squared = step_baselines * step_baselines
     gain = law.gain * squared / (squared + law.half_step**2) if squared > 0 else 0.0
+    gain += law.noise_gain * noise_share
     return law.common + (1 - law.common) / (1 + gain * (n_views - 1))
 
 
@@ -636,7 +647,7 @@ def _relative_variance(law, n_views, step_baselines):
 def _interval(ascending, value):
     """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it.
 
-    For a value outside the table, it is the nearest end of the table.
+    A value outside the table is replaced by the nearest end of the table.
     """
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:

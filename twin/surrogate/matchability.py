@@ -40,6 +40,7 @@ from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
+from twin.surrogate.window_texture import WindowTexture, window_texture
 
 #: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
 #: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.
@@ -69,6 +70,7 @@ class Matchability:
         border_px: (r,) distances from the nearest border of the image at which the next field is tabulated [px of the
             binned images].
         bound_ratios: (r,) bound at these distances, divided by that of the whole image; see `bound_ratios`.
+        texture: distribution of the bound over the windows of dense matching, at the medium depth.
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
             baseline / depth].
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
@@ -89,6 +91,7 @@ class Matchability:
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
         self._set_image_scale(scenario, illumination, terrain)
         self.border_px, self.bound_ratios = bound_ratios(scenario, illumination, self.medium_depth_m, self.binning)
+        self.texture = texture_of_windows(scenario, illumination, terrain, self.medium_depth_m, self.binning)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
         self.lamp_share = lamp_share(scenario, illumination)
 
@@ -99,6 +102,11 @@ class Matchability:
         The medium depth is the geometric mean of the smallest and the largest depth.
         """
         return self.bound_at(self.medium_depth_m)
+
+    @property
+    def window_bounds_px(self) -> Array:
+        """Returns the bound (m,) of the median window of dense matching at `depths_m` [px of the binned images]."""
+        return self.bounds_px * self.texture.median_ratio
 
     @property
     def medium_depth_m(self) -> float:
@@ -224,7 +232,7 @@ def bound_ratios(
 
     The gradients of the texture are proportional to the light that the floor reflects, so the bound is proportional to
     the noise divided by this light. Both are averaged (RMS) over the pixels with nearly the same distance from the
-    nearest border of the image of a level floor of constant albedo. The ratio is 1 where no light returns.
+    nearest border of the image of a level floor of constant albedo. All ratios are 1 if the floor reflects no light.
 
     Args:
         scenario: description of the survey.
@@ -252,6 +260,32 @@ def bound_ratios(
     ratios = np.sqrt((noise2 + tiny) / np.maximum(signal2, tiny) / max(of_all, 1e-12))
     distances_px = (np.arange(_RINGS) + 0.5) * min(reflected.shape) / 2 / _RINGS
     return distances_px, ratios if signal2.sum() > tiny.sum() else np.ones(_RINGS)
+
+
+def texture_of_windows(
+    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depth_m: float, binning: int = 1
+) -> WindowTexture:
+    """Returns the distribution of the bound over the windows of dense matching, for a level floor; without snow.
+
+    Args:
+        scenario: description of the survey.
+        illumination: optical properties of the water, and daylight in the water.
+        terrain: true floor.
+        depth_m: depth of the floor along the optical axis.
+        binning: see `precision`.
+    """
+    clear = _without_unmodelled_effects(_with_linear_images(scenario))
+    rig = clear.believed_rig()
+    formation = ImageFormation(clear, illumination, None, np.random.default_rng(0))
+    texture, texel_m = _texture(clear, terrain, depth_m * rig.width_px / rig.focal_px)
+    albedo = _albedo(texture, texel_m, rig, depth_m)
+    depth, camera_pose = _level_floor(clear, depth_m)
+    radiance, smooth = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
+    gain = sensor_of(clear, rig).meter(radiance).gain
+    lit, untextured = (
+        matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning) for light in (radiance, smooth)
+    )
+    return window_texture(lit - untextured)
 
 
 def _border_distances(shape: tuple[int, ...]) -> Array:
@@ -373,8 +407,7 @@ def _untextured(albedo: Image) -> Image:
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns a floor texture and its texel size [m]: that of the photos or of the mesh of the floor, or else a
-    generated one.
+    """Returns the texture of the floor's photos or mesh, or else a generated one, and its texel size [m].
 
     Args:
         scenario: description of the survey.

@@ -1,9 +1,9 @@
 """Effect of marine snow on matching, from images of a level floor with and without snow.
 
-A flake changes the grey levels n of a patch with gradient g along the rows. Least-squares matching then shifts the
-patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its weight, 1 / variance, is
-smaller. A patch that flakes change too much is not matched: the correlation between its two images is too low. The
-image of a flake, its defocus and the light on it are those of `imaging.snow`.
+Let g be the gradient of a patch along the rows, and n the change of its grey levels by flakes. Least-squares matching
+shifts the patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its weight,
+1 / variance, is smaller. A patch that flakes change too much is not matched: the correlation between its two images is
+too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Simulated world without images; vehicle, navigation sensors and floor are modelled as in `RenderedWorld`.
+"""Simulated world without images; vehicle and navigation sensors are modelled as in `RenderedWorld`.
 
-One difference: beacons are projected with the believed calibration of the cameras.
+The floor has neither objects nor overhangs.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SurrogateWorld(World):
 
     Raises:
         ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
-            snow prevents all matches at a medium depth.
+            snow prevents all matches at `Matchability.medium_depth_m`.
     """
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, fitted: FittedErrorModel):
@@ -124,7 +124,7 @@ def _refusal(quantity: QuantityOutsideFit) -> TwinError:
 
 
 def _check_matches(mission: Mission, matchability: Matchability) -> None:
-    """Raises ScenarioError if marine snow prevents all matches at a medium depth."""
+    """Raises ScenarioError if marine snow prevents all matches at `Matchability.medium_depth_m`."""
     if math.isfinite(matchability.medium_bound_px):
         return
     error = TwinError(
@@ -148,7 +148,7 @@ def surrogate_vision(
         stopwatch: timer of the stages.
 
     Raises:
-        ScenarioError: marine snow prevents all matches at a medium depth.
+        ScenarioError: marine snow prevents all matches at `Matchability.medium_depth_m`.
     """
     scenario, terrain = mission.scenario, mission.terrain
     matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)

@@ -41,7 +41,7 @@ from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
-_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])  # tabulated distances from the image border, in widths of its law
+_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])  # tabulated distances from the border, in widths of `border_error`
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _CORNER_AREA_PX2 = 75.0  # smallest image area per detected corner, in rendered surveys
@@ -136,7 +136,7 @@ class SurrogateVision:
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
         last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after `restart_tracking`.
-        n_corners: number of points that can be matched in a keyframe without noise.
+        n_corners: number of points of a keyframe that the estimators try to match, see `corner_count`.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
@@ -510,31 +510,34 @@ class SurrogateVision:
         level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
         error_factor = float(np.exp(level + ratio)) * model.depth_binned_error(self.binning)
         sigma_factor = float(np.exp(level)) * model.depth_binned_sigma(self.binning)
-        depths_m, bounds_px = self.scene.matchability.depths_m, self.scene.matchability.bounds_px
-        binned_scatter = np.full(len(bounds_px), model.depth_binned_scatter(self.binning))
-        cell_scatter = model.depth_cell_scatter(bounds_px) if self.binning == 1 else binned_scatter
+        matchability = self.scene.matchability
+        bounds_px, window_px = matchability.bounds_px, matchability.window_bounds_px
         border_px, border_factors = self._border_factors(model)
         return CellErrors(
-            lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px, depths_m,
-            model.depth_error.sigma_px(bounds_px, self.lamp_share) * error_factor,
-            model.depth_sigma.sigma_px(bounds_px, self.lamp_share) * sigma_factor,
-            cell_scatter,
+            lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px,
+            matchability.depths_m,
+            model.depth_error.sigma_px(window_px, self.lamp_share) * error_factor,
+            model.depth_sigma.sigma_px(window_px, self.lamp_share) * sigma_factor,
+            model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
             np.array([model.map_completeness(b) for b in bounds_px]),
             model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
             np.array([model.edge_error(b) for b in bounds_px]), model.edge_sigma_gain, model.edge_half_px,
             model.border_holes.share, model.border_holes.width_px(bounds_px, self.lamp_share),
             model.error_scatter_share,
             border_px, *border_factors,
+            error_noise_share=model.depth_error.noise_share(window_px),
+            sigma_noise_share=model.depth_sigma.noise_share(window_px),
         )  # fmt: skip
 
     def _border_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
         """Returns distances (r,) from the border of the images [px], and the factors (r,) on standard deviations there.
 
-        The factors on the true and on the reported standard deviation of depth contain the light, which depends on the
-        position in the image (`Matchability.bound_ratios`), and the truncated matching windows at the border. The third
-        factor is that on the errors near walls.
+        The factors on the true and on the reported standard deviation of depth account for the light, which depends on
+        the position in the image (`Matchability.bound_ratios`), and for the truncated matching windows at the border.
+        The third factor is that on the errors near walls.
         """
-        scene, medium_px = self.scene.matchability, self.scene.matchability.medium_bound_px
+        scene = self.scene.matchability
+        medium_px = scene.medium_bound_px * scene.texture.median_ratio
         border_px = np.union1d(scene.border_px, model.border_error.width_px * _BORDER_STEPS)
         at_px = medium_px * np.interp(border_px, scene.border_px, scene.bound_ratios)
         laws = model.depth_error, model.depth_sigma

@@ -2,8 +2,8 @@
 
 During a rendered survey, every measurement is made in the images and is also sampled by the surrogate at the same true
 poses. Most statistics are ratios of the reported standard deviations (image measurement / surrogate), or errors
-relative to the truth, normalised by reported covariances. Image and surrogate measurements have the same geometry, so
-the ratios depend on the error model alone.
+relative to the truth, normalised by reported covariances. Image and surrogate measurements have the same geometry,
+which therefore cancels in the ratios.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from twin.surrogate.error_model import BinningFactors, BorderErrorLaw, DepthLaw,
 from twin.surrogate.map_model import WALL_SLOPE
 from twin.surrogate.vision import SurrogateVision
 
-_MIN_CELLS = 200  # a statistic of height errors needs at least this many cells, a fraction of holes a tenth
+_MIN_CELLS = 200  # smallest number of cells of a class; half as many near borders, a tenth for fractions of holes
 _STEEP_SLOPE = 0.6  # rise over run that level cells do not reach
 _VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells, and the end
 ROUGH_PX = 0.25  #: roughness that smooth and level cells do not reach [px]
@@ -61,8 +61,8 @@ class ComparisonVision:
 
     Attributes:
         statistics: samples by name. `..._sigma_ratio` is the ratio of the standard deviation reported for the image
-            measurement to the one that the surrogate reports. `..._nees...` is a squared error normalised by a reported
-            covariance, divided by the number of degrees of freedom.
+            measurement to the one that the surrogate reports. `..._nees...` is a squared error or difference,
+            normalised by a reported covariance and divided by the number of degrees of freedom.
     """
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
@@ -71,6 +71,8 @@ class ComparisonVision:
         self.runs_in_background = images.runs_in_background
         self.statistics: dict[str, list[float]] = defaultdict(list)
         self.statistics["lamp_share"] = [surrogate.lamp_share]
+        texture = surrogate.scene.matchability.texture
+        self.statistics["window_ratio"], self.statistics["texture_scatter"] = [texture.median_ratio], [texture.scatter]
         self._poses: dict[int, Array] = {}
         self._last_node = -1
         self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the chain's previous link
@@ -206,9 +208,8 @@ class ComparisonVision:
         none = model._replace(
             depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0,
             edge_error=SigmaLaw(0.0, 0.0), edge_sigma_gain=0.0, border_error=BorderErrorLaw(0.0, 1.0),
-            depth_cell_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0, depth_ratio_scatter=0.0,
+            depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0, depth_ratio_scatter=0.0,
             depth_binned_error=BinningFactors(1.0, 1.0), depth_binned_sigma=BinningFactors(1.0, 1.0),
-            depth_binned_scatter=BinningFactors(0.0, 0.0),
         )  # fmt: skip
         unit = _NONE._replace(floor_px=UNIT_PX)
         models = {
@@ -238,15 +239,17 @@ class ComparisonVision:
 
         The reported standard deviation varies from cell to cell, and the errors of a cell are normal with a standard
         deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
-        variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The variance of
-        errors is that of a cell with the median sigma. Near walls, where gross errors are the subject, it is the
-        square of the 90th percentile of the absolute errors, which a few outliers do not change.
+        variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The median error is
+        subtracted first. The variance of errors is that of a cell with the median sigma. Near walls, where gross errors
+        are the subject, it follows from the 90th percentile of the absolute errors, which a few outliers do not change.
+
         The third statistic is the ratio of the 90th percentile of absolute errors to the median, in the map from images
-        and in the map sampled with all errors; it exceeds that of normal errors if their standard deviation varies over
+        and in the map sampled with all errors. It exceeds that of normal errors if their standard deviation varies over
         the cells.
-        The fourth one is the scatter of ln(sigma) in the class, relative to a sampled map in which depth has the
-        same precision in all cells. The upper half of its distribution determines the largest errors, so it is taken
-        from the median and the 90th percentile.
+
+        The fourth statistic is the scatter of the logarithm of sigma in the map from images / sigma in a sampled map
+        whose depth has the same precision in all cells. The upper half of the distribution determines the largest
+        errors, so the scatter is computed from the median and the 90th percentile.
 
         Args:
             name: name of the class.
@@ -284,9 +287,9 @@ class ComparisonVision:
     def _compare_borders(self, maps: dict[str, ElevationMap]) -> None:
         """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map.
 
-        The cells are level ones, divided by their distance from the image border. `border_error_ratio` is the ratio of
-        the medians of the absolute errors, `border_sigma_ratio` that of the medians of the reported standard
-        deviations, `border_distance_px` the median distance of the cells.
+        The cells are those of little roughness with no wall within a matching window, divided by their distance from
+        the image border. `border_error_ratio` is the ratio of the medians of the absolute errors, `border_sigma_ratio`
+        that of the medians of the reported standard deviations, `border_distance_px` the median distance of the cells.
         """
         map_model = self.surrogate.scene.map_model
         images, sampled = maps["images"], maps["all"]
@@ -311,8 +314,8 @@ class ComparisonVision:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
 
         Level cells are divided by roughness and by the number of consecutive keyframes that observed them, cells near
-        walls by `edge_strength`. Other cells within a matching window of a wall or of rough cells, and cells near the
-        image border, belong to no class.
+        walls by `edge_strength`. Steep smooth cells are one class. Cells near the image border belong to no class, nor
+        do other cells within a matching window of a wall or of rough cells.
         """
         map_model = self.surrogate.scene.map_model
         rough = self._in_px(map_model.roughness_m)

@@ -1,9 +1,10 @@
 """Fit of the error model to the statistics of rendered surveys.
 
-The functions that model reported standard deviations (`SigmaLaw`) are fitted to the ratios of the standard deviations
-reported for image measurements to those reported by the surrogate. The error ratios are fitted to squared errors
-normalised by the reported covariance. Medians and trimmed means make the fit robust against a few failed measurements.
-Every survey has the same weight, except in the fits of `match_bias_fraction`, `edge_half_px` and the laws of depth.
+The laws of the reported standard deviations of matching, F2F and F2M (`SigmaLaw`) are fitted to the ratios of the
+standard deviations reported for image measurements to those reported by the surrogate. The error ratios are fitted to
+squared errors normalised by reported covariances. Medians and trimmed means make the fit robust against a few failed
+measurements. Every survey has the same weight, except in the fits of `match_bias_fraction`, `border_error`,
+`edge_half_px` and the laws of depth.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by 
 _PRIOR = 0.01  # weight of the relative departure of a parameter from its value in the compared model
 _HOLE_OUTLIER = 0.01  # residual of a fraction without a height beyond which a bin of cells has less weight
 _OUTLIER = 0.3  # residual of the logarithm of a standard deviation beyond which it has less weight
-_LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # statistics of cells without edges
+_LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # first parts of the names of the statistics of level cells
 _LEVEL_TAILS = ("map_tail_smooth", "map_tail_rough")
 _NORMAL_TAIL = 2.4387  # 90th percentile of the absolute value of a normal variable, divided by the median
 _FAR_PX = 20.0  # distance from the image border beyond which matching windows are complete
@@ -70,7 +71,6 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     )
     links = _fit_link_errors(surveys, median("match_sigma_ratio"), median("lamp_share"), compared)
     errors, reported = (_fit_map_variances(surveys, quantity, compared) for quantity in ("error", "sigma"))
-    cell_scatter, binned_scatter = _fit_cell_scatter(surveys, compared.depth_cell_scatter)
     completeness = _fit_completeness(surveys, compared.map_completeness)
     compared_fractions = np.array([compared.match_fraction(b) * compared.point_fraction(b) for b in bounds])
     match_fractions = _matched_without_relief(surveys) * compared_fractions / median("point_fraction")
@@ -95,9 +95,8 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         mosaic_sigma_px=mosaic_sigma_px,
         depth_error=errors.depth,
         depth_sigma=reported.depth,
-        depth_cell_scatter=cell_scatter,
+        depth_texture_scatter=_fit_texture_scatter(surveys, compared.depth_texture_scatter),
         error_scatter_share=_fit_error_scatter(surveys, compared.error_scatter_share),
-        depth_binned_scatter=binned_scatter,
         depth_binned_error=errors.binned,
         depth_binned_sigma=reported.binned,
         depth_survey_scatter=_robust_scatter(reported.departures),
@@ -213,15 +212,15 @@ def _fit_link_errors(
     """Separates link errors into contributions of patch matching, of relief and of a bias of each keyframe.
 
     Errors due to relief grow with the unevenness of the floor and with the distance between the keyframes. The links of
-    each survey are therefore sorted by distance and divided into thirds, and match error ratio, its growth under lamps
-    and relief gain are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
+    each survey are therefore sorted by distance and divided into thirds. Match error ratio, relief gain and the growth
+    of both under lamps are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
     logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain, so the gain
     of the compared model, but at least `RELIEF_GAIN`, is a weak prior.
 
     A keyframe's bias makes the errors of two consecutive links cancel partly, because the keyframe ends the first link
     and starts the second. Relief adds equal errors to both. The bias fraction is fitted to the scalar products of the
-    errors of consecutive links.
-    (Loops of three keyframes do not determine the bias, because links from the same keyframe have correlated errors.)
+    errors of consecutive links. Loops of three keyframes do not determine the bias, because links from the same
+    keyframe have correlated errors.
 
     Args:
         surveys: statistics of n surveys.
@@ -288,7 +287,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
     At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
     multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
-    1 + (growth * distance)^2 / 2. The distance is in units of the mean depth.
+    1 + (growth * distance)^2 / 2. The distance is that of `SurrogateVision.distance_in_depths`.
 
     Returns:
         Growth; and the ratio (n,) of the standard deviation reported for a survey's links from images to the one that
@@ -362,11 +361,12 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
 
 
 def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErrorLaw) -> BorderErrorLaw:
-    """Fits the `BorderErrorLaw` to errors and reported standard deviations of level cells near the image borders.
+    """Fits the `BorderErrorLaw` to errors and reported standard deviations of cells near the image borders.
 
-    They are divided by those of the map sampled from the compared model, and by the median of these ratios over the
-    cells of the survey farther than `_FAR_PX` from the border. Residuals are differences of logarithms; large ones have
-    less weight. The result is the compared law if no survey has cells near the border.
+    The data are the ratios of `border_error_ratio` and `border_sigma_ratio` (map from images / sampled map), relative
+    to the median of the ratios of the same survey farther than `_FAR_PX` from the border. Residuals are differences of
+    logarithms; large ones have less weight. The result is the compared law if no survey has cells both near the border
+    and far from it.
     """
     rows = []
     for s in surveys:
@@ -448,7 +448,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     tracks does not reduce it, and its variance follows from the height per pixel of disparity. The reported variances
     of the map with pose errors alone already contain the effects of a lateral shift and of relief.
 
-    Variances do not simply add up: the map computes part of its variance from the heights around a cell, whose errors
+    Variances do not add up: the map computes part of its variance from the heights around a cell, whose errors
     count as relief. The model variance is therefore multiplied by the ratio of the variance in the map sampled from
     the compared model to the model variance with the compared parameters. Repeated fits converge, each with the
     result of the former as compared model. Residuals are differences of logarithms. Surveys without binning have the
@@ -464,28 +464,30 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     for number, s in enumerate(surveys):
         classes = [name for name in s if name.startswith(f"map_{quantity}_")]
         rows += [s[name] for name in classes]
-        condition = float(np.median(s["bound_px"])), float(np.median(s["lamp_share"])), float(s["metres_per_px"][0])
+        bound = float(np.median(s["bound_px"]))
+        condition = bound, bound * s["window_ratio"][0], float(np.median(s["lamp_share"])), s["metres_per_px"][0]
         conditions += [condition] * len(classes)
         weights += [float(binning[number] == 1) / np.sqrt(max(len(classes), 1))] * len(classes)
         numbers += [number] * len(classes)
     images, pose, depth, lateral, edge, sampled, views, step, rough = np.array(rows).T
-    (bounds, lamps, metres_per_px), weight, is_error = np.array(conditions).T, np.array(weights), quantity == "error"
+    (bounds, windows, lamps, metres_per_px), weight = np.array(conditions).T, np.array(weights)
+    is_error = quantity == "error"
     of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
     per_px2 = of_depth / UNIT_PX**2
 
     def variance(x: np.ndarray) -> np.ndarray:
-        law = DepthLaw(*x[:6])
-        depth_px2 = law.sigma_px(bounds, lamps) ** 2 * law.relative_variance(views, step)
-        relief_px2 = relief_error_px(rough, x[7], x[8]) ** 2
-        common = metres_per_px**2 * relief_px2 + x[6] ** 2 * of_lateral if is_error else 0.0
-        return pose + per_px2 * depth_px2 + common + (x[9] ** 2 + (x[10] * bounds) ** 2) * of_edge
+        law = DepthLaw(*x[:7])
+        depth_px2 = law.sigma_px(windows, lamps) ** 2 * law.relative_variance(views, step, windows)
+        relief_px2 = relief_error_px(rough, x[8], x[9]) ** 2
+        common = metres_per_px**2 * relief_px2 + x[7] ** 2 * of_lateral if is_error else 0.0
+        return pose + per_px2 * depth_px2 + common + (x[10] ** 2 + (x[11] * bounds) ** 2) * of_edge
 
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
     gains = (compared.relief_error_gain, compared.relief_error_limit_px, *edge_law)
     law = compared.depth_error if is_error else compared.depth_sigma
-    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.01, 0.0, 0.0])
-    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 5.0, 3.0, 1.0, 10.0, 200.0 if is_error else 1e-6])
-    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 0.2, 0.5, 0.05, 1.0, 10.0])
+    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0])
+    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 10.0, 5.0, 3.0, 1.0, 10.0, 200.0 if is_error else 1e-6])
+    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 1.0, 0.2, 0.5, 0.05, 1.0, 10.0])
     margin = np.minimum(1e-3, (highest - lowest) / 4)
     start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + margin, highest - margin)
 
@@ -507,7 +509,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     departures -= np.select([by == 2, by == 4], factors, 0.0)
     x = found.x.tolist()
     binned_factors = BinningFactors(*np.exp(factors).tolist())
-    return _MapErrors(DepthLaw(*x[:6]), x[6], x[7], x[8], SigmaLaw(*x[9:]), departures, binned_factors)
+    return _MapErrors(DepthLaw(*x[:7]), x[7], x[8], x[9], SigmaLaw(*x[10:]), departures, binned_factors)
 
 
 def _robust_scatter(departures: np.ndarray) -> float:
@@ -515,33 +517,36 @@ def _robust_scatter(departures: np.ndarray) -> float:
     return float(_NORMAL_MAD * np.median(np.abs(departures)))
 
 
-def _fit_cell_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> tuple[ScatterLaw, BinningFactors]:
-    """Fits the `ScatterLaw` of the depth over the cells of a map, and returns it with the scatter of binned images.
+def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> ScatterLaw:
+    """Fits the `ScatterLaw` of the depth over the cells of a map; the law is the compared one if no map has cells.
 
-    The scatter of a survey is the median over its classes of cells without edges. The law is fitted to the surveys
-    without binning; it is the law of the compared model if there are none.
+    The scatter of a survey is the median over its classes of level cells. Residuals much larger than
+    `_OUTLIER` have less weight. Surveys with binned images take part: their bounds and textures are those of the binned
+    images.
+
+    Args:
+        surveys: statistics of n surveys.
+        compared: law of the compared model.
     """
     rows = [
-        (np.median(s["bound_px"]), s["binning"][0], np.median([s[name][0] for name in s if name.startswith(_LEVEL)]))
+        (np.median(s["bound_px"]), s["texture_scatter"][0], np.median([s[x][0] for x in s if x.startswith(_LEVEL)]))
         for s in surveys
         if any(name.startswith(_LEVEL) for name in s)
     ]
-    bounds, binning, scatters = np.array(rows).reshape(-1, 3).T
-    fine = binning == 1
+    if not rows:
+        return compared
+    bounds, textures, scatters = np.array(rows).T
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        return ScatterLaw(*x)(bounds[fine]) - scatters[fine]
+        return ScatterLaw(*x)(bounds, textures) - scatters
 
-    law = compared
-    if fine.any():
-        x = least_squares(residuals, [0.8, 0.04], bounds=([0.0, 1e-3], [2.0, 1.0]), loss="soft_l1", f_scale=0.1).x
-        law = ScatterLaw(*x.tolist())
-    binned = (float(np.median(scatters[binning == k])) if (binning == k).any() else 0.0 for k in (2, 4))
-    return law, BinningFactors(*binned)
+    limits = [0.0, 1e-3], [20.0, 1.0]
+    x = least_squares(residuals, [2.0, 0.02], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
+    return ScatterLaw(*x.tolist())
 
 
 def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> float:
-    """Fits `error_scatter_share` to the tails of the height errors of cells without edges.
+    """Fits `error_scatter_share` to the tails of the height errors of level cells.
 
     If the logarithm of the standard deviation of normal errors varies with the standard deviation s, the logarithm of
     the ratio of their 90th percentile to their median grows in proportion to s^2. The tail of a survey is the median

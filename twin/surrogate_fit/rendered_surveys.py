@@ -58,7 +58,7 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 def comparison_model(model: ErrorModel) -> ErrorModel:
     """Returns an error model whose fractions of matched points do not decrease with the Cramér-Rao bound.
 
-    Measurements in images of turbid water then have sampled ones too.
+    Image measurements in turbid water can then be compared with sampled measurements.
     """
     points, matches = (law._replace(half_px=_NEVER_PX) for law in (model.point_fraction, model.match_fraction))
     return model._replace(point_fraction=points, match_fraction=matches)
@@ -92,10 +92,7 @@ def _is_complete(statistics: SurveyStatistics) -> bool:
 
 
 def _is_lost(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey lost too many frames or links; its remaining links are mostly gross errors.
-
-    The status of such a survey is "degraded" or "aborted" (`self_check.MAX_LINKS_FAILED`).
-    """
+    """Returns whether a survey lost too many frames or links; its remaining links are mostly gross errors."""
     return any(float(np.mean(statistics.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed_images"))
 
 

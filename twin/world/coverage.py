@@ -22,14 +22,14 @@ class Coverage:
     """Observed cells of a grid.
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
-    left image, both cameras see these points, and there is no depth edge between them. With objects, the quad must also
-    reach the surface seen from above: floor that the cameras see below an overhang is not observed, as the map has the
-    height of the overhang there.
+    left image, both cameras see these points, and there is no depth edge between them. With `top_m`, the quad must also
+    reach that surface: floor that the cameras see below an overhang is not observed, as the map has the height of the
+    overhang there.
 
     Args:
         grid: grid of the map.
         rig: calibration of the cameras of the depth images.
-        top_m: (rows, cols) true height of the surface seen from above; None: a floor without objects.
+        top_m: (rows, cols) true height of the surface seen from above [m]; None: a height grid without objects.
 
     Attributes:
         seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrains import Terrain
 from twin.core.floor_rays import HeightField, cast_pixels, ray_grid
 from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
@@ -16,6 +17,7 @@ from twin.judge.overlap import KeyframePoses
 from twin.world.coverage import Coverage
 from twin.world.mission import Mission
 from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
+from twin.world.planned_surface import planned_surface
 
 #: Approximate number of columns of the depth images from which the coverage is computed, and largest number of grid
 #: cells along the longer side of the terrain.
@@ -34,11 +36,12 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class FloorForecast:
-    """Forecast for the n planned keyframes over the floor; NaN where an image shows no floor.
+    """Forecast for the n planned keyframes over the floor with its objects; NaN where an image shows no floor.
 
     There are k pairs of consecutive keyframes along the swaths, and j pairs across neighbouring swaths.
 
     Args:
+        surface: floor and objects as seen from above, see `planned_surface`; "floor" below refers to this surface.
         keyframes: planned poses of the keyframes.
         depth_m: (n, m) depth along the optical axis at m pixels on a regular grid [m].
         altitude_m: (n,) height of the camera above the floor straight below it [m].
@@ -53,6 +56,7 @@ class FloorForecast:
             of fewer pixels.
     """
 
+    surface: Terrain
     keyframes: KeyframePoses
     depth_m: Array
     altitude_m: Array
@@ -68,7 +72,7 @@ class FloorForecast:
 
 
 class PlannedOverlap(NamedTuple):
-    """Median overlap and sidelap of the planned keyframes, by ray casting on the floor; None without pairs."""
+    """Median overlap and sidelap of the planned keyframes, by ray casting on floor and objects; None without pairs."""
 
     along: float | None
     across: float | None
@@ -82,17 +86,18 @@ def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedO
         most_pairs: largest number of pairs that are evaluated along, and across, the swaths, chosen at equal intervals.
     """
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
-    pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(mission.terrain)
+    pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(planned_surface(mission))
     return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in pairs))
 
 
 def forecast_over_floor(mission: Mission) -> FloorForecast:
-    """Returns the forecast of a mission, computed by casting rays from the planned keyframes to the floor.
+    """Returns the forecast of a mission, computed by casting rays from the planned keyframes to floor and objects.
 
-    The cameras look straight down from the planned positions. Objects, lens distortion, the port and calibration errors
-    are neglected.
+    The cameras look straight down from the planned positions. Lens distortion, the port, calibration errors and the
+    space below overhangs are neglected.
     """
-    rig, field = mission.rig, floor_of(mission.terrain)
+    rig, surface = mission.rig, planned_surface(mission)
+    field = floor_of(surface)
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
     poses = keyframes.world_from_camera
     depth = cast_pixels(field, poses, rig, ray_grid(rig, RAY_COLUMNS))
@@ -101,9 +106,10 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
     x, y, z = keyframes.position_m.T
     along, across = planned_pairs(keyframes)
     return FloorForecast(
+        surface=surface,
         keyframes=keyframes,
         depth_m=depth,
-        altitude_m=z - mission.terrain.height_at(x, y),
+        altitude_m=z - surface.height_at(x, y),
         clearance_m=nearest,  # the optical axis is vertical
         footprint_m=median[:, None] * [rig.width_px / rig.fx_px, rig.height_px / rig.fy_px],
         gsd_m=median / rig.focal_px,

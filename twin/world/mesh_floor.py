@@ -29,7 +29,7 @@ from terrains.objects.floor_mesh import (
     upward_part,
 )
 from terrains.objects.mesh import Mesh, extent
-from terrains.objects.mesh_file import read_textured_mesh
+from terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from terrains.terrain import texture_shape
 from twin.core.records import Array, Image, MapGrid
 from twin.errors import TwinError
@@ -78,7 +78,7 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     t = scenario.terrain
     file = _mesh_file(t)
     y_up = t.mesh_up == "y" or (t.mesh_up is None and file.suffix.lower() == ".glb")
-    whole = divided(levelled(read_textured_mesh(file, FIELD, y_up), t.mesh_scale))
+    whole = _divided(levelled(read_textured_mesh(file, FIELD, y_up), t.mesh_scale), file)
     grid = _node_grid(whole.mesh, t.grid_m, file)
     top = -_depth([whole.mesh], grid, FROM_ABOVE)
     covered = np.isfinite(top)
@@ -110,6 +110,16 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
     roof = -_depth([downward_part(mesh) for mesh in meshes], grid, FROM_ABOVE)
     under = true_heights(grid, floor.under.height_at)
     return FloorSurface(np.where(np.isfinite(top), top, under), roof - low > OVERHANG_M)
+
+
+def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
+    """Returns a mesh without long edges; raises TwinError if this takes too many triangles, or it is too large."""
+    if not np.isfinite(extent(whole.mesh)).all():
+        raise TwinError(FIELD, f"{file.name!r} is too large", "a mesh that covers the planned area")
+    try:
+        return divided(whole)
+    except ValueError as error:
+        raise TwinError(FIELD, f"{file.name!r} {error}", "triangles of similar width and length") from None
 
 
 def _mesh_file(t: TerrainConfig) -> Path:
@@ -148,7 +158,8 @@ def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
     Args:
         meshes: meshes in world axes.
         grid: the grid.
-        axes: FROM_ABOVE, for the negative height of the highest surface, or FROM_BELOW, for that of the lowest.
+        axes: FROM_ABOVE, so that the depth is the negative height of the highest surface, or FROM_BELOW, so that it is
+            the height of the lowest surface.
     """
     depth = np.full((grid.rows, grid.cols), np.inf, np.float32)
     for mesh in meshes:

@@ -188,19 +188,20 @@ def prepare(scenario: Scenario) -> Mission:
     """Returns the mission of a scenario: loads its floor and objects, plans the survey, and checks all of them.
 
     Raises:
-        ScenarioError: the survey cannot be flown; the error lists every reason with file and line.
+        ScenarioError: the survey cannot be flown; the error lists every reason with file and line, or with its `--set`.
     """
     errors: list[str] = []
     source = scenario.source
     mesh_floor = None
     if scenario.terrain.kind == "mesh":
+        _attempt(lambda: _check_texture_keys(scenario.terrain), source, errors)
         mesh_floor = _attempt(lambda: load_mesh_floor(scenario), source, errors)
         terrain = mesh_floor and mesh_floor.terrain
     else:
         terrain = _attempt(lambda: load_terrain(scenario), source, errors)
     plan = _attempt(lambda: plan_survey(scenario, terrain), source, errors)
     _attempt(lambda: _check_plugins(scenario), source, errors)
-    _attempt(lambda: _check_speed(scenario), source, errors)
+    _attempt(lambda: _check_speed(scenario, plan), source, errors)
     _attempt(lambda: _check_current(scenario), source, errors)
     if (sensor := scenario.sensor) is not None:
         _attempt(lambda: _check_exposure(sensor), source, errors)
@@ -307,14 +308,19 @@ def _check_plugins(scenario: Scenario) -> None:
         raise TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
 
 
-def _check_speed(scenario: Scenario) -> None:
-    """Raises TwinError if `plan.speed_mps` exceeds the top speed: forwards or, for loops, in the slowest direction."""
+def _check_speed(scenario: Scenario, plan: SurveyPlan | None) -> None:
+    """Raises TwinError if the cruise speed exceeds the top speed: forwards or, for loops, in the slowest direction.
+
+    Args:
+        scenario: the vehicle, and `plan.speed_mps`.
+        plan: the planned survey, which is slower than `plan.speed_mps` on tight loops; None: it could not be planned.
+    """
     if scenario.vehicle.dynamics == "kinematic":
         return
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
     directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
     reach = min(top_speed_mps(scenario.vehicle, direction) for direction in directions)
-    if scenario.plan.speed_mps > reach:
+    if (scenario.plan.speed_mps if plan is None else plan.speed_mps) > reach:
         raise TwinError(
             "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
         )

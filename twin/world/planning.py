@@ -121,7 +121,7 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
 
     Raises:
-        TwinError: no spacing with scales of at least `_LEAST_SCALE` gives enough overlap.
+        TwinError: no spacing with scales of at least `_LEAST_SCALE` was found that gives enough overlap.
     """
     make = _PATTERNS[pattern]
     whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request

@@ -25,7 +25,7 @@ class TopSurface(NamedTuple):
     """Surface as seen from above; all arrays are (rows, cols).
 
     Args:
-        height_m: float32, height of the highest surface.
+        height_m: float32, height of the highest surface [m].
         objects: uint16, 1 + number (from 0) of the object at the top; 0: the floor.
         overhung: bool, whether the floor is hidden below an object with a gap of more than OVERHANG_M.
     """
@@ -40,7 +40,7 @@ def top_surface(grid: MapGrid, floor_m: NDArray[np.float32], objects: Sequence[P
 
     Args:
         grid: grid of the map.
-        floor_m: (rows, cols) height of the floor at the cell centres.
+        floor_m: (rows, cols) height of the floor at the cell centres [m].
         objects: the objects; at most 65,535.
     """
     surface = TopSurface(floor_m.copy(), np.zeros(floor_m.shape, np.uint16), np.zeros(floor_m.shape, np.bool_))

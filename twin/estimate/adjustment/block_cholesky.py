@@ -10,7 +10,8 @@ Blocks of the inverse are computed from the last panel to the first (Takahashi e
 cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold blocks of the inverse, among them
 cov(below), in place of the factor.
 
-In the kernels, s is the `SymbolicFactor`, p a panel and `_D` the size of a block.
+In the kernels, s is the `SymbolicFactor`, `panels` the array of `CholeskyFactor`, p a panel and `_D` the size of a
+block.
 """
 
 from __future__ import annotations
@@ -157,6 +158,7 @@ def _factorise(s, original, panels):
     Returns False if the matrix is not numerically positive definite.
 
     Args:
+        s, panels: see the module.
         original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.
     """
     for p in range(len(s.panel_start) - 1):
@@ -215,7 +217,9 @@ def _next_ancestor(s, positions, start):
     """Finds the panel that holds positions[start], and where all remaining positions are stored in that panel.
 
     Args:
+        s: see the module.
         positions: (m,) positions below a panel, ascending.
+        start: index of the first remaining position.
 
     Returns:
         end: positions[start:end] are the panel's own positions; later ones are below the panel.
@@ -243,6 +247,7 @@ def _subtract(product, at, panel):
     Args:
         product: (6 m, 6 w), m x w blocks.
         at: (m,) block rows in the panel; the first w are also the block columns.
+        panel: matrix of the panel, changed in place.
     """
     for b in range(len(at)):
         for a in range(min(b + 1, product.shape[1] // _D)):
@@ -268,6 +273,7 @@ def _invert(s, panels, diagonal):
     """Replaces the factor by the blocks of the inverse with the same sparsity pattern.
 
     Args:
+        s, panels: see the module.
         diagonal: (n, 6, 6), filled with the diagonal blocks of the inverse, in elimination order.
     """
     for p in range(len(s.panel_start) - 2, -1, -1):
@@ -294,7 +300,7 @@ def _invert(s, panels, diagonal):
 
 @njit(cache=True, nogil=True)
 def _solve_in_place(s, panels, x):
-    """Solves for a right-hand side x (6 n,) in elimination order, and overwrites x with the solution."""
+    """Solves the factorised linear system; the right-hand side x (6 n,), in elimination order, becomes the solution."""
     for p in range(len(s.panel_start) - 1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)

@@ -1,8 +1,8 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
 The elimination order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree
-whose columns have nearly the same sparsity pattern below the diagonal form a supernode; they are renumbered to be
-consecutive, and their columns are stored as one dense matrix, a panel.
+whose columns have nearly the same sparsity pattern below the diagonal form a supernode. The nodes of a supernode are
+renumbered to be consecutive, and their columns are stored as one dense matrix, a panel.
 """
 
 from __future__ import annotations

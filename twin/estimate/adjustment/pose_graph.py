@@ -170,7 +170,10 @@ class Solution(NamedTuple):
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
-    """Returns the solution at the local minimum of the cost that the iteration reaches from `start`.
+    """Returns the solution that the iteration reaches from `start`.
+
+    The method is Gauss-Newton with Levenberg-Marquardt damping. The solution is a local minimum of the cost, unless
+    `max_iterations` is reached first.
 
     Args:
         graph: factors of the graph.
@@ -350,8 +353,9 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
     """Adds the mixed second derivatives of binary factors (poses and shared parameter) to the border (n, 6).
 
     Args:
-        first, second, by_j, i_from_j: see `_add_binary`.
+        first, second, by_j: see `_add_binary`.
         weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
+        i_from_j: (m, 4, 4) poses of j in i.
         border: (n, 6), changed in place.
     """
     for m in range(len(first)):

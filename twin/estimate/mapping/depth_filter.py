@@ -227,8 +227,8 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
 
-    The gradient of inverse depth is set to zero across a depth discontinuity, beside an unknown pixel and at the image
-    border.
+    The gradient of inverse depth is set to zero across a depth discontinuity, next to an unknown pixel and at the
+    image border.
     """
     height, width = depth.shape
     z = depth[v, u]

@@ -155,7 +155,12 @@ def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
 
 
 def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
-    """Returns the numbers of the images whose bounding boxes (n, 4), see `footprint`, overlap a part of the grid."""
+    """Returns the indices of the images whose footprints overlap a part of the grid.
+
+    Args:
+        boxes: (n, 4) bounding boxes of the footprints, see `footprint`.
+        part: the part of the grid.
+    """
     west, south, east, north = boxes.T
     east_m, south_m = part.west_m + part.cols * part.cell_m, part.north_m - part.rows * part.cell_m
     return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))

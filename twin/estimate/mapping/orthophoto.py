@@ -65,9 +65,9 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
     """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is the box around the parts of the four corner rays between the highest and the lowest floor; if the camera is
-    lower than the highest floor, they begin at the camera. The box is infinite if the camera is not above the lowest
-    floor, or if a corner ray does not point downwards.
+    It is the box around the parts of the four corner rays between the highest and the lowest floor. If the camera is
+    lower than the highest floor, these parts begin at the camera. The box is infinite if the camera is not above the
+    lowest floor, or if a corner ray does not point downwards.
 
     Args:
         world_from_camera: (4, 4) pose of the camera.

@@ -92,7 +92,7 @@ class DvlIntegrator:
             number: number of the current node.
 
         Returns:
-            The displacement, or None if a reading was missing since the last node.
+            The displacement, or None if a reading is missing, at the last node or since.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]

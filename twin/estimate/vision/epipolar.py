@@ -60,7 +60,7 @@ class Refinement(NamedTuple):
     """Result of `refine`.
 
     Args:
-        disparity_px: (H, W) refined disparity [px]; NaN where the refinement failed.
+        disparity_px: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed.
         sigma_px: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard
             deviation `PRIOR_PX` [px].
         gain: (H, W) fraction of an error of the disparity that the last iteration removes: 1 on texture, 0 without
@@ -135,7 +135,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         fitted, unit_variance, gain, mean_square = fit
         sigma = np.sqrt(unit_variance * np.maximum(mean_square, noise))
         window_px = _choose_window_sigma(_measurement_sigma(sigma, gain), fitted, window_px)
-    known = (fitted > UNKNOWN_PX) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
+    known = (fitted >= 0) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
     return Refinement(
         np.where(known, fitted, np.nan).astype(np.float32),
         np.where(known, sigma, np.nan).astype(np.float32),
@@ -148,7 +148,7 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
     """Returns the standard deviation (H, W) of a disparity from the measurement alone, sigma / gain.
 
-    Where there is little texture, it is too large, because `sigma` includes the error due to the prior.
+    Where there is little texture, the result is too large, because `sigma` includes the error due to the prior.
 
     Args:
         sigma, gain: `Refinement.sigma_px`, which includes the prior, and `Refinement.gain`.
@@ -198,7 +198,7 @@ def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
 
 
 def _mean(image: Map) -> Map:
-    """Returns the local mean (H, W) of an image over the window in which brightness and contrast are matched."""
+    """Returns the mean (H, W) of an image over a square of `BALANCE_PX` pixels around each pixel."""
     return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 

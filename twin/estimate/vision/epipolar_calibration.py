@@ -32,10 +32,10 @@ from twin.estimate.vision.stereo import StereoPoints
 
 #: Which of pitch, yaw, roll and row offset are removed from the right images.
 CORRECTED = np.array([True, False, True, True])
-#: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times a poor calibration's errors.
+#: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times those of a poor calibration.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
-_SIGNIFICANT = 4.0  # the correction is updated if it changes a row at a corner by more than this many sigma ...
-NOTICEABLE_PX = 0.02  # ... and by more than this
+_SIGNIFICANT = 4.0  # smallest change of a row by an update of the correction [standard deviations]
+NOTICEABLE_PX = 0.02  #: smallest change of a row by an update of the correction [px]
 _HUBER = 1.5
 _ITERATIONS = 5
 _MAD_TO_SIGMA = 1.4826

@@ -1,6 +1,6 @@
 """Choice of the image scale: pixels are binned if texture is so coarse that many corners are detected in noise.
 
-Over a floor with texels of 7.6 cm (12 pixels wide, with twice the contrast of the noise), only 35 to 60 % of the
+Over a floor with texels of 7.6 cm (12 pixels wide, with a contrast of twice the noise), only 35 to 60 % of the
 corners of the full left image are matched in the right image: the other corners are noise, and F2F tracking fails
 within 18 s. With pixels binned by 2 or 4, 88 to 96 % are matched and the survey succeeds. Over floors with fine
 texture, 95 to 99 % are matched without binning. Larger patches alone do not help, because the same noise corners are

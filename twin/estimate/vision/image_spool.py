@@ -123,6 +123,10 @@ class ImageSpool:
         return self.folder / f"{row:06d}_{side}.png"
 
     def _read(self, row: int, side: str) -> NDArray[np.uint8]:
-        """Returns an image (height, width, 3) RGB from disk."""
-        data = np.fromfile(self._path(row, side), np.uint8)
-        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), np.uint8)
+        """Returns an image (height, width, 3) RGB from disk; raises OSError if it is missing or damaged."""
+        path = self._path(row, side)
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
+        if image is None:
+            raise OSError(f"{path} is damaged: it is not a readable PNG")
+        return np.asarray(image, np.uint8)

@@ -1,13 +1,15 @@
 """Light pattern of the cameras: the smooth part of the images that lamps and backscatter fix to the cameras.
 
-It does not move with the floor. In turbid water its gradient exceeds that of the texture of the floor, above all where
-the light of the lamps ends, and a matcher that takes it for texture finds the disparity of the pattern. It is estimated
-from the images of many keyframes, which share it, and subtracted before dense matching.
+The pattern moves with the cameras, not with the floor. In turbid water its gradient exceeds that of the texture of the
+floor, above all where the light of the lamps ends. A matcher that takes the pattern for texture finds the disparity of
+the pattern. The pattern is therefore estimated from the images of many keyframes and subtracted before dense matching,
+unless the texture dominates the pattern.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -32,37 +34,62 @@ class LightPattern(NamedTuple):
     right: Map
 
 
-def light_pattern(pairs: Iterable[tuple[Map, Map]]) -> LightPattern | None:
-    """Returns the light pattern of a survey; None for fewer than two stereo pairs.
-
-    A product of Legendre polynomials is fitted to each image. A coefficient of the pattern is its mean m over the n
-    images, multiplied by max(0, 1 - v / m^2), the positive-part estimator of James & Stein (1961), with v the variance
-    of the mean. Coefficients that vary between the images as much as their mean, because texture and relief cause them,
-    are therefore left in the images. Images of neighbouring keyframes overlap, so v = s^2 / n (1 + r) / (1 - r), with
-    s^2 the variance of the coefficient over the images and r the correlation of consecutive images, as in a first-order
-    autoregressive process.
+def pattern_fit(pair: tuple[Map, Map]) -> Array:
+    """Returns the coefficients (2, `DEGREE` + 1, `DEGREE` + 1) of Legendre polynomials fitted to each image of a pair.
 
     Args:
-        pairs: (H, W) float32 grey levels of the left and the right image of keyframes, in their order.
+        pair: (H, W) float32 grey levels of the left and the right image.
     """
-    fits, shape = [], (0, 0)
-    for pair in pairs:
-        shape = pair[0].shape
-        rows, columns = (np.linalg.pinv(_polynomials(n)) for n in shape)
-        fits.append([rows @ image.astype(np.float64) @ columns.T for image in pair])
+    rows, columns = (_fitting_matrix(n) for n in pair[0].shape)
+    return np.array([rows @ image.astype(np.float64) @ columns.T for image in pair])
+
+
+def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern | None:
+    """Returns the light pattern of a survey; None if it is not needed or not known.
+
+    A coefficient of the pattern is its mean m over the n keyframes, multiplied by max(0, 1 - v / m^2), a shrinkage as
+    in the positive-part estimator of James & Stein (1961), with v the variance of the mean. A coefficient whose mean
+    does not exceed the standard deviation of this mean is due to texture and relief and is therefore left in the
+    images. Images of neighbouring keyframes overlap, so v = s^2 / n (1 + r) / (1 - r), with s^2 the variance of the
+    coefficient over the keyframes and r the correlation of consecutive keyframes, as in a first-order autoregressive
+    process.
+
+    The pattern misleads the matching only where it dominates the texture. The result is therefore None if the sum of
+    m^2 over all coefficients, except the mean grey levels, does not exceed the sum of s^2: an image then varies more by
+    the floor in view than by the light of the cameras, and the mean over the keyframes may be that of a part of the
+    floor which most of them show. The result is also None for fewer than two keyframes.
+
+    Args:
+        fits: coefficients of the keyframes (`pattern_fit`), in their order.
+        shape: height and width (H, W) of the images [px].
+    """
     if len(fits) < 2:
         return None
     coefficients = np.array(fits)
     mean, deviation = coefficients.mean(axis=0), coefficients - coefficients.mean(axis=0)
-    variance = deviation.var(axis=0, ddof=1) * _images_per_independent_image(deviation) / len(fits)
+    scatter = deviation.var(axis=0, ddof=1)
+    if _power_without_mean(mean**2) <= _power_without_mean(scatter):
+        return None
+    variance = scatter * _images_per_independent_image(deviation) / len(fits)
     kept = np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean
     left, right = (_polynomials(shape[0]) @ side @ _polynomials(shape[1]).T for side in kept)
     return LightPattern(left.astype(np.float32), right.astype(np.float32))
 
 
+def _power_without_mean(squares: Array) -> float:
+    """Returns the sum of squared coefficients (2, d, d) without those of the constant polynomial."""
+    return float(squares.sum() - squares[:, 0, 0].sum())
+
+
 def _polynomials(n: int) -> Array:
     """Returns the Legendre polynomials (n, `DEGREE` + 1) at n pixels."""
     return np.asarray(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), DEGREE), np.float64)
+
+
+@lru_cache(maxsize=8)
+def _fitting_matrix(n: int) -> Array:
+    """Returns the pseudo-inverse (`DEGREE` + 1, n) of the polynomials at n pixels."""
+    return np.asarray(np.linalg.pinv(_polynomials(n)), np.float64)
 
 
 def _images_per_independent_image(deviation: Array) -> float:

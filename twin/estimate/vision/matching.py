@@ -83,7 +83,7 @@ def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """Returns the image (height, width, ...) with squares of `by` x `by` pixels averaged to one; they must tile it."""
+    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged; they must tile the image."""
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)

@@ -170,7 +170,7 @@ class Mosaic:
 
 
 def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the magnitude of the brightness gradient [grey levels per cell]; zero where a neighbour is unknown."""
+    """Returns the magnitude of the brightness gradient [grey levels per cell]; 0 where it is not known."""
     strength = np.zeros_like(bright)
     across, along = bright[1:-1, 2:] - bright[1:-1, :-2], bright[2:, 1:-1] - bright[:-2, 1:-1]
     known = height[1:-1, 2:] + height[1:-1, :-2] + height[2:, 1:-1] + height[:-2, 1:-1] + height[1:-1, 1:-1]

@@ -14,8 +14,8 @@ Systematic errors of patch matching, measured against the simulated truth, and t
   B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
   (`matching.gray`).
 - Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, which cuts off its
-  window, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 mrad relative to the next.
-  Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
+  window, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 to 0.6 mrad relative to the
+  next. Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
 
 Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
 fine, with cubic B-spline interpolation (Unser 1999).
@@ -141,7 +141,7 @@ def match_templates(
         centres, correlation, cov = _match(energy, gradient, nuisance, target[level], start, warp, half, tolerance)
         matched = correlation > _MIN_CORRELATION
         shift = centres * scale - offset - points
-        if level and matched.any():  # unmatched patches, e.g. those cut off by the border, probably have the same shift
+        if level and matched.any():  # unmatched patches, e.g. those cut off by the border, get the median shift
             shift[~matched] = np.median(shift[matched], axis=0)
             matched[:] = True
         points[matched] += shift[matched]
@@ -312,8 +312,7 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
     """Matches patches at one pyramid level.
 
     Returns:
-        Positions (n, 2), correlations (n,) and covariances (n, 2, 2). Where matching failed, they are the guess, -1 and
-        zero.
+        Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zero where matching failed.
     """
     n = (2 * half + 1) ** 2
     height, width = spline.shape

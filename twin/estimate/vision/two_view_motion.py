@@ -167,8 +167,8 @@ def pair_motion(
     model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). Residuals have Huber weights.
 
     If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
-    estimated without it: over a level floor all points have nearly the same phase, and an amplitude of 1 / (2 pi) px
-    would then explain the noise of all measurements.
+    estimated without it. This happens over a level floor, where all points have nearly the same sub-pixel position: a
+    sine of amplitude 1 / (2 pi) px, whose slope is 1, then explains the noise of all measurements.
 
     Args:
         measured: points in the earlier pair a and the later pair b.
@@ -267,7 +267,7 @@ def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
 
 
 def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -> DisparityOffset | None:
-    """Returns the offset of all disparities, estimated together with the motion by one more Gauss-Newton step.
+    """Returns the offset of all disparities, as an additional unknown of the last Gauss-Newton step.
 
     The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
     unit vector along the disparity. None if disparity is not measured in both pairs, or if it cannot be estimated.

@@ -26,9 +26,9 @@ def coarse_motion(
     """Returns the pose (4, 4) of a node in the left camera of another one; None if too few features agree.
 
     SIFT features (Lowe 2004) of the left images are matched by their descriptors. The features of the node get their
-    depth from the nearest matched stereo point within a patch. The pose follows from the points and their pixels in
-    the other image (perspective-n-point with RANSAC). It is accurate to a pixel or two: a prediction, not a
-    measurement.
+    depth from the nearest matched stereo point within a patch side. The pose follows from the points and their pixels
+    in the other image (perspective-n-point with RANSAC). The error of the pose displaces points by one or two pixels,
+    so the pose serves as a prediction for the measurement of a link.
 
     Args:
         node, other: (H, W) grey levels of the left images.

@@ -133,8 +133,8 @@ class PixelLight:
 
     Args:
         sums: (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `walk.walk`.
-        bin_edges_px: (n,) lower edges of the bins of blurred light: distance from the pixel to the image that its point
-            of the floor would have without scattering.
+        bin_edges_px: (n,) lower edges of the bins of blurred light: distance between the pixel and the unscattered
+            image of the point of the floor from which the light came.
     """
 
     sums: Array

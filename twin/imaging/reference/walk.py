@@ -42,7 +42,7 @@ GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that ar
 UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
 #: Kinds of vertices. As an argument, an `int` constant would make numba compile each function once for each value.
 ON_FLOOR, IN_WATER = np.int64(0), np.int64(1)
-WEAK, STEPS = 0.002, 10000  # weight relative to the first below which the roulette starts; most vertices of a walk
+WEAK, STEPS = 0.002, 10000  # weight relative to the first below which roulette starts; largest number of vertices
 
 
 @njit(cache=True, nogil=True)
@@ -60,7 +60,7 @@ def beam_at(beam, cosine):
 
 @njit(cache=True, nogil=True)
 def response(scene, kind, normal, direction, ox, oy, oz):
-    """Returns the scattering function of a vertex for light from a direction, back along the path [1/sr].
+    """Returns the share of the light from a direction that a vertex sends back along the path, per solid angle [1/sr].
 
     Args:
         kind: ON_FLOOR (albedo / pi times the cosine) or IN_WATER (phase function).

@@ -1,0 +1,49 @@
+"""Distribution of the texture over the windows of dense matching.
+
+The Cramér-Rao bound of an image contains the RMS gradient of the whole image (`matchability`). Dense matching fits a
+plane of disparities in a small Gaussian window, so the bound of a pixel contains the RMS gradient g in that window:
+it is the bound of the image times G / g, with the RMS gradient G of the image. Over even texture, such as sand, g is
+nearly the same in all windows. Over reefs, dark patches without texture and bright edges differ by several times.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+WINDOW_PX = 5  #: side of the windows, with about the area of the Gaussian window of `estimate.vision.epipolar`
+_WEAKEST = 0.05  # smallest RMS gradient of a window that is counted, relative to that of the image
+
+
+class WindowTexture(NamedTuple):
+    """Distribution over windows of the Cramér-Rao bound of matching in one window.
+
+    Args:
+        median_ratio: bound of the median window, divided by that of the RMS gradient of the image.
+        scatter: standard deviation over windows of the logarithm of the bound.
+    """
+
+    median_ratio: float
+    scatter: float
+
+
+EVEN_TEXTURE = WindowTexture(1.0, 0.0)
+
+
+def window_texture(signal: NDArray[np.floating]) -> WindowTexture:
+    """Returns the distribution of the bound over the windows of an image; `EVEN_TEXTURE` for an image without texture.
+
+    Args:
+        signal: (rows, cols) grey levels of the part of the image that the texture causes, without noise.
+    """
+    squares = np.diff(signal.astype(np.float64), axis=1) ** 2
+    whole = float(np.sqrt(squares.mean()))
+    inner = WINDOW_PX // 2
+    means = cv2.blur(squares, (WINDOW_PX, WINDOW_PX))[inner:-inner, inner:-inner]
+    if whole == 0 or not means.size:
+        return EVEN_TEXTURE
+    relative = np.maximum(np.sqrt(means) / whole, _WEAKEST)
+    return WindowTexture(1 / float(np.median(relative)), float(np.std(np.log(relative))))
