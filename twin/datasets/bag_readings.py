@@ -178,7 +178,7 @@ def _place(bag: Bag, topic: str, k: int) -> str:
 
 
 def _height(message: Any, _: str) -> tuple[Array, Array]:
-    """Returns the height (1,) above the level of zero pressure [m] and its variance (1,) of a message FluidPressure."""
+    """Returns height above the level of zero pressure [m] and variance, each (1,), of a FluidPressure message."""
     variance = np.array([message.variance]) / PASCAL_PER_METRE**2
     return -np.array([message.fluid_pressure]) / PASCAL_PER_METRE, variance
 

@@ -1,4 +1,7 @@
-"""Connectivity of a pose graph: warns of nodes without an edge, nodes without a vertex, and separate components."""
+"""Connectivity of a pose graph file.
+
+The warnings are on vertices without an edge, edges to nodes that no line of the file defines, and separate components.
+"""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ class _Magnification(NamedTuple):
 
 
 def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
-    """Returns the taps of lateral colour."""
+    """Returns the interpolation that magnifies the red and the blue band relative to the green one (lateral colour)."""
     red, blue = lens.lateral_colour
     scales = 1 + np.array([red, 0.0, blue])
     first, across = _taps_of(rig.width_px, rig.cx_px, scales)

@@ -75,7 +75,7 @@ def _fill_rounded_from(source, positions, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _row_memory(n):
-    """Returns working memory for a row of n pixels: columns and rows (n,), `weights` and `cells` of `spline_row`."""
+    """Returns uninitialised source columns and rows (n,) of n output pixels, `weights` and `cells` of `spline_row`."""
     x, y = np.empty(n, np.float32), np.empty(n, np.float32)
     return x, y, np.empty((8, n), np.float32), np.empty(n, np.int32)
 

@@ -92,9 +92,9 @@ class Shadows:
 
 
 def direction_to_casting_sun(daylight: Daylight) -> Array | None:
-    """Returns the unit direction (3,) to the sun under water, in world axes; None if it casts no shadow.
+    """Returns the unit direction (3,) to the sun under water, in world axes; None without daylight.
 
-    There is no shadow without daylight, and a sun in the zenith is assumed to cast none.
+    It is also None for a sun at the zenith, which is assumed to cast no shadow.
     """
     slanted = daylight.surface_lx.any() and daylight.source.sun_cosine < 1
     return np.array(daylight.source.to_sun) if slanted else None

@@ -73,7 +73,7 @@ def true_size(item: TankObject) -> Size:
 
 
 def window_around(item: TankObject, height_m: Array, grid: MapGrid) -> Window:
-    """Returns the part of a map around an object, with heights above the median of its outer border."""
+    """Returns the part of a map around an object; heights are relative to the median height of the outer border."""
     x, y = (axis - c for axis, c in zip(grid.centres(), item.centre_m, strict=True))
     inside = [np.abs(axis) <= side / 2 + MARGIN_M for axis, side in zip((x, y), item.size_m, strict=False)]
     part = height_m[np.ix_(inside[1], inside[0])].astype(np.float64)

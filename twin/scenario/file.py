@@ -399,7 +399,10 @@ _ALLOWED = {
 
 
 def shown(text: str, longest: int = 200) -> str:
-    """Returns a string for an error message, shortened if it has more than `longest` characters."""
+    """Returns the text for an error message.
+
+    Of a text with more than `longest` characters, the first half of `longest` is shown with the length of the text.
+    """
     return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
 
 

@@ -75,7 +75,7 @@ class MissionActions:
 
     @property
     def times(self) -> ActionTimes:
-        """Returns the total times that the vehicle was slowed and stopped."""
+        """Returns the total durations for which the vehicle was slowed and stopped [s]."""
         return ActionTimes(self.n_frames["slow"] / self.rate_hz, self.n_frames["hold"] / self.rate_hz)
 
     def _next_action(self, lost: bool) -> Action:

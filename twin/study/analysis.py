@@ -231,8 +231,8 @@ class StudyAnalysis:
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
         """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
 
-        Metrics that are constant, or that some survey of the design lacks because it is not complete or has no value,
-        are left out.
+        Metrics that are constant are left out, as are those without a value in some survey of the design, for
+        instance because that survey is not complete.
         """
         axes = axis_names(self.study)
         usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1

@@ -75,7 +75,9 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
 def _patches(
     clean: Gray, snow: tuple[Gray, Gray], noise: float, patch_px: int
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Returns variance [px^2], error due to snow [px] and match mask, each (n,), of patches at every second pixel.
+    """Returns how patches at every second pixel are matched.
+
+    Three arrays (n,): variance of the matched position [px^2], its error due to snow [px], whether it is matched.
 
     Args:
         clean: noise-free image without snow.
