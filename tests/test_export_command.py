@@ -279,7 +279,7 @@ def test_an_export_is_not_mixed_with_other_files(recorded_run, tmp_path):
 def test_a_truncated_image_of_the_run_is_named(recorded_run, tmp_path, name, quality):
     image = recorded_run / "frames" / "left" / "000001.png"
     image.write_bytes(image.read_bytes()[:-20])
-    with pytest.raises(TwinError, match=r"left/000001.png: is truncated or no PNG"):
+    with pytest.raises(TwinError, match=r"left/000001.png: is truncated or not a PNG"):
         export(recorded_run, [name], tmp_path / "out", ExportOptions(jpeg_quality=quality))
     assert list((tmp_path / "out").iterdir()) == []
 
