@@ -14,11 +14,11 @@ from terrains.terrain import Terrain
 from twin.app.export_command import ExportOptions, export, run_contents
 from twin.app.true_layers import floor_normals, optical_flow
 from twin.core import geometry
-from twin.core.records import Frame, Readings, StereoRig, Trajectory
+from twin.core.records import Frame, ImuReadings, Readings, StereoRig, Trajectory
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import geotiff
-from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
+from twin.report.frame_recorder import IMU_COLUMNS, FrameRecorder, remove_keyframe_images
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 
@@ -32,6 +32,8 @@ SCENARIO = {
     "plan": {"area_m": [1.0, 0.4], "tracks": 1, "altitude_m": 1.5},
     "objects": [{"shape": "boulder", "size_m": 0.4, "position_m": [-0.4, 0.1]}],
 }
+
+RIGID = SCENARIO | {"vehicle": {"dynamics": "rigid"}, "navigation": {"aiding": ["pressure"]}}
 
 
 def frame(index, stereo):
@@ -83,6 +85,45 @@ def test_exported_points_are_in_world_axes_for_a_map_in_the_plane_of_a_tilted_ri
         vertices = trimesh.load(path, process=False).vertices
         x, y, z = geometry.transform(map_from_world, np.asarray(vertices)).T
         np.testing.assert_allclose(z, made.height_at(x, y), atol=1e-5, err_msg=name)
+
+
+def test_readings_of_the_imu_are_recorded_frame_by_frame_without_loss(tmp_path):
+    rng = np.random.default_rng(0)
+    given = [ImuReadings(np.arange(4 * k, 4 * k + 4) / 120, rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+             for k in range(3)]  # fmt: skip
+    with FrameRecorder(tmp_path, "keyframes") as recorder:
+        for k, one in enumerate(given):
+            seen = frame(k, True)
+            recorder.add(replace(seen, readings=replace(seen.readings, imu=one)), np.eye(4), np.zeros(6))
+    lines = (tmp_path / "frames" / "imu.csv").read_text().splitlines()
+    assert lines[0] == ",".join(IMU_COLUMNS)
+    table = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    np.testing.assert_array_equal(table, np.vstack([np.column_stack(one) for one in given]))
+
+
+def test_an_imu_does_not_change_the_flight_and_its_readings_reach_the_frames():
+    from twin.world.mission import prepare
+    from twin.world.rendered_world import RenderedWorld
+
+    frames = []
+    for section in ({}, {"imu": {"rate_hz": 60.0}}):
+        mission = prepare(Scenario.model_validate(RIGID | section))
+        with RenderedWorld(mission, Stopwatch()) as world:
+            sequence = mission.planned_frames(1)
+            world.start_sequence(sequence, 1)
+            found = []
+            for k in range(3):
+                found.append((world.observe(sequence[k]), world.vehicle.world_from_body))
+                world.act(np.full(8, 0.3))
+            frames.append(found)
+    for (plain, plain_pose), (fitted, pose) in zip(*frames, strict=True):
+        np.testing.assert_array_equal(plain.left, fitted.left)
+        np.testing.assert_array_equal(plain_pose, pose)
+        assert plain.readings.imu is None and plain.readings.pressure_z_m == fitted.readings.pressure_z_m
+    times_s = [one.readings.imu.times_s for one, _ in frames[1]]
+    np.testing.assert_allclose(times_s[0], [0.0])
+    np.testing.assert_allclose(times_s[1], np.arange(1, 13) / 60)
+    np.testing.assert_allclose(times_s[2], np.arange(13, 25) / 60)
 
 
 def test_an_image_that_cannot_be_written_is_an_error_at_a_later_frame(tmp_path):

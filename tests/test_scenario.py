@@ -12,6 +12,7 @@ from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import dump_toml, load_scenario
 from twin.scenario.model import EstimateConfig, Scenario
 from twin.scenario.toml_lines import key_lines
+from twin.scenario.toml_text import value_errors
 from twin.study.study_file import load_study
 from twin.study.surveys import surveys
 
@@ -21,12 +22,16 @@ PLAN_KEYS = (
 )
 TOP_KEYS = (
     "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "
-    "snow, current, navigation, plan, control, estimate, map, beacons, objects, require"
+    "snow, current, navigation, imu, plan, control, estimate, map, beacons, objects, require"
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
     "full_well_e, read_noise_e, bits, bayer, vignetting_power, motion_blur, readout_ms, tone_curve, white_balance, "
     "white_gains, white_temperature_k"
+)
+IMU_KEYS = (
+    "rate_hz, gyroscope_noise_density, gyroscope_random_walk, gyroscope_bias_sigma_radps, accelerometer_noise_density, "
+    "accelerometer_random_walk, accelerometer_bias_sigma_mps2"
 )
 
 SCENES = sorted(file.stem for file in (Path(__file__).parent.parent / "scenes").glob("*.toml"))
@@ -96,6 +101,16 @@ BAD_FILES = [
             "3: navigation.dvl_scale_sigma: 0.2: not allowed (allowed: less than or equal to 0.1)",
         ],
     ),
+    (
+        "[imu]\nrate_hz = 0\ngyroscope_noise_density = -1e-3\naccelerometer_random_walk = nan\nnoise = 3",
+        [
+            "2: imu.rate_hz: 0: not allowed (allowed: greater than 0)",
+            "3: imu.gyroscope_noise_density: -0.001: not allowed (allowed: greater than or equal to 0)",
+            "4: imu.accelerometer_random_walk: nan: not allowed (allowed: a finite number)",
+            f"5: imu.noise: unknown key (allowed: {IMU_KEYS})",
+        ],
+    ),
+    ("imu = true", ["1: imu: True: not allowed (allowed: a section)"]),
     (
         "[[beacons]]\nposition_m = [0, 0, 1]\n[[beacons]]\nposition_m = [0, nan, 1]\n[[beacons]]\ncolour = 3",
         [
@@ -281,6 +296,13 @@ def test_any_scenario_survives_a_round_trip_through_toml(
     )
     file = written(tmp_path_factory.mktemp("round"), dump_toml(scenario))
     assert load_scenario(file).model_dump() == scenario.model_dump()
+
+
+def test_an_imu_exists_only_with_its_section_and_a_scenario_without_one_has_the_hash_that_it_had_before(tmp_path):
+    plain, fitted = load_scenario("reef"), load_scenario("reef", ["imu={}"])
+    assert plain.imu is None and plain.fingerprint() == "cfc69c006ef9a458" and "[imu]" not in dump_toml(plain)
+    assert fitted.imu is not None and fitted.fingerprint() != plain.fingerprint()
+    assert load_scenario(written(tmp_path, dump_toml(fitted))).imu == fitted.imu
 
 
 def test_a_sensor_exists_only_with_its_section_and_survives_a_round_trip(tmp_path):
@@ -474,3 +496,10 @@ def test_every_key_has_a_description_in_plain_words():
 )
 def test_texels_are_as_fine_as_the_pixels_of_the_images_by_default(values: list[str], texel_m: float) -> None:
     assert load_scenario("quickstart", ["rig.hfov_deg=60", *values]).texel_m == pytest.approx(texel_m)
+
+
+@pytest.mark.parametrize(
+    ("value", "valid"), [(-(2**63), True), (2**63 - 1, True), (-(2**63) - 1, False), (2**63, False)]
+)
+def test_integers_of_a_toml_file_have_64_bits(value, valid):
+    assert (not list(value_errors({"a": {"b": [value]}}))) is valid

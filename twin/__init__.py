@@ -41,8 +41,8 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
         overrides: strings `key=value` that replace values of the file, for example `plan.tracks=2`.
 
     Raises:
-        ScenarioError: the scenario is invalid; the message lists the errors, each as
-            `FILE:LINE: key: problem (allowed: ...)`, or as `--set: ...` for an override.
+        ScenarioError: there is no such scenario, or a file or an override is invalid. The message lists the errors of
+            files as `FILE:LINE: key: problem (allowed: ...)` and those of overrides in lines that begin with `--set`.
     """
     from twin.scenario.file import load_scenario
 

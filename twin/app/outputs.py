@@ -64,14 +64,14 @@ def is_empty(folder: Path) -> bool:
 
 
 def _check_path(path: Path, option: str, allowed: str) -> None:
-    """Raises TwinError if a path can neither exist nor be created."""
+    """Raises TwinError if the file system rejects a path (see `path_problem`); the path need not exist."""
     if problem := path_problem(path):
         shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
         raise TwinError(option, f"{shown!r}: {problem}", allowed)
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError unless a file can be created in `path`, or in its closest existing parent if it is no folder."""
+    """Raises TwinError unless a file can be created in the folder `path` or in its closest existing parent."""
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest
     try:

@@ -157,6 +157,22 @@ class BeaconDetection(NamedTuple):
     pixel: tuple[float, float]
 
 
+class ImuReadings(NamedTuple):
+    """Readings of an inertial measurement unit (IMU) at the origin of the body, in the axes of the body.
+
+    The specific force is the acceleration minus that of free fall: a body at rest measures 9.81 m/s2 upwards.
+
+    Args:
+        times_s: (n,) times [s], increasing.
+        rates_radps: (n, 3) angular rates of the body in its own axes [rad/s].
+        specific_forces_mps2: (n, 3) specific forces [m/s2].
+    """
+
+    times_s: Array
+    rates_radps: Array
+    specific_forces_mps2: Array
+
+
 @dataclass(frozen=True)
 class Readings:
     """Readings of the navigation sensors at a frame; None where a sensor is not fitted or has no new reading.
@@ -167,6 +183,7 @@ class Readings:
         dvl_mps: (3,) velocity of the body's origin over ground, in body axes [m/s].
         usbl_m: (3,) position of the left camera in the world, at some keyframes [m].
         beacons: beacons detected in the left image, at keyframes.
+        imu: readings of the IMU after the previous frame, up to the time of this frame.
     """
 
     pressure_z_m: float | None = None
@@ -174,6 +191,7 @@ class Readings:
     dvl_mps: Array | None = None
     usbl_m: Array | None = None
     beacons: tuple[BeaconDetection, ...] | None = None
+    imu: ImuReadings | None = None
 
 
 class Displacement(NamedTuple):

@@ -52,7 +52,7 @@ class LinkQueue:
 
         Raises:
             OSError: images could not be read or written.
-            Exception: a measurement failed otherwise. After any error, all pending measurements are dropped.
+            Exception: a measurement failed for another reason. After any error, all pending measurements are dropped.
         """
         while len(self._pending) > all_but:
             try:
@@ -293,8 +293,8 @@ class KeyframeNetwork:
 
         Raises:
             OSError: images could not be read or written.
-            Exception: a measurement failed otherwise. After any error, the network is incomplete and `align_all`
-                returns None.
+            Exception: a measurement failed for another reason. After any error, the network is incomplete and
+                `align_all` returns None.
         """
         try:
             for links in self._queue.collect(all_but):

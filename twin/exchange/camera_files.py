@@ -1,4 +1,4 @@
-"""Camera calibration in the files of OpenCV, Kalibr and COLMAP, true and believed."""
+"""Export of the true and the believed camera calibration in the file formats of OpenCV, Kalibr and COLMAP."""
 
 from __future__ import annotations
 

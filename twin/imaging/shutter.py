@@ -118,9 +118,9 @@ def _flow(x, y, near, scale, twist):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, W, 3) with motion blur; compiled kernel of `blur_by_motion`.
+    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur.
 
-    `flat` (H W, 3) is the radiance at mid-exposure.
+    Compiled kernel of `blur_by_motion`. `flat` (H W, 3) is the radiance at mid-exposure.
     """
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)

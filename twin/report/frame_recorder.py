@@ -12,12 +12,15 @@ import cv2
 import numpy as np
 
 from twin.core.growing_array import GrowingArray
-from twin.core.records import Array, Frame, Image, Readings
+from twin.core.records import Array, Frame, Image, ImuReadings, Readings
 
 Record = Literal["none", "keyframes", "all"]
 #: Last columns of frames/frames.csv; an empty cell is a missing reading.
 READING_COLUMNS = ("pressure_z_m", "roll_rad", "pitch_rad", "yaw_rad", "forward_mps", "left_mps", "up_mps",
                    "usbl_x_m", "usbl_y_m", "usbl_z_m")  # fmt: skip
+#: Columns of frames/imu.csv.
+IMU_COLUMNS = ("time_s", "rate_x_radps", "rate_y_radps", "rate_z_radps", "specific_force_x_mps2",
+               "specific_force_y_mps2", "specific_force_z_mps2")  # fmt: skip
 #: Columns between index, time_s, stereo and the readings: `Frame.exposure`, empty if the cameras do not report it.
 EXPOSURE_COLUMNS = ("exposure_r", "exposure_g", "exposure_b")
 _MOST_WAITING = 8  # frames whose images wait to be written; a survey waits for the disk beyond this number
@@ -32,11 +35,11 @@ _PNG = [
 class FrameRecorder:
     """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
-    `frames.csv` has index, time, exposure and sensor readings (without beacons) of every frame, and whether it has a
-    stereo pair. `truth.npz` has the true poses and velocities in double precision; the text files of trajectories are
-    rounded. With "all", `left` and `right` have the images of the frames as PNG files; the right camera takes images
-    only at frames that are to become keyframes. With "keyframes", the images are those that the estimators store in the
-    folder `keyframes`.
+    `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
+    has a stereo pair. `imu.csv` has the readings of the IMU in body axes, if there is one. `truth.npz` has the true
+    poses and velocities in double precision; the text files of trajectories are rounded. With "all", `left` and `right`
+    have the images of the frames as PNG files; the right camera takes images only at frames that are to become
+    keyframes. With "keyframes", the images are those that the estimators store in the folder `keyframes`.
 
     Args:
         folder: run folder.
@@ -51,7 +54,7 @@ class FrameRecorder:
         self._poses, self._twists = GrowingArray(4, 4), GrowingArray(6)
         self._writer = ThreadPoolExecutor(1)  # compresses while the next frame is rendered
         self._waiting: deque[Future[None]] = deque()
-        self._lines = None
+        self._lines, self._imu_lines = None, None
         if record != "none":
             self._folder.mkdir(parents=True, exist_ok=True)
             self._lines = (self._folder / "frames.csv").open("w", newline="", encoding="utf-8")
@@ -69,6 +72,8 @@ class FrameRecorder:
         self._writer.shutdown()
         if self._lines is not None:
             self._lines.close()
+            if self._imu_lines is not None:
+                self._imu_lines.close()
             truth = {"world_from_camera": self._poses.array, "twist_body": self._twists.array}
             np.savez(self._folder / "truth.npz", allow_pickle=False, **truth)
         if kind is None:
@@ -93,10 +98,20 @@ class FrameRecorder:
         exposure = ["", "", ""] if frame.exposure is None else [repr(float(value)) for value in frame.exposure]
         stereo = int(frame.right is not None)
         self._rows.writerow([frame.index, repr(float(frame.time_s)), stereo, *exposure, *_cells(frame.readings)])
+        if frame.readings.imu is not None:
+            self._add_imu(frame.readings.imu)
         if self._record == "all":
             while len(self._waiting) >= _MOST_WAITING or (self._waiting and self._waiting[0].done()):
                 self._waiting.popleft().result()
             self._waiting.append(self._writer.submit(self._write, frame.index, frame.left, frame.right))
+
+    def _add_imu(self, readings: ImuReadings) -> None:
+        """Writes readings of the IMU to imu.csv, which the first call creates."""
+        if self._imu_lines is None:
+            self._imu_lines = (self._folder / "imu.csv").open("w", newline="", encoding="utf-8")
+            csv.writer(self._imu_lines).writerow(IMU_COLUMNS)
+        table = np.column_stack(readings)
+        csv.writer(self._imu_lines).writerows([repr(value) for value in row] for row in table.tolist())
 
     def _write(self, index: int, left: Image, right: Image | None) -> None:
         """Writes the images of a frame."""

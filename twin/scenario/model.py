@@ -593,6 +593,40 @@ class NavigationConfig(Section):
     )  # fmt: skip
 
 
+class ImuConfig(Section):
+    """Inertial measurement unit (IMU) at the origin of the body; its readings are recorded, our estimators ignore them.
+
+    It measures angular rates and specific forces in body axes. Names and units of the noise are those of Kalibr and
+    EuRoC: a noise density times the root of the rate is the standard deviation of the white noise of a reading. The
+    defaults are those of an ADIS16448: noise from EuRoC (Burri et al. 2016), biases from RotorS (Furrer et al. 2016).
+    A surrogate survey simulates no IMU.
+    """
+
+    rate_hz: float | None = Field(
+        default=None, gt=0, le=1000,
+        description="rate of the readings, at most and by default that of the physics: the smallest multiple of "
+        "rig.frame_rate_hz that is at least 120 Hz; kinematic vehicle: rig.frame_rate_hz [Hz]",
+    )  # fmt: skip
+    gyroscope_noise_density: float = Field(
+        default=1.6968e-4, ge=0, le=1, description="white noise of each angular rate [rad/s/sqrt(Hz)]"
+    )
+    gyroscope_random_walk: float = Field(
+        default=1.9393e-5, ge=0, le=1, description="random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]"
+    )
+    gyroscope_bias_sigma_radps: float = Field(
+        default=8.7e-3, ge=0, le=1, description="standard deviation of the bias of each angular rate at 0 s [rad/s]"
+    )
+    accelerometer_noise_density: float = Field(
+        default=2.0e-3, ge=0, le=10, description="white noise of each specific force [m/s2/sqrt(Hz)]"
+    )
+    accelerometer_random_walk: float = Field(
+        default=3.0e-3, ge=0, le=10, description="random walk of the bias of each specific force [m/s3/sqrt(Hz)]"
+    )
+    accelerometer_bias_sigma_mps2: float = Field(
+        default=0.196, ge=0, le=10, description="standard deviation of the bias of each specific force at 0 s [m/s2]"
+    )
+
+
 class BeaconConfig(Section):
     """Small light at a surveyed position."""
 
@@ -883,6 +917,7 @@ class Scenario(Section):
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
     navigation: NavigationConfig = NavigationConfig()
+    imu: ImuConfig | None = Field(default=None, description="inertial measurement unit; default: none")
     plan: PlanConfig = PlanConfig()
     control: ControlConfig = ControlConfig()
     estimate: EstimateConfig = EstimateConfig()
@@ -954,8 +989,12 @@ class Scenario(Section):
         return EstimatorSettings(**self.estimate.model_dump(exclude={"plugin"}))
 
     def fingerprint(self) -> str:
-        """Returns a hash of all values except `record`, 16 hexadecimal digits; of files, only the paths are hashed."""
-        return hashlib.sha256(self.model_dump_json(exclude={"record"}).encode()).hexdigest()[:16]
+        """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.
+
+        `record` is left out, and `imu` if there is none: the section is younger than results that have the hash.
+        """
+        left_out = {"record"} if self.imu else {"record", "imu"}
+        return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()[:16]
 
 
 def _tan_deg(angle_deg: float) -> float:

@@ -12,7 +12,7 @@ from twin.errors import TwinError
 #: Limits of a TOML text: characters, levels of tables and arrays, and characters of a key.
 MAX_CHARACTERS, MAX_LEVELS, MAX_KEY_CHARACTERS = 1_000_000, 32, 200
 #: Largest magnitude of an integer (TOML 1.0: 64 bits, signed).
-MAX_INTEGER = 2**63 - 1
+MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 
 #: A dotted key with more than 100 parts; the time that `tomllib` takes grows with the square of their number.
 _LONG_KEY = re.compile(r"""(?<![\w"'.-])(?:["'\w-]+[ \t]*\.[ \t]*){100}""")
@@ -60,5 +60,5 @@ def value_errors(tree: dict[str, Any]) -> Iterator[TwinError]:
                     pending.append((f"{key}.{name}" if key else name, level + 1, item))
         elif isinstance(value, list):
             pending += [(f"{key}.{k}", level + 1, item) for k, item in enumerate(value)]
-        elif isinstance(value, int) and abs(value) > MAX_INTEGER:
-            yield TwinError(key, "an integer with too many digits", f"-{MAX_INTEGER} to {MAX_INTEGER}")
+        elif isinstance(value, int) and not MIN_INTEGER <= value <= MAX_INTEGER:
+            yield TwinError(key, "an integer with too many digits", f"{MIN_INTEGER} to {MAX_INTEGER}")

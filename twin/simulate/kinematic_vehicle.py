@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import SurveyAborted
+from twin.simulate.inertial_sensor import inertial_quantities
 
 Array = NDArray[np.float64]
 
@@ -18,12 +21,19 @@ class KinematicVehicle:
 
     Args:
         world_from_body: (4, 4) initial pose, at rest and level.
+
+    Attributes:
+        inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]. The angular rate is zero. The
+            acceleration is the change of velocity at the start of the last step, divided by the duration of the step.
+        after_timestep: function called with `inertial` after each step; None: none is called.
     """
 
     def __init__(self, world_from_body: Array):
         self.world_from_body = world_from_body.copy()
         self.time_s = 0.0
         self._velocity = np.zeros(3)
+        self.inertial = inertial_quantities(world_from_body[:3, :3], np.zeros(3), np.zeros(3))
+        self.after_timestep: Callable[[Array], None] | None = None
 
     @property
     def twist_body(self) -> Array:
@@ -38,8 +48,13 @@ class KinematicVehicle:
         """
         if not np.isfinite(command).all():
             raise SurveyAborted(f"the commanded velocity is not finite at {self.time_s:.3f} s")
-        self._velocity = np.array([command[0], command[1], 0.0])
+        velocity = np.array([command[0], command[1], 0.0])
+        acceleration = (velocity - self._velocity) / duration_s
+        self._velocity = velocity
         pose = self.world_from_body.copy()
         pose[:3, 3] += self._velocity * duration_s
         self.world_from_body = pose
         self.time_s += duration_s
+        self.inertial = inertial_quantities(pose[:3, :3], np.zeros(3), acceleration)
+        if self.after_timestep is not None:
+            self.after_timestep(self.inertial)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
+from twin.simulate.inertial_sensor import inertial_quantities
 from twin.simulate.thrusters import LaggedThrusters
 
 Array = NDArray[np.float64]
@@ -31,6 +33,9 @@ class MujocoVehicle:
         vehicle: vehicle settings of the scenario: buoyancy, and factors on drag and added mass.
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
+
+    Attributes:
+        after_timestep: function called with `inertial` after each timestep; None: none is called.
     """
 
     def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
@@ -48,6 +53,7 @@ class MujocoVehicle:
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
         mujoco.mj_step1(self._model, self._data)
+        self.after_timestep: Callable[[Array], None] | None = None
 
     @property
     def time_s(self) -> float:
@@ -63,6 +69,13 @@ class MujocoVehicle:
     def twist_body(self) -> Array:
         """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return twist_from_free_joint(self._rotation, self._velocity_now())
+
+    @property
+    def inertial(self) -> Array:
+        """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2], at the time of the pose."""
+        velocity, wrench = self._velocity_now(), self._thrusters.wrench()
+        acceleration = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
+        return inertial_quantities(self._rotation, velocity[3:], acceleration[:3])
 
     @property
     def _rotation(self) -> Array:
@@ -85,6 +98,8 @@ class MujocoVehicle:
         for _ in range(n_steps):
             self._advance(self._thrusters.wrench())
             self._thrusters.step()
+            if self.after_timestep is not None:
+                self.after_timestep(self.inertial)
         self._history.append(self._snapshot())
 
     def _advance(self, wrench: Array) -> None:

@@ -1,4 +1,4 @@
-"""Navigation sensors: pressure, attitude, Doppler velocity log, acoustic positioning and beacons, each with noise."""
+"""Navigation sensors, each with noise: pressure, attitude, Doppler velocity log, acoustic positioning, beacons, IMU."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
 from twin.scenario.model import NavigationConfig
+from twin.simulate.inertial_sensor import InertialSensor
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -21,7 +22,7 @@ _BEACON_HEIGHT_M = 0.05  # greatest height of a beacon above the surface on whic
 
 
 class NavigationSensors:
-    """All navigation sensors of a vehicle; only those listed in `navigation.aiding` return readings.
+    """All navigation sensors of a vehicle; of those that may aid, only those in `navigation.aiding` return readings.
 
     Args:
         settings: the sensors used for aiding, and the interval of acoustic fixes.
@@ -30,6 +31,7 @@ class NavigationSensors:
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
         project: projects points (n, 3) in left camera axes to pixels (n, 2) with the true calibration; None: the
             projection of `rig`.
+        imu: inertial measurement unit; None: the vehicle has none.
     """
 
     def __init__(
@@ -39,9 +41,11 @@ class NavigationSensors:
         rig: StereoRig,
         rng: Mapping[str, np.random.Generator],
         project: Callable[[Array], Array] | None = None,
+        imu: InertialSensor | None = None,
     ):
         self._project = rig.project if project is None else project
         self._aiding, self._noise, self._rig, self._rng = settings.aiding, noise, rig, rng
+        self._imu = imu
         self._dvl = DopplerVelocityLog(noise, rng["dvl"])
         self._usbl = AcousticPositioning(noise, settings.usbl_interval_s, rng["usbl"])
 
@@ -74,6 +78,7 @@ class NavigationSensors:
             dvl_mps=velocity if "dvl" in self._aiding else None,
             usbl_m=fix if "usbl" in self._aiding else None,
             beacons=sightings,
+            imu=None if self._imu is None else self._imu.read(),
         )
 
     def per_frame_sensors(self) -> PerFrameSensors:

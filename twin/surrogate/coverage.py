@@ -92,7 +92,10 @@ class QuantityOutsideFit(NamedTuple):
 
 
 def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
-    """Returns the quantities of a survey outside the fitted range, extended by `Quantity.factor` at its `limits`.
+    """Returns the quantities whose values in a survey lie outside the allowed range.
+
+    The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; the
+    other end is unlimited.
 
     Args:
         conditions: smallest and largest value of each quantity in the survey, by name.

@@ -95,7 +95,7 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
         path: TOML file; None for the error model supplied with this package.
 
     Raises:
-        TwinError: the file does not exist, is not an error model, or contains renamed keys.
+        TwinError: the file does not exist, is not an error model, or contains the former name of a renamed key.
     """
     path = DEFAULT_FILE if path is None else Path(path)
     try:
@@ -153,7 +153,7 @@ def _range_lines(ranges: Mapping[str, Range]) -> list[str]:
 
 
 def _check_names(path: Path, tree: Mapping[str, Any]) -> None:
-    """Raises a TwinError that lists the renamed keys in a file, if there are any."""
+    """Raises a TwinError that lists the former names of renamed keys in a file, if there are any."""
     former = {name: value for name, value in tree.items() if name != "fitted_range"}
     renamed = [f"{name} was renamed to {_RENAMED[name]}" for name in dict.fromkeys(_keys(former)) if name in _RENAMED]
     if renamed:

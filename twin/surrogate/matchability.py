@@ -25,6 +25,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 import terrains
 from terrains.ground_cover import DEFAULT_COVERS
@@ -37,6 +38,7 @@ from twin.estimate.vision.image_scale import BINNINGS
 from twin.imaging.camera import Depth
 from twin.imaging.illumination import Illumination
 from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.optics import Radiance
 from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
@@ -279,13 +281,9 @@ def texture_of_windows(
     formation = ImageFormation(clear, illumination, None, np.random.default_rng(0))
     texture, texel_m = _texture(clear, terrain, depth_m * rig.width_px / rig.focal_px)
     albedo = _albedo(texture, texel_m, rig, depth_m)
-    depth, camera_pose = _level_floor(clear, depth_m)
-    radiance, smooth = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
+    radiance, untextured = _radiance_of_texture(clear, formation, albedo, depth_m)
     gain = sensor_of(clear, rig).meter(radiance).gain
-    lit, untextured = (
-        matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning) for light in (radiance, smooth)
-    )
-    return window_texture(lit - untextured)
+    return window_texture(_texture_signal(radiance, untextured, gain, binning))
 
 
 def _border_distances(shape: tuple[int, ...]) -> Array:
@@ -386,19 +384,39 @@ def _bound_px(
     binning: int,
 ) -> float:
     """Returns the Cramér-Rao bound [px of the binned images] for a level floor at a depth, with an albedo image."""
-    depth, camera_pose = _level_floor(scenario, depth_m)
-    radiance, smooth = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
+    radiance, untextured = _radiance_of_texture(scenario, formation, albedo, depth_m)
     sensor = sensor_of(scenario, rig)
     setting = sensor.meter(radiance)
-    lit, untextured = (
-        matching.gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32), binning)
-        for light in (radiance, smooth)
-    )
-    signal = lit - untextured
+    signal = _texture_signal(radiance, untextured, setting.gain, binning)
     first, second = (matching.gray(sensor.image(radiance, setting, rng).astype(np.float32), binning) for _ in range(2))
     noise = float((first - second).std()) / np.sqrt(2)
     gradient = float(np.sqrt(np.mean(np.diff(signal, axis=1) ** 2)))
     return np.sqrt(2) * noise / (scenario.estimate.patch_px * max(gradient, 1e-6))
+
+
+def _radiance_of_texture(
+    scenario: Scenario, formation: ImageFormation, albedo: Image, depth_m: float
+) -> tuple[Radiance, Radiance]:
+    """Returns the radiances (H, W, 3) of a level floor at a depth: with an albedo image, and with its mean colour."""
+    depth, camera_pose = _level_floor(scenario, depth_m)
+    textured, untextured = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
+    return textured, untextured
+
+
+def _texture_signal(textured: Radiance, untextured: Radiance, gain: float, binning: int) -> NDArray[np.floating]:
+    """Returns the difference (rows, cols) that the texture makes in the grey image of `binning` [grey levels].
+
+    Args:
+        textured: radiance (H, W, 3) of the floor.
+        untextured: radiance (H, W, 3) of a floor of its mean colour.
+        gain: pixel value of a unit of radiance, 1 at saturation.
+        binning: see `precision`.
+    """
+    lit, smooth = (
+        matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning)
+        for light in (textured, untextured)
+    )
+    return lit - smooth
 
 
 def _untextured(albedo: Image) -> Image:

@@ -27,6 +27,8 @@ from twin.plugin.guard import check_loadable, terrain_heights
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source, TerrainConfig
 from twin.simulate.autopilot import top_speed_mps
+from twin.simulate.hull import physics_timestep_s
+from twin.simulate.inertial_sensor import imu_rate_hz
 from twin.world.clearance import path_points, planned_clearance
 from twin.world.limits import check_map_size
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
@@ -210,6 +212,8 @@ def prepare(scenario: Scenario) -> Mission:
         _attempt(lambda: _check_white_balance(sensor), source, errors)
     _attempt(lambda: _check_lens_blur(scenario), source, errors)
     _attempt(lambda: _check_snow(scenario.snow), source, errors)
+    if (imu := scenario.imu) is not None:
+        _attempt(lambda: imu_rate_hz(imu, motion_rate_hz(scenario)), source, errors)
     true_cameras = _attempt(lambda: make_true_cameras(scenario), source, errors)
     illumination = _attempt(lambda: _illumination(scenario), source, errors)
     _attempt(lambda: check_require(scenario.require), source, errors)
@@ -242,6 +246,13 @@ def _attempt(build, source: Source, errors: list[str]):
     except TwinError as error:
         errors.append(source.describe(error))
     return None
+
+
+def motion_rate_hz(scenario: Scenario) -> float:
+    """Returns the rate at which the motion of the vehicle is simulated: that of the physics, or that of the frames."""
+    frame_rate_hz = scenario.rig.frame_rate_hz
+    rigid = scenario.vehicle.dynamics == "rigid"
+    return round(1 / (frame_rate_hz * physics_timestep_s(frame_rate_hz))) * frame_rate_hz if rigid else frame_rate_hz
 
 
 def load_terrain(scenario: Scenario) -> terrains.Terrain:

@@ -14,12 +14,13 @@ from twin.imaging.camera import StereoCamera
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.renderer import Renderer
 from twin.simulate.hull import physics_timestep_s
+from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import Coverage, true_heights
 from twin.world.mesh_floor import floor_surface
-from twin.world.mission import Mission, Step
+from twin.world.mission import Mission, Step, motion_rate_hz
 from twin.world.top_surface import top_surface
 from twin.world.world import CameraImages, TrueSurface, World, streams
 
@@ -45,9 +46,12 @@ class RenderedWorld(World):
             else KinematicVehicle(mission.start_of_body)
         )
         noise, believed = scenario.believed_noise(), mission.rig
-        super().__init__(
-            mission, stopwatch, vehicle, NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project)
-        )
+        imu = None
+        if scenario.imu is not None:
+            imu = InertialSensor(scenario.imu, motion_rate_hz(scenario), vehicle.inertial, rng["imu"])
+            vehicle.after_timestep = imu.add
+        sensors = NavigationSensors(scenario.navigation, noise, believed, rng, cameras.project, imu)
+        super().__init__(mission, stopwatch, vehicle, sensors)
         self.renderer = Renderer(scene, rig.width_px, rig.height_px, vfov_deg)
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
         image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)

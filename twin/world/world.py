@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Names of the random streams, in the order in which their seeds are spawned. Add a new stream at the end, to keep the
 #: random numbers of the others.
-_STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate")
+_STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu")
 
 #: Simulates the frames of a sequence from index k, at most up to the next keyframe; returns the index of the first
 #: frame that it did not simulate.
