@@ -12,7 +12,7 @@ from twin.app import expected_error, plan_summary
 from twin.app.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
-from twin.surrogate.error_model import BinningFactors, ScatterLaw
+from twin.surrogate.error_model import BinnedDepthLaw, ScatterLaw
 from twin.surrogate.window_texture import EVEN_TEXTURE, WindowTexture
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
@@ -111,9 +111,9 @@ def test_the_expected_error_is_that_of_the_bound_of_the_median_window(monkeypatc
 
 def test_the_expected_error_of_binned_images_has_the_factor_of_the_error_model(monkeypatch):
     """A pixel of binned images is two pixels wide, so the same error in pixels is twice as large in metres."""
-    model = FITTED.model._replace(
-        depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_binned_error=BinningFactors(1.5, 2.0)
-    )
+    law = FITTED.model.depth_error
+    change = BinnedDepthLaw(1.5, 2.0, law.common, law.gain, law.noise_gain)
+    model = FITTED.model._replace(depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_binned_error=change)
     full, binned = (_expected_over_a_flat_floor(by, model, monkeypatch).sigma_m for by in (1, 2))
     np.testing.assert_allclose(binned / full, 2 * 1.5, rtol=1e-9)
 

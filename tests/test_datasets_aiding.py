@@ -248,3 +248,34 @@ def test_readings_of_a_bag_that_cannot_be_used_are_named(tmp_path):
         assert re.search(note, " ".join(bag_readings(tmp_path / str(number), *messages).notes)), note
     with pytest.raises(TwinError, match=r"/imu: message 1: the orientation is 3, .* \(allowed: a unit quaternion\)"):
         bag_readings(tmp_path / "bad", ("/imu", attitude_message(w=3.0)))
+
+
+def test_of_two_topics_of_type_imu_the_one_with_an_orientation_gives_the_attitude(tmp_path):
+    raw = bags.ROS.inertial(bags.START_NS, np.array([0.1, 0.2, 0.3]), np.array([0, 0, 9.81]), (1e-3, 1e-2))
+    empty, broken, unsure = attitude_message(w=0.0), attitude_message(w=np.nan), attitude_message()
+    empty.orientation.x = empty.orientation.y = empty.orientation.z = 0.0
+    unsure.orientation_covariance = np.zeros(9)
+    for number, other in enumerate((raw, empty, broken, unsure)):
+        for names in (("/a", "/z"), ("/z", "/a")):
+            messages = dict(zip(names, (other, attitude_message()), strict=True))
+            found = bag_readings(tmp_path / f"{number}{names[0][1]}", *sorted(messages.items()))
+            np.testing.assert_allclose(found.attitude.values, [[0.1, 0.2, 0.3]], atol=1e-12)
+            assert found.notes == ()
+
+
+def test_topics_of_rates_alone_are_named_as_without_orientation(tmp_path):
+    raw = bags.ROS.inertial(bags.START_NS, np.zeros(3), np.array([0, 0, 9.81]), (1e-3, 1e-2))
+    for number, topics in enumerate((("/imu",), ("/front", "/rear"))):
+        found = bag_readings(tmp_path / str(number), *((topic, raw) for topic in topics))
+        (note,) = found.notes
+        assert note == f"The attitude is not used: no message of {', '.join(topics)} states an orientation."
+        assert found.attitude is None
+
+
+def test_a_sensor_that_warms_up_is_recognised_by_a_later_message(tmp_path):
+    early = attitude_message(w=np.nan)
+    late = attitude_message()
+    late.header.stamp.sec += 1
+    raw = bags.ROS.inertial(bags.START_NS, np.zeros(3), np.array([0, 0, 9.81]), (1e-3, 1e-2))
+    found = bag_readings(tmp_path, ("/raw", raw), ("/imu", early), ("/imu", late))
+    assert len(found.attitude.values) == 1 and "1 of 2 readings of /imu are not used" in " ".join(found.notes)

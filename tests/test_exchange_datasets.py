@@ -1,5 +1,6 @@
 """Exported data sets: other programs and our own readers find images, poses and calibration where they were."""
 
+import csv
 import json
 from dataclasses import replace
 
@@ -7,18 +8,20 @@ import cv2
 import numpy as np
 import pytest
 import rasterio.warp
+import yaml
+from physics_world import vehicle
 from scipy.spatial.transform import Rotation
 
 from twin.app.camera_models import believed_calibration, true_calibration
 from twin.core import geometry
-from twin.core.records import ElevationMap, MapGrid, Readings, StereoRig, Trajectory
+from twin.core.records import ElevationMap, ImuReadings, MapGrid, Readings, StereoRig, Trajectory
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.readers import read_dataset
 from twin.errors import TwinError
 from twin.exchange import camera_files, colmap, euroc, geotiff, ifdo, kitti, metashape, nerfstudio, tum
 from twin.exchange.attitude import yaw_pitch_roll_deg
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
-from twin.exchange.run_contents import RecordedFrame, RunContents, project
+from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu, RunContents, project
 from twin.scenario.model import Scenario
 
 N = 5
@@ -280,3 +283,74 @@ def test_the_model_of_the_fit_is_that_of_opencv():
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
     camera = believed_calibration(RIG).left._replace(distortion=distortion)
     np.testing.assert_allclose(project(points, camera), expected, atol=1e-9)
+
+
+NOISE = ImuNoise(1.5e-4, 2e-5, 3e-3, 4e-3)
+
+
+def turned(seconds, rate_hz=120.0):
+    """Returns exact IMU readings of a simulated vehicle that turns about all axes, and its poses at 5 Hz."""
+    rov, found = vehicle(buoyancy_n=1.0), []
+    found.append((rov.inertial, rov.world_from_body))
+    rov.after_timestep = lambda values: found.append((values, rov.world_from_body))
+    for k in range(round(seconds * 30)):
+        turn = 0.35 * np.sin(0.03 * k + np.arange(8)) + 0.15 * np.array([1, -1, 1, -1, 0, 0, 0, 0])
+        rov.step(turn, 1 / 30)
+    values = np.array([one for one, _ in found])
+    bodies = np.array([pose for _, pose in found])
+    readings = ImuReadings(np.arange(len(values)) / rate_hz, values[:, :3], values[:, 3:])
+    path = Trajectory(np.arange(0, len(values), 24) / rate_hz, bodies[::24] @ RIG.body_from_camera)
+    return RecordedImu(readings, rate_hz, NOISE), path
+
+
+def test_imu_readings_of_a_euroc_folder_are_those_of_the_run_and_integrate_to_its_attitudes(contents, tmp_path):
+    imu, path = turned(4.0)
+    euroc.export(replace(contents, imu=imu, trajectories={"truth": path}), tmp_path)
+    with (tmp_path / "mav0" / "imu0" / "data.csv").open(newline="") as lines:
+        header, *rows = csv.reader(lines)
+    names = [name.split(" ")[0] for name in header]
+    assert names == ["#timestamp", *(f"{kind}_RS_S_{axis}" for kind in "wa" for axis in "xyz")]
+    times_ns = np.array([int(row[0]) for row in rows])
+    np.testing.assert_array_equal(times_ns, 10**9 + np.round(np.arange(481) * 1e9 / 120).astype(int))
+    values = np.array([[float(cell) for cell in row[1:]] for row in rows])
+    np.testing.assert_array_equal(values, np.hstack(imu.readings[1:]))
+    truth = np.loadtxt(tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
+    attitude = Rotation.from_quat(truth[:, 4:], scalar_first=True)
+    turn = np.radians(np.diff(attitude.as_euler("ZYX", degrees=True)[[0, -1]], axis=0))[0]
+    assert (np.abs(turn) > 0.05).all()  # about all three axes
+    here = attitude[0]
+    for k in range(len(values) - 1):
+        rate = (values[k, :3] + values[k + 1, :3]) / 2
+        here = here * Rotation.from_rotvec(rate * (times_ns[k + 1] - times_ns[k]) * 1e-9)
+        if (k + 1) % 24 == 0:
+            assert times_ns[k + 1] == int(truth[(k + 1) // 24, 0])
+            assert np.rad2deg((here.inv() * attitude[(k + 1) // 24]).magnitude()) < 0.05  # of the trapezoidal rule
+    upwards = attitude.apply(values[::24, 3:])  # specific forces in the world: gravity upwards, and some acceleration
+    np.testing.assert_allclose(upwards.mean(axis=0), [0, 0, 9.81], atol=0.2)
+
+
+def test_the_noise_of_the_imu_is_written_with_the_keys_of_kalibr(contents, tmp_path):
+    imu, _ = turned(0.1)
+    euroc.export(replace(contents, imu=imu), tmp_path)
+    sensor = yaml.safe_load((tmp_path / "mav0" / "imu0" / "sensor.yaml").read_text())
+    assert sensor["sensor_type"] == "imu" and sensor["rate_hz"] == 120.0
+    assert sensor["T_BS"] == {"rows": 4, "cols": 4, "data": np.eye(4).ravel().tolist()}
+    believed, true = camera_files.export(replace(contents, imu=imu), tmp_path)
+    kalibr = yaml.safe_load((believed / "imu.yaml").read_text())
+    assert kalibr == yaml.safe_load((true / "imu.yaml").read_text())
+    assert kalibr.pop("rostopic") == "/imu/data_raw" and kalibr.pop("update_rate") == 120.0
+    assert kalibr == NOISE._asdict() == {key: sensor[key] for key in NOISE._fields}
+    chain, point = yaml.safe_load((true / "kalibr.yaml").read_text()), np.array([0.3, -0.2, 0.5])
+    for camera, pose in (("cam0", np.eye(4)), ("cam1", contents.true.left_from_right)):
+        in_camera = geometry.transform(np.array(chain[camera]["T_cam_imu"]), point[None])[0]
+        np.testing.assert_allclose(
+            geometry.transform(RIG.body_from_camera @ pose, in_camera[None])[0], point, atol=1e-12
+        )
+    assert read_calibration(believed / "kalibr.yaml").left.size_px == (64, 48)
+
+
+def test_without_an_imu_nothing_is_written_for_one(contents, tmp_path):
+    euroc.export(contents, tmp_path)
+    (believed, _) = camera_files.export(contents, tmp_path)
+    assert not (tmp_path / "mav0" / "imu0").exists() and not (believed / "imu.yaml").exists()
+    assert "imu" not in (believed / "kalibr.yaml").read_text()

@@ -12,13 +12,14 @@ from rosbags.highlevel import AnyReader
 
 import twin
 from twin.core import geometry
-from twin.core.records import Readings
+from twin.core.records import ImuReadings, Readings
 from twin.datasets.bag_reader import BagReader, BagTopics
 from twin.datasets.frames import RecordedFrames
 from twin.datasets.replay import ReplayOptions
 from twin.exchange import euroc, ros2
 from twin.exchange.euroc import timestamp_ns
 from twin.exchange.formats import FORMATS
+from twin.exchange.run_contents import ImuNoise, RecordedImu
 
 N = 4
 ANGLES = np.array([0.05, -0.1, 2.0])
@@ -33,6 +34,13 @@ SCENARIO = {
 }
 
 
+IMU = RecordedImu(
+    ImuReadings(np.arange(73) / 120, *np.random.default_rng(0).normal(size=(2, 73, 3)) + [[[0]], [[9.81]]]),
+    120.0,
+    ImuNoise(1e-3, 2e-5, 2e-2, 4e-3),
+)
+
+
 def readings(k):
     """Returns readings of all sensors at frame 1, of the pressure sensor alone at frame 2, of none elsewhere."""
     if k == 1:
@@ -42,7 +50,7 @@ def readings(k):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return made.flown(tmp_path_factory.mktemp("run"), N, readings, scenario=SCENARIO)
+    return made.flown(tmp_path_factory.mktemp("run"), N, readings, scenario=SCENARIO, imu=IMU)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +76,16 @@ def stamp_ns(message):
 
 def test_the_topics_and_times_are_those_of_the_run(bag, run):
     pair = [f"/{side}/{name}" for side in ("left", "right") for name in ("image_rect/compressed", "camera_info")]
-    other = ["/tf_static", "/tf", "/odometry", "/ground_truth/odometry", "/imu/data", "/pressure", "/dvl"]
+    other = [
+        "/tf_static",
+        "/tf",
+        "/odometry",
+        "/ground_truth/odometry",
+        "/imu/data",
+        "/imu/data_raw",
+        "/pressure",
+        "/dvl",
+    ]
     assert set(bag) == {*pair, *other}
     times_ns = [timestamp_ns(frame.time_s) for frame in run.frames]
     for topic in (*pair, "/odometry", "/ground_truth/odometry"):
@@ -143,6 +160,22 @@ def test_readings_are_in_the_units_of_the_messages(bag):
     velocity = bag["/dvl"][0][1].twist
     assert [velocity.twist.linear.x, velocity.twist.linear.y, velocity.twist.linear.z] == [0.3, -0.1, 0.02]
     assert velocity.covariance[0] == pytest.approx(1e-4) and velocity.covariance[-1] == -1
+
+
+def test_rates_and_specific_forces_are_those_of_the_run_without_an_orientation(bag):
+    found = bag["/imu/data_raw"]
+    assert [time_ns for time_ns, _ in found] == [stamp_ns(one) for _, one in found]
+    assert [time_ns for time_ns, _ in found] == [10**9 + round(k / 120 * 1e9) for k in range(73)]
+    for values, name in ((IMU.readings.rates_radps, "angular_velocity"),
+                         (IMU.readings.specific_forces_mps2, "linear_acceleration")):  # fmt: skip
+        read = [getattr(one, name) for _, one in found]
+        np.testing.assert_array_equal([[one.x, one.y, one.z] for one in read], values)
+    for _, one in found:
+        assert one.header.frame_id == "base_link" and one.orientation_covariance[0] == -1
+    # white noise of density s has the standard deviation s sqrt(rate)
+    first = found[0][1]
+    np.testing.assert_allclose(first.angular_velocity_covariance.reshape(3, 3), np.eye(3) * 1e-6 * 120)
+    np.testing.assert_allclose(first.linear_acceleration_covariance.reshape(3, 3), np.eye(3) * 4e-4 * 120)
 
 
 def geometry_zero():

@@ -101,6 +101,60 @@ def test_readings_of_the_imu_are_recorded_frame_by_frame_without_loss(tmp_path):
     np.testing.assert_array_equal(table, np.vstack([np.column_stack(one) for one in given]))
 
 
+@pytest.fixture
+def run_with_imu(tmp_path):
+    """Returns the folder of a run with three frames and an IMU, and the readings of the IMU."""
+    rng = np.random.default_rng(0)
+    parts = [ImuReadings(np.arange(4 * k, 4 * k + 4) / 120, rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+             for k in range(3)]  # fmt: skip
+    scenario = Scenario.model_validate({"imu": {"gyroscope_noise_density": 1e-3}})
+    with FrameRecorder(run_folder(tmp_path / "run", scenario), "all") as recorder:
+        for k, one in enumerate(parts):
+            seen = frame(k, True)
+            recorder.add(replace(seen, readings=replace(seen.readings, imu=one)), np.eye(4), np.zeros(6))
+    return tmp_path / "run", ImuReadings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def test_an_export_has_the_readings_of_the_imu_without_loss(run_with_imu, tmp_path):
+    folder, given = run_with_imu
+    imu = run_contents(folder).imu
+    assert imu is not None and imu.rate_hz == pytest.approx(120.0)
+    assert imu.noise.gyroscope_noise_density == 1e-3 and imu.noise.accelerometer_noise_density == 2e-3
+    for expected, read in zip(given, imu.readings, strict=True):
+        np.testing.assert_array_equal(read, expected)
+    export(folder, ["euroc"], tmp_path / "out")
+    table = np.loadtxt(tmp_path / "out" / "euroc" / "mav0" / "imu0" / "data.csv", delimiter=",")
+    np.testing.assert_array_equal(table[:, 1:], np.hstack(given[1:]))
+    (folder / "frames" / "imu.csv").unlink()
+    assert run_contents(folder).imu is None
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda text: text[:-30], "imu.csv: cannot be read: line 13 is incomplete"),
+        (lambda text: "", "imu.csv: cannot be read: its first line is ''"),
+        (lambda text: text.replace("rate_x", "rate_q"), "imu.csv: cannot be read: its first line is 'time_s,rate_q"),
+        (lambda text: text.replace("\n0.0,", "\nnan,"), "line 2 has a value that is not finite"),
+        (lambda text: text.replace("\n0.025,", "\n0.005,"), "line 5 has .* a time that does not increase"),
+        (lambda text: text.replace("\n0.025,", "\nx,"), "imu.csv: cannot be read: could not convert string"),
+    ],
+)
+def test_damaged_readings_of_the_imu_are_refused(run_with_imu, change, problem):
+    file = run_with_imu[0] / "frames" / "imu.csv"
+    file.write_text(change(file.read_text()))
+    with pytest.raises(TwinError, match=problem):
+        run_contents(run_with_imu[0])
+
+
+def test_readings_of_an_imu_that_the_scenario_does_not_have_are_refused(run_with_imu):
+    (run_with_imu[0] / "scenario.resolved.toml").write_text(dump_toml(Scenario()))
+    with pytest.raises(
+        TwinError, match=r"imu.csv: belongs to no sensor: scenario.resolved.toml has no section \[imu\]"
+    ):
+        run_contents(run_with_imu[0])
+
+
 def test_an_imu_does_not_change_the_flight_and_its_readings_reach_the_frames():
     from twin.world.mission import prepare
     from twin.world.rendered_world import RenderedWorld

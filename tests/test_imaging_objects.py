@@ -13,7 +13,7 @@ from terrains.objects.shapes import SHAPES, build_shape
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging import object_view
-from twin.imaging.mesh_raster import ObjectView, Projection, Target, draw_mesh
+from twin.imaging.mesh_raster import DrawnMesh, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.object_view import ObjectRenderer, Objects
 
 W, H, FOCAL = 160, 120, 150.0
@@ -108,12 +108,8 @@ def test_colours_are_interpolated_in_perspective():
     square = mesh_of(corners, [[0, 1, 2], [0, 2, 3]], np.repeat([[0.0], [1.0], [1.0], [0.0]], 3, axis=1))
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), np.inf, np.float32)
     camera_from_world = np.linalg.inv(geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 1.6])))
-    draw_mesh(
-        square,
-        camera_from_world,
-        PROJECTION,
-        Target(depth, albedo, *ObjectView(np.empty((H, W, 3), np.float32), np.zeros((H, W), np.uint16))),
-    )
+    view = ObjectView(np.empty((H, W, 3), np.float32), np.zeros((H, W), np.uint16))
+    draw_meshes([DrawnMesh(square, camera_from_world)], PROJECTION, Target(depth, albedo, *view))
     seen = np.isfinite(depth)
     height = 1.6 - depth[seen]
     assert seen.sum() > 5000

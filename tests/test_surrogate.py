@@ -19,10 +19,13 @@ from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.estimate.vision import matching
+from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
 from twin.surrogate import error_model_file
 from twin.surrogate.error_model import (
+    BinnedDepthLaw,
     BorderErrorLaw,
     BorderLaw,
     DepthLaw,
@@ -43,7 +46,14 @@ from twin.surrogate.map_model import (
     step_slope,
     window_noise,
 )
-from twin.surrogate.matchability import Matchability, bound_ratios, bounds_px, lamp_share, unevenness_px
+from twin.surrogate.matchability import (
+    NO_DEPENDENCE,
+    Matchability,
+    bounds_px,
+    lamp_share,
+    position_dependence,
+    unevenness_px,
+)
 from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
 from twin.surrogate.vision import corner_count, match_sigma_px, overlap_inflation
 from twin.surrogate.window_texture import EVEN_TEXTURE, window_texture
@@ -471,13 +481,15 @@ def test_a_height_error_of_the_pose_shifts_the_patch_without_the_cells_of_the_ne
     assert 0.05 < known.sum() / np.isfinite(whole.height_m).sum() < 0.4
 
 
-def map_model_over(height_m):
-    """Returns the map model of a floor with heights (ny, nx) at nodes 2 cm apart, centred at the origin."""
+def map_model_over(height_m, relative_bounds=NO_DEPENDENCE.bounds):
+    """Returns the map model of a floor with heights (ny, nx) at nodes 2 cm apart around the origin, and the rig."""
     n = len(height_m)
     west = -(n - 1) * 0.02 / 2
     grid = MapGrid(west - 0.01, -west + 0.01, 0.02, n, n)
     rig = mission().rig
-    return MapModel(grid, height_m[::-1].astype(np.float32), rig, height_field(height_m, 0.02, west, west), 2.0), rig
+    floor = height_field(height_m, 0.02, west, west)
+    model = MapModel(grid, height_m[::-1].astype(np.float32), rig, floor, 2.0, relative_bounds=relative_bounds)
+    return model, rig
 
 
 def test_a_wall_hides_the_floor_behind_it_from_the_map():
@@ -643,37 +655,99 @@ def test_errors_near_walls_decrease_from_the_border_of_the_image_to_its_centre()
     np.testing.assert_allclose(factor, [2.2, 1 + 1.2 / np.e, 1 + 1.2 / np.e**3])
 
 
+def cells_of(patch):
+    """Returns the window of the grid that a patch covers."""
+    return np.s_[patch.row : patch.row + patch.height_m.shape[0], patch.col : patch.col + patch.height_m.shape[1]]
+
+
 def test_errors_of_depth_follow_the_table_of_the_distance_from_the_border(vision, no_errors):
     """Only the keyframe itself observes the cells, so their distance is that in its images."""
     model, pose = vision.scene.map_model, tilted(0.1, 0.2, 2.0)
     plain = no_errors._replace(depth_error_px=np.full(2, 0.1), depth_sigma_px=np.full(2, 0.2))
-    ramp = plain._replace(
-        border_distances_px=np.array([0.0, 50.0]), border_error=np.array([3.0, 1.0]), border_sigma=np.array([2.0, 1.0])
-    )  # fmt: skip
+    ramp = plain._replace(border_distances_px=np.array([0.0, 50.0]), border_depth=np.array([3.0, 1.0]))
     observed = model.observe(pose, pose)
     first, second = patch_of(model, plain, pose), patch_of(model, ramp, pose)
-    window = np.s_[first.row : first.row + first.height_m.shape[0], first.col : first.col + first.height_m.shape[1]]
     known, near = np.isfinite(first.height_m), np.clip(1 - observed.border_px / 50, 0, 1)
-    errors = [(patch.height_m - model.height_m[window])[known] for patch in (first, second)]
+    errors = [(patch.height_m - model.height_m[cells_of(first)])[known] for patch in (first, second)]
     np.testing.assert_allclose(errors[1], errors[0] * (1 + 2 * near[known]), atol=1e-6)
     sigmas = [np.sqrt(patch.variance_m2[known]) for patch in (first, second)]
-    np.testing.assert_allclose(sigmas[1], sigmas[0] * (1 + near[known]), rtol=1e-4)
+    np.testing.assert_allclose(sigmas[1], sigmas[0] * (1 + 2 * near[known]), rtol=1e-4)
 
 
-def test_lamps_make_the_centre_of_the_image_more_precise_than_its_border_and_daylight_does_not():
-    lamps = "lamps=[{position_m=[0.25, 0.35, -0.05], pan_deg=-8.0}, {position_m=[0.25, -0.35, -0.05], pan_deg=8.0}]"
+def test_errors_of_depth_follow_the_bound_at_the_position_in_the_image(no_errors):
+    """The bound is 1 at the left and 2 at the right border, so its square is a ramp of information between them."""
+    grid_m = np.zeros((121, 121))
+    even, rig = map_model_over(grid_m)
+    model, _ = map_model_over(grid_m, np.array([[1.0, 2.0]]))
+    zeros = np.zeros((121, 121), np.float32)
+    ratios = np.linspace(1.0, 2.0, 100)
+    errors = CellErrors(
+        *[zeros] * 5, 0.0, np.array([1.0, 3.0]), np.full(2, 0.1), np.full(2, 0.2), np.zeros(2), np.ones(2),
+        bound_ratios=ratios, bound_error=ratios**2, bound_sigma=ratios,
+    )  # fmt: skip
+    pose, beside = (geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([x, 0.0, 2.0])) for x in (0.0, 0.02))
+    observed = model.observe(pose, pose)
+    plain, patch = (patch_of(m, errors, pose) for m in (even, model))
+    known = np.isfinite(patch.height_m)
+    rows, cols = (k[cells_of(patch)][known] for k in np.indices((121, 121)))
+    floor = [model.grid.west_m + (cols + 0.5) * 0.02, model.grid.north_m - (rows + 0.5) * 0.02, 0 * cols, 0 * cols + 1]
+    column = (rig.focal_px * (geometry.inverse(pose) @ floor)[0] / 2.0 + rig.cx_px + 0.5) / rig.width_px * 2 - 0.5
+    information = 1 - 0.75 * np.clip(column, 0, 1)
+    np.testing.assert_allclose(observed.information[known], information, rtol=1e-3)
+    ratio = 1 / np.sqrt(information)
+    np.testing.assert_allclose(model.bound_ratio[cells_of(patch)][known], ratio, rtol=1e-3)
+    np.testing.assert_allclose((patch.height_m / plain.height_m)[known], ratio**2, rtol=5e-3)
+    np.testing.assert_allclose((patch.variance_m2 / plain.variance_m2)[known], ratio**2, rtol=5e-3)
+    second = model.observe(beside, beside)
+    patch_of(model, errors, pose, beside)
+    twice = patch_of(model, errors, beside)
+    both = np.isfinite(twice.height_m) & (model.views[cells_of(twice)] == 2)
+    rows, cols = (np.nonzero(both)[k] + offset for k, offset in enumerate((twice.row, twice.col)))
+    summed = observed.information[rows - observed.row, cols - observed.col] + second.information[both]
+    np.testing.assert_allclose(model.bound_ratio[rows, cols], np.sqrt(2 / summed), rtol=1e-5)
+
+
+LAMPS = "lamps=[{position_m=[0.25, 0.35, -0.05], pan_deg=-8.0}, {position_m=[0.25, -0.35, -0.05], pan_deg=8.0}]"
+
+
+def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_daylight_does_not():
     lit, sunlit = (
-        bound_ratios(m.scenario, m.illumination, 2.0)
-        for m in (mission(lamps, "sun.illuminance_lx=0"), mission("lamps=[]", "sun.illuminance_lx=1000"))
+        position_dependence(m.scenario, m.illumination, 2.0).bounds
+        for m in (mission(LAMPS, "sun.illuminance_lx=0"), mission("lamps=[]", "sun.illuminance_lx=1000"))
     )
-    assert np.all(np.diff(lit[1]) < 0) and lit[1][0] > 1.2 and lit[1][-1] < 0.85
-    np.testing.assert_allclose(sunlit[1], 1.0, atol=0.08)
-    assert np.all(np.diff(lit[0]) > 0) and lit[0][-1] < 120
+    assert lit[:, [0, -1]].min() > 1.1 > 0.9 > lit[2:4, 3:5].max()
+    np.testing.assert_allclose(sunlit, 1.0, atol=0.08)
+
+
+def test_the_relative_bound_is_that_of_random_textures_in_crops_of_the_image():
+    """Oracle: bounds from gradients and noise of other textures (white noise) in each quarter of the image."""
+    m = mission(LAMPS, "sun.illuminance_lx=0", "water.jerlov=III")
+    table = position_dependence(m.scenario, m.illumination, 2.0).bounds
+    rng, rig = np.random.default_rng(7), m.scenario.believed_rig()
+    formation = ImageFormation(m.scenario, m.illumination, None, rng)
+    shape = rig.height_px, rig.width_px
+    depth, camera = np.full(shape, 2.0, np.float32), StampedPose(tilted(0.0, 0.0, 2.0), 0.0)
+    albedo = np.repeat(rng.integers(40, 140, (*shape, 1), np.uint8), 3, axis=2)
+    lights = [formation.radiance(image, depth, 0, camera) for image in (albedo, np.full_like(albedo, 90))]
+    sensor = sensor_of(m.scenario, rig)
+    setting = sensor.meter(lights[0])
+    signal = matching.gray(((lights[0] - lights[1]) * 255 * setting.gain).astype(np.float32))
+    first, second = (matching.gray(sensor.image(lights[0], setting, rng).astype(np.float32)) for _ in range(2))
+    ratio2 = [block_means(x, 3, 4) for x in ((first - second)[:, 1:] ** 2, np.diff(signal, axis=1) ** 2)]
+    expected = np.sqrt(ratio2[0] / ratio2[1] / (ratio2[0].mean() / ratio2[1].mean()))
+    information = block_means(np.repeat(np.repeat(1 / table**2, 10, axis=0), 10, axis=1), 3, 4)
+    np.testing.assert_allclose(1 / np.sqrt(information), expected, rtol=0.08)
+
+
+def block_means(values, rows, cols):
+    return np.array(
+        [[part.mean() for part in np.array_split(row, cols, axis=1)] for row in np.array_split(values, rows)]
+    )
 
 
 def test_no_light_from_the_floor_gives_equal_bounds_over_the_image():
     m = mission("water.turbidity=100", "lamps=[]", "sun.illuminance_lx=1000")
-    np.testing.assert_array_equal(bound_ratios(m.scenario, m.illumination, 1000.0)[1], 1.0)
+    assert position_dependence(m.scenario, m.illumination, 1000.0) is NO_DEPENDENCE
 
 
 def test_rough_cells_have_more_holes(vision, no_errors):
@@ -690,14 +764,18 @@ def test_rough_cells_have_more_holes(vision, no_errors):
 
 TRUE_DEPTH = DepthLaw(0.05, 1.5, 1.2, 0.05, 3.0, 1.4, 0.8)
 TRUE_EDGE = SigmaLaw(0.7, 12.0)
+TRUE_BINNED = BinnedDepthLaw(1.2, 2.5, 0.2, 2.0, 0.3)
 
 
-def map_statistics(rng, scatter=0.02):
+def map_statistics(rng, scatter=0.02, binning=1):
     """Returns statistics of surveys whose variances follow `TRUE_DEPTH`, with known lateral, relief and edge errors.
+
+    In binned images, they follow the law that `TRUE_BINNED` makes of it.
 
     The variances of sampled maps are the sums of those of their errors, with the parameters of `ErrorModel()`.
     """
-    model = ErrorModel()
+    model, true = ErrorModel(), TRUE_BINNED.changed(TRUE_DEPTH, binning)
+    law, _ = model.depth_laws(binning)
     conditions = (
         (0.02, 0, 0.5),
         (0.02, 1, 1.5),
@@ -709,19 +787,17 @@ def map_statistics(rng, scatter=0.02):
         (0.02, 0, 0.1),
     )
     for bound_px, lamp, step in conditions:
-        survey = {"bound_px": [bound_px], "lamp_share": [lamp], "binning": [1, 1], "metres_per_px": [8e-3**0.5]}
+        survey = {"bound_px": [bound_px], "lamp_share": [lamp], "binning": 2 * [binning], "metres_per_px": [8e-3**0.5]}
         survey |= {"window_ratio": [1.0]}
         classes = ("smooth1", 1, 0.0), ("smooth4", 5, 0.0), ("smooth15", 20, 0.0), ("rough9", 11, 0.05)
         for name, views, rough_px in (*classes, ("rougher9", 11, 0.2), ("steep", 5, 0.0), ("edge", 4, 1.0)):
             pose, per_px2 = 1e-7, 8e-3
             lateral, edge = (1e-5 if name == "steep" else 0.0), (1e-3 if name == "edge" else 0.0)
-            depth_px = TRUE_DEPTH.sigma_px(bound_px, lamp) ** 2 * TRUE_DEPTH.relative_variance(views, step, bound_px)
+            depth_px = true.sigma_px(bound_px, lamp) ** 2 * true.relative_variance(views, step, bound_px)
             relief = relief_error_px(rough_px, 0.4, 0.05) ** 2
             images = pose + per_px2 * (depth_px + relief) + 1.5**2 * lateral + TRUE_EDGE(bound_px) ** 2 * edge
             images *= float(np.exp(scatter * rng.standard_normal()))
-            sampled_px = model.depth_error.sigma_px(bound_px, lamp) ** 2 * model.depth_error.relative_variance(
-                views, step, bound_px
-            )
+            sampled_px = law.sigma_px(bound_px, lamp) ** 2 * law.relative_variance(views, step, bound_px)
             sampled_px += relief_error_px(rough_px, model.relief_error_gain, model.relief_error_limit_px) ** 2
             sampled = (
                 pose
@@ -790,16 +866,12 @@ def test_the_fit_finds_the_scatter_of_depth_errors_between_surveys():
     assert fit._robust_scatter(departures) == pytest.approx(0.2, rel=0.4)
 
 
-def test_surveys_with_binned_images_determine_a_factor_and_not_the_laws_of_depth():
-    surveys = list(map_statistics(np.random.default_rng(0)))
+def test_surveys_with_binned_images_determine_their_law_and_not_the_laws_of_full_images():
+    surveys, by_2, by_4 = (list(map_statistics(np.random.default_rng(k), binning=k)) for k in (1, 2, 4))
     fine = fit._fit_map_variances(surveys, "error", ErrorModel())
-    binned = [
-        {k: [v[0] * 2.5**2, *v[1:]] if k.startswith("map") else v for k, v in s.items()} | {"binning": [4, 4]}
-        for s in map_statistics(np.random.default_rng(0), 0.0)
-    ]
-    both = fit._fit_map_variances([*surveys, *binned], "error", ErrorModel())
-    assert fine.binned == (1, 1)
-    assert both.binned == pytest.approx((1, 2.5), rel=0.05)
+    both = fit._fit_map_variances([*surveys, *by_2, *by_4], "error", ErrorModel())
+    assert fine.binned == ErrorModel().depth_binned_error
+    assert both.binned == pytest.approx(TRUE_BINNED, rel=0.15)
     np.testing.assert_allclose(both.depth, fine.depth, rtol=1e-3)
     assert fit._robust_scatter(both.departures) < 0.03
 

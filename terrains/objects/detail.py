@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrains.objects.mesh import Mesh
+from terrains.objects.parts import Parts, parts_of
 
 FEWEST_FACES = 64  #: a level with at most this many triangles is the last one
 
@@ -21,12 +22,19 @@ class Level(NamedTuple):
     """One level of detail.
 
     Args:
-        mesh: the mesh.
+        mesh: the mesh; its positions are stored column by column, as the rasterizer reads them.
         cell_m: side of the cells in which vertices were merged; 0 for the full mesh.
+        parts: bounds of the parts of the mesh.
     """
 
     mesh: Mesh
     cell_m: float
+    parts: Parts
+
+
+def level_of(mesh: Mesh, cell_m: float) -> Level:
+    """Returns a mesh as a level of detail; see `Level` for the arguments."""
+    return Level(mesh._replace(vertices_m=np.asfortranarray(mesh.vertices_m)), cell_m, parts_of(mesh))
 
 
 def levels_of(mesh: Mesh) -> tuple[Level, ...]:
@@ -37,13 +45,13 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
     """
     corners = mesh.vertices_m[mesh.faces]
     cell_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    levels = [Level(mesh, 0.0)]
+    levels = [level_of(mesh, 0.0)]
     while len(levels[-1].mesh.faces) > FEWEST_FACES:
         coarser = clustered(mesh, cell_m)
         if len(coarser.faces) == 0:
             break
         if len(coarser.faces) < len(levels[-1].mesh.faces):
-            levels.append(Level(coarser, cell_m))
+            levels.append(level_of(coarser, cell_m))
         cell_m *= np.sqrt(2)
     return tuple(levels)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.detail import Level, cell_colours
+from terrains.objects.detail import cell_colours, level_of
 from terrains.objects.mesh import Mesh, extent
 from terrains.objects.mesh_file import MAX_FACES, TexturedMesh
 from terrains.objects.model import ObjectModel, PlacedObject
@@ -177,8 +177,9 @@ def _tile(
     used, faces = np.unique(mesh.faces[part], return_inverse=True)
     vertices, faces = mesh.vertices_m[used], np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
     kept = colours if texture < 0 else colours[:1]
-    levels = tuple(Level(Mesh(vertices, faces, values[used]), cell_m) for values, cell_m in kept)
-    low, high = extent(levels[0].mesh)
+    full = level_of(Mesh(vertices, faces, kept[0][0][used]), 0.0)
+    levels = tuple(full._replace(mesh=full.mesh._replace(colours=values[used]), cell_m=side) for values, side in kept)
+    low, high = extent(full.mesh)
     centre = (low + high) / 2
     radius_m = float(np.linalg.norm(vertices - centre, axis=1).max())
     model = ObjectModel(levels, low, high, centre, radius_m)

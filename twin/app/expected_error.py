@@ -92,14 +92,13 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     depth, slope, rough_m, edge_m = _floor_points(mission, forecast, rig)
     bound = np.interp(depth, matching.depths_m, matching.bounds_px)
     table = matching.bounds_px
-    one_px = model.depth_error.sigma_px(matching.window_bounds_px, matching.lamp_share)
-    sigma_px = np.interp(depth, matching.depths_m, one_px)
-    sigma_px *= model.depth_binned_error(matching.binning)
+    law, _ = model.depth_laws(matching.binning)
+    sigma_px = np.interp(depth, matching.depths_m, law.sigma_px(matching.window_bounds_px, matching.lamp_share))
     in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
     poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
     step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
     window = np.interp(depth, matching.depths_m, matching.window_bounds_px)
-    share = model.depth_error.relative_variance(1 / (1 - overlap), step / rig.baseline_m, window)
+    share = law.relative_variance(1 / (1 - overlap), step / rig.baseline_m, window)
     scatters = model.error_scatter_share * model.depth_texture_scatter(table, matching.texture.scatter)
     scatter = np.interp(depth, matching.depths_m, scatters)
     evenly = (0.5 + np.arange(len(depth)) * _GOLDEN_RATIO) % 1

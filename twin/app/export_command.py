@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,13 +16,13 @@ from numpy.typing import NDArray
 
 from twin.app.camera_models import believed_calibration, true_calibration
 from twin.app.outputs import new_folder
+from twin.app.recorded_frames import recorded_frames, recorded_imu
 from twin.core.georeference import Georeference
-from twin.core.records import Array, ElevationMap, Exposure, Image, Readings
+from twin.core.records import ElevationMap, Image
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
 from twin.exchange.run_contents import RecordedFrame, RunContents
-from twin.report.frame_recorder import EXPOSURE_COLUMNS, READING_COLUMNS
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
 from twin.scenario.file import load_scenario
@@ -127,7 +126,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     if scenario is not None:
         rig = scenario.believed_rig()
     assert rig is not None
-    frames = _frames(run)
+    frames = recorded_frames(run)
     elevation = _elevation(run)
     return RunContents(
         folder=folder,
@@ -139,6 +138,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         trajectories=run.trajectories,
         keyframe_rows=run.keyframes.frames,
         frames=frames,
+        imu=None if scenario is None else recorded_imu(folder, scenario),
         elevation=elevation,
         error_m=_layer(run, "dem_error", elevation),
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
@@ -219,70 +219,3 @@ def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.fl
     if raster is None or elevation is None or raster.grid != elevation.grid:
         return None
     return raster.values.astype(np.float32)
-
-
-def _frames(run: Run) -> tuple[RecordedFrame, ...]:
-    """Returns the frames of a run whose left image was recorded, in the order of time.
-
-    Without frames.csv, as in a replay, these are keyframes; their times are those of the online or the true trajectory.
-
-    Raises:
-        TwinError: frames.csv is damaged or lacks a keyframe.
-    """
-    keyframes = set(run.keyframes.frames.tolist())
-    folder = run.folder / "frames"
-    table = folder / "frames.csv"
-    if table.is_file():
-        listed = _listed(table)
-        if missing := keyframes - {row[0] for row in listed}:
-            raise TwinError(str(table), f"has no line for the keyframe {min(missing)}", "a complete list of the frames")
-    else:
-        path = next((run.trajectories[key] for key in ("online", "truth") if key in run.trajectories), None)
-        times = [] if path is None else path.times_s.tolist()
-        listed = [(k, times[k], None, Readings()) for k in sorted(keyframes) if k < len(times)]
-    found = []
-    for index, time_s, exposure, readings in listed:
-        left, right = (folder / side / f"{index:06d}.png" for side in ("left", "right"))
-        if not left.is_file() and index in keyframes:
-            left, right = (run.image_file(index, side) for side in ("left", "right"))
-        if left.is_file():
-            right = right if right.is_file() else None
-            found.append(RecordedFrame(index, time_s, left, right, index in keyframes, readings, exposure))
-    return tuple(found)
-
-
-def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
-    """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
-    try:
-        with table.open(newline="", encoding="utf-8") as lines:
-            return [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise TwinError(str(table), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
-
-
-def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
-    """Returns index, time, exposure and readings of a line of frames.csv.
-
-    Raises:
-        ValueError: the line has too few or too many cells, or a cell is not a number.
-        KeyError: a column is missing.
-    """
-    if None in row or None in row.values():
-        raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
-    return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
-
-
-def _exposure(row: dict[str, str]) -> Exposure | None:
-    """Returns the exposure of a line of frames.csv; None if its cells are empty."""
-    red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
-    return (float(red), float(green), float(blue)) if red else None
-
-
-def _readings(row: dict[str, str]) -> Readings:
-    """Returns the readings of a line of frames.csv, which has no detected beacons."""
-    cells = [row[name] for name in READING_COLUMNS]
-
-    def vector(first: int) -> Array | None:
-        return np.array([float(cell) for cell in cells[first : first + 3]]) if cells[first] else None
-
-    return Readings(float(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))

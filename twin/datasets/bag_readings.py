@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ _TYPES = {
 }
 _Converter = Callable[[Any, str], tuple[Array, Array]]  # of a message and its place to values and variances
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
+_N_FIRST = 100  # number of messages of a topic in which an orientation is looked for
 _SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that count as one place
 
 
@@ -47,11 +49,12 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     """Returns the readings in a bag; None without any.
 
     The body is the frame of the attitude or, if there is none, that of the velocity. If /tf_static does not join this
-    frame to the left camera, neither attitude nor velocity is used. A sensor is also not used if there are several
-    topics of its type, if one of its messages states no covariance, or if it is not where it must be: the pressure
-    sensor at the left camera, the DVL at the origin of the body (within 1 cm). Readings with a value or a covariance
-    that is not finite are left out. The notes of the result name the readings that are not used. Readings whose headers
-    have no times have those of their recording.
+    frame to the left camera, neither attitude nor velocity is used. The attitude is that of the only topic of type Imu
+    whose messages state an orientation. A sensor is also not used if there are several topics of its type, if one of
+    its messages states no covariance, or if it is not where it must be: the pressure sensor at the left camera, the DVL
+    at the origin of the body (within 1 cm). Readings with a value or a covariance that is not finite are left out. The
+    notes of the result name the readings that are not used. Readings whose headers have no times have those of their
+    recording.
 
     Args:
         bag: the bag.
@@ -100,7 +103,7 @@ def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[st
 
 
 def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _Recorded | None:
-    """Returns the readings of the only topic of a type.
+    """Returns the readings of the only topic of a type; of Imu, the only one whose messages state an orientation.
 
     The result is None if there is no such topic; also, with an entry in `notes`, if several topics have this type, if a
     message has no covariance, or if the topic has no finite reading.
@@ -109,8 +112,10 @@ def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _
         TwinError: a reading is impossible.
     """
     topics = [name for name, one in bag.topics.items() if one == kind]
+    if quantity is ATTITUDE:
+        topics = _with_orientation(bag, topics, notes)
     if len(topics) > 1:
-        notes.append(f"The {quantity.name} is not used: several topics have it ({', '.join(sorted(topics))[:200]}).")
+        notes.append(f"The {quantity.name} is not used: several topics have it ({_listed(topics)}).")
     if len(topics) != 1:
         return None
     topic = topics[0]
@@ -122,6 +127,35 @@ def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _
     if series is not None and messages.unstamped:
         notes.append(f"The readings of {topic} have no times in their headers; the times of recording were used.")
     return None if series is None else _Recorded(topic, messages.frame, series)
+
+
+def _listed(topics: list[str]) -> str:
+    """Returns the names of topics for a note, at most 200 characters."""
+    return ", ".join(sorted(topics))[:200]
+
+
+def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str]:
+    """Returns those of the topics of type Imu that state an orientation, with its covariance if one of them has it.
+
+    Topics of rates and specific forces alone are left out; if all are, an entry in `notes` says so.
+
+    Raises:
+        TwinError: the bag is damaged.
+    """
+    first = {name: list(islice(bag.messages(name), _N_FIRST)) for name in topics}
+    stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
+    known = [name for name in stated if any(np.any(message.orientation_covariance) for message in first[name])]
+    if topics and not any(message.orientation_covariance[0] >= 0 for name in topics for message in first[name]):
+        notes.append(f"The attitude is not used: no message of {_listed(topics)} states an orientation.")
+        return []
+    return known or stated or topics
+
+
+def _states_orientation(message: Any) -> bool:
+    """Returns whether a message Imu has a unit quaternion whose covariance does not mark it as not measured (-1)."""
+    q = message.orientation
+    norm = np.linalg.norm([q.w, q.x, q.y, q.z])
+    return bool(message.orientation_covariance[0] >= 0 and abs(norm - 1) <= _UNIT_QUATERNION)
 
 
 class _Messages(NamedTuple):

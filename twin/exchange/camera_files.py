@@ -1,4 +1,4 @@
-"""Export of the true and the believed camera calibration in the file formats of OpenCV, Kalibr and COLMAP."""
+"""Export of the true and the believed calibration in the file formats of OpenCV, Kalibr (with IMU) and COLMAP."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from twin.core import geometry
-from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, RunContents
+from twin.exchange.run_contents import CameraIntrinsics, RecordedImu, RigCalibration, RunContents
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
@@ -26,8 +26,10 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
             target = folder / name
             target.mkdir(exist_ok=True)
             write_opencv(target / "opencv.yaml", rig)
-            write_kalibr(target / "kalibr.yaml", rig)
+            write_kalibr(target / "kalibr.yaml", rig, with_imu=contents.imu is not None)
             write_colmap_cameras(target, rig)
+            if contents.imu is not None:
+                write_kalibr_imu(target / "imu.yaml", contents.imu)
             written.append(target)
     return written
 
@@ -54,12 +56,25 @@ def write_opencv(file: Path, rig: RigCalibration) -> None:
         storage.release()
 
 
-def write_kalibr(file: Path, rig: RigCalibration) -> None:
-    """Writes a Kalibr camchain: cam0 left, cam1 right with T_cn_cnm1; k3 is left out, as the model radtan has none."""
+def write_kalibr(file: Path, rig: RigCalibration, with_imu: bool = False) -> None:
+    """Writes a Kalibr camchain: cam0 left, cam1 right with T_cn_cnm1; k3 is left out, as the model radtan has none.
+
+    With an IMU, whose axes are those of the body, each camera also has T_cam_imu.
+    """
     right_from_left = geometry.inverse(rig.left_from_right)
+    left_from_body = geometry.inverse(rig.body_from_left)
     tree = {"cam0": _kalibr_camera(rig.left, "cam0"), "cam1": _kalibr_camera(rig.right, "cam1")}
-    tree["cam1"]["T_cn_cnm1"] = [[float(value) for value in row] for row in right_from_left]
+    tree["cam1"]["T_cn_cnm1"] = right_from_left.tolist()
+    if with_imu:
+        tree["cam0"]["T_cam_imu"] = left_from_body.tolist()
+        tree["cam1"]["T_cam_imu"] = (right_from_left @ left_from_body).tolist()
     file.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), encoding="utf-8")
+
+
+def write_kalibr_imu(file: Path, imu: RecordedImu) -> None:
+    """Writes the imu.yaml of Kalibr: noise densities, random walks, rate and topic (that of --to mcap)."""
+    tree = {"rostopic": "/imu/data_raw", "update_rate": float(imu.rate_hz), **imu.noise._asdict()}
+    file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
 
 def _kalibr_camera(camera: CameraIntrinsics, name: str) -> dict[str, Any]:

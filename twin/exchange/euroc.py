@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,8 +12,13 @@ import yaml
 from twin.core import geometry
 from twin.core.records import Frame, StereoRig, Trajectory
 from twin.exchange.image_copy import copy_image
-from twin.exchange.run_contents import RecordedFrame, RunContents
+from twin.exchange.run_contents import RecordedFrame, RecordedImu, RunContents
 
+#: Columns of imu0/data.csv as in the EuRoC data set: angular rates and specific forces of the sensor, in its axes.
+_IMU_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
 _FIRST_NS = 1_000_000_000  # time of a frame at 0 s: EuRoC has no times of zero
 
 
@@ -81,7 +87,7 @@ class EurocWriter:
         rig = self.rig
         tree = {
             "sensor_type": "camera",
-            "T_BS": {"cols": 4, "rows": 4, "data": [float(value) for value in body_from_camera.ravel()]},
+            "T_BS": _matrix(body_from_camera),
             "rate_hz": float(rig.frame_rate_hz),
             "resolution": [rig.width_px, rig.height_px],
             "camera_model": "pinhole",
@@ -98,7 +104,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     Returns the path of mav0, as a list of one.
 
-    The readings are those of the pressure sensor, AHRS, DVL and USBL that were recorded. The truth consists of the
+    The readings are those of the pressure sensor, AHRS, DVL, USBL and IMU that were recorded. The truth consists of the
     poses of the body at all frames of the survey, including those without a recorded image.
     """
     writer = EurocWriter(folder, contents.rig, contents.jpeg_quality)
@@ -108,6 +114,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     if "truth" in contents.trajectories:
         writer.add_truth(contents.trajectories["truth"])
     _write_readings(writer.root, contents)
+    if contents.imu is not None:
+        _write_imu(writer.root / "imu0", contents.imu)
     return [writer.root]
 
 
@@ -153,6 +161,24 @@ def _write_readings(root: Path, contents: RunContents) -> None:
             if all(sigmas):
                 tree = {"sensor_type": name[:-1], "sigma": [float(sigma) for sigma in sigmas]}
                 (root / name / "sensor.yaml").write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+
+
+def _write_imu(folder: Path, imu: RecordedImu) -> None:
+    """Writes data.csv, without loss, and sensor.yaml of the IMU, whose axes are those of the body."""
+    folder.mkdir()
+    values = np.hstack([imu.readings.rates_radps, imu.readings.specific_forces_mps2])
+    with (folder / "data.csv").open("w", encoding="utf-8") as lines:
+        lines.write(f"{_IMU_HEADER}\n")
+        for time_s, row in zip(imu.readings.times_s, values.tolist(), strict=True):
+            lines.write(",".join([str(timestamp_ns(time_s)), *map(repr, row)]) + "\n")
+    tree = {"sensor_type": "imu", "T_BS": _matrix(np.eye(4)), "rate_hz": float(imu.rate_hz), **imu.noise._asdict()}
+    text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
+    (folder / "sensor.yaml").write_text(text, encoding="utf-8")
+
+
+def _matrix(pose: np.ndarray) -> dict[str, Any]:
+    """Returns a pose (4, 4) in the form of EuRoC's sensor.yaml."""
+    return {"cols": 4, "rows": 4, "data": [float(value) for value in pose.ravel()]}
 
 
 def timestamp_ns(time_s: float) -> int:

@@ -18,7 +18,7 @@ from twin.errors import TwinError
 from twin.exchange.euroc import timestamp_ns
 from twin.exchange.image_copy import encoded_image
 from twin.exchange.ros2_messages import BODY, LEFT, RIGHT, WORLD, MessageFactory
-from twin.exchange.run_contents import RunContents
+from twin.exchange.run_contents import RecordedImu, RunContents
 
 BAG = "ros2_bag"  # folder of the bag, and the name of its MCAP file
 _AIR_PA = 101_325.0  # standard air pressure
@@ -36,7 +36,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes the bag `folder`/ros2_bag (MCAP and metadata.yaml) with all messages in the order of time.
 
     Topics: /left/image_rect/compressed, /left/camera_info and the same for right; /tf_static; /odometry and /tf of the
-    final trajectory; /ground_truth/odometry if the truth is known; /imu/data (attitude), /pressure, /dvl if recorded.
+    final trajectory; /ground_truth/odometry if the truth is known; /imu/data (attitude), /imu/data_raw (rates and
+    specific forces), /pressure, /dvl if recorded.
     All times are those of `euroc.timestamp_ns`.
 
     Raises:
@@ -74,6 +75,8 @@ def pressure_pa(height_m: float, surface_m: float) -> float:
 def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
     """Returns all messages of a run in the order of time; images are read one by one."""
     streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
+    if contents.imu is not None:
+        streams.append(_inertial(contents.imu, factory))
     body_from_left = contents.rig.body_from_camera
     for topic, name in (("/odometry", "final"), ("/ground_truth/odometry", "truth")):
         if name in contents.trajectories and len(contents.trajectories[name]):
@@ -166,6 +169,15 @@ def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
         if readings.dvl_mps is not None:
             sigma_mps = float(navigation.get("dvl_sigma_mps", 0.0))
             yield Message(time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps))
+
+
+def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
+    """Yields the readings of the IMU; the variance of white noise of density s at a rate f is s^2 f."""
+    root = np.sqrt(imu.rate_hz)
+    sigmas = imu.noise.gyroscope_noise_density * root, imu.noise.accelerometer_noise_density * root
+    for time_s, rates, forces in zip(*imu.readings, strict=True):
+        time_ns = timestamp_ns(time_s)
+        yield Message(time_ns, "/imu/data_raw", factory.inertial(time_ns, rates, forces, sigmas))
 
 
 def _static_qos() -> list[Any]:

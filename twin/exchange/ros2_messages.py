@@ -103,12 +103,26 @@ class MessageFactory:
             rpy_rad: (3,) roll, pitch and yaw of the body in the world [rad].
             sigmas_rad: (3,) their standard deviations [rad].
         """
-        unknown, zero = np.zeros(9), self._vector(np.zeros(3))
-        unknown[0] = _NOT_MEASURED
+        unknown, zero = _unknown_covariance(), self._vector(np.zeros(3))
         attitude = geometry.pose(geometry.rotation_from_rpy(*(float(angle) for angle in rpy_rad)), np.zeros(3))
         return self._make(
             "sensor_msgs/msg/Imu", self._header(time_ns, BODY), self._quaternion(attitude),
             np.diag(np.square(sigmas_rad)).ravel(), zero, unknown, zero, unknown.copy(),
+        )  # fmt: skip
+
+    def inertial(self, time_ns: int, rates_radps: Array, forces_mps2: Array, sigmas: tuple[float, float]) -> Any:
+        """Returns sensor_msgs/Imu with angular rates and specific forces; the orientation is marked as not measured.
+
+        Args:
+            time_ns: time of the reading.
+            rates_radps: (3,) angular rates of the body in its own axes [rad/s].
+            forces_mps2: (3,) specific forces in the axes of the body, "linear acceleration" in ROS [m/s2].
+            sigmas: standard deviations of the white noise of each rate [rad/s] and of each specific force [m/s2].
+        """
+        rate_cov, force_cov = (np.diag([sigma**2] * 3).ravel() for sigma in sigmas)
+        return self._make(
+            "sensor_msgs/msg/Imu", self._header(time_ns, BODY), self._quaternion(np.eye(4)), _unknown_covariance(),
+            self._vector(rates_radps), rate_cov, self._vector(forces_mps2), force_cov,
         )  # fmt: skip
 
     def pressure(self, time_ns: int, pressure_pa: float, sigma_pa: float) -> Any:
@@ -165,3 +179,8 @@ class MessageFactory:
         """
         twist = self._make("geometry_msgs/msg/Twist", self._vector(twist_body[3:]), self._vector(twist_body[:3]))
         return self._make("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
+
+
+def _unknown_covariance() -> Array:
+    """Returns the covariance (9,) of a quantity of sensor_msgs/Imu that is not measured."""
+    return np.array([_NOT_MEASURED, *[0.0] * 8])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.georeference import Georeference
-from twin.core.records import Array, ElevationMap, Exposure, Image, Readings, StereoRig, Trajectory
+from twin.core.records import Array, ElevationMap, Exposure, Image, ImuReadings, Readings, StereoRig, Trajectory
 
 #: Trajectories that give the poses of exported images, best first.
 POSES = ("truth", "final")
@@ -38,6 +38,36 @@ class RecordedFrame:
     keyframe: bool
     readings: Readings = field(default_factory=Readings)
     exposure: Exposure | None = None
+
+
+class ImuNoise(NamedTuple):
+    """Noise of an inertial measurement unit (IMU) in the terms of Kalibr.
+
+    Args:
+        gyroscope_noise_density: white noise of each angular rate [rad/s/sqrt(Hz)].
+        gyroscope_random_walk: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)].
+        accelerometer_noise_density: white noise of each specific force [m/s2/sqrt(Hz)].
+        accelerometer_random_walk: random walk of the bias of each specific force [m/s3/sqrt(Hz)].
+    """
+
+    gyroscope_noise_density: float
+    gyroscope_random_walk: float
+    accelerometer_noise_density: float
+    accelerometer_random_walk: float
+
+
+class RecordedImu(NamedTuple):
+    """Readings of the IMU of a run, which is at the origin of the body.
+
+    Args:
+        readings: all readings of the run, in body axes.
+        rate_hz: number of readings per second.
+        noise: noise that the scenario states.
+    """
+
+    readings: ImuReadings
+    rate_hz: float
+    noise: ImuNoise
 
 
 class CameraIntrinsics(NamedTuple):
@@ -157,6 +187,7 @@ class RunContents:
         georeference: position of the scene in a CRS, from the measured DEM or the options of the export; None: local
             coordinates.
         true_layers: renders the world again and returns its true layers; None without a simulated world.
+        imu: readings of the IMU; None if none were recorded.
         jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: copies of the PNG files.
         progress: called with the completed fraction of the format that is being written, 0 to 1.
     """
@@ -175,6 +206,7 @@ class RunContents:
     orthomosaic: Path | None = None
     georeference: Georeference | None = None
     true_layers: Callable[[], TrueLayers] | None = None
+    imu: RecordedImu | None = None
     jpeg_quality: int | None = None
     progress: Callable[[float], None] = field(default=lambda _: None)
 

@@ -130,8 +130,8 @@ def _spread(steps: Array, range_m: Array, grid_px: tuple[Array, Array], rig: Ste
 
     Args:
         steps: (rows + 2 MARGIN, cols + 2 MARGIN, ranges, 3) backscatter of each step of range, with the margin.
-        range_m: (ranges,) ranges.
-        grid_px: rows and columns of the grid, with the margin [px].
+        range_m: (ranges,) range in the middle of each step [m].
+        grid_px: positions of the rows and of the columns of the grid, with the margin [px].
         rig: the camera.
         water: optical properties of the water.
     """
@@ -153,9 +153,9 @@ def _size(rig: StereoRig) -> tuple[float, float]:
 
 
 def _grid_px(n: int, size_px: float, margin: int) -> Array:
-    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` more on each side, up to `size_px` away.
+    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px].
 
-    The spacing of the latter grows with the distance.
+    The spacing of the outer positions grows outwards; the outermost ones are `size_px` away from the ends.
     """
     outside = size_px * (np.arange(1.0, margin + 1) / max(margin, 1)) ** 2
     return np.concatenate([-outside[::-1], np.linspace(0.0, size_px, n), size_px + outside])

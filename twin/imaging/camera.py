@@ -158,9 +158,9 @@ class StereoCamera:
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
-        """Returns the left and the right image at the time of the last capture; has no effect on later captures.
+        """Returns the left and the right image (H, W, 3) at the time of the last capture.
 
-        The noise is that of the next capture.
+        Has no effect on later captures. The noise is that of the next capture.
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.

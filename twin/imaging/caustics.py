@@ -117,7 +117,7 @@ class Caustics:
         return both[..., 0], both[..., 1]
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
-        """Returns `closed_pattern`."""
+        """Returns the result of `closed_pattern`, computed without its cache."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
         spectrum = np.asarray(cv2.dft(light), np.float32)
@@ -148,10 +148,11 @@ class Caustics:
 def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase: PhaseTable) -> Array:
     """Returns the modulation transfer function of the irradiance at a depth below a narrow vertical beam.
 
-    Light that is scattered by the angle t at the height h above the plane meets it at a distance of h tan(t), after a
-    path that is longer by h (1 / cos(t) - 1), over which it is absorbed. With any number of such scattering events
-    (Wells 1973), the irradiance has the transform exp(b (F(k) - F(0))), where F(k) is the integral over h from 0 to the
-    depth and over all downward directions of p(t) exp(-a h (1 / cos(t) - 1)) J0(k h tan(t)).
+    Light that is scattered by the angle t at the height h above the plane meets the plane at the distance h tan(t)
+    from the beam, after a path that is longer by h (1 / cos(t) - 1), over which light is absorbed. With any number of
+    such scattering events (Wells 1973), the irradiance has the transform exp(b (F(k) - F(0))), where F(k) is the
+    integral over h from 0 to the depth and over all downward directions of p(t) exp(-a h (1 / cos(t) - 1))
+    J0(k h tan(t)).
 
     Args:
         k: wave numbers of the pattern, of any shape [rad/m].
@@ -197,15 +198,15 @@ def _packed(transfer: Array) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_waves(east, north, cosine, sine, spectrum):
-    """Adds waves to the spectrum whose inverse transform has the slopes towards east and north as its two parts.
+    """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
 
-    The slopes are real: each coefficient of a half plane of wave numbers determines that of the opposite wave number.
+    Both slopes are real: the coefficient of a wave number determines that of the opposite wave number.
 
     Args:
         east, north: (n, n / 2 + 1) complex amplitudes of the slopes at time 0.
-        cosine, sine: (n, n / 2 + 1) of the phase by which the waves have advanced.
-        spectrum: (n, n, 2) real and imaginary part of the sum of the spectrum of the slopes towards east and of i times
-            that of the slopes towards north.
+        cosine, sine: (n, n / 2 + 1) cosine and sine of the phase by which the waves have advanced.
+        spectrum: (n, n, 2) real and imaginary part of the spectrum, modified in place: that of the slopes towards east
+            plus i times that of the slopes towards north.
     """
     n, half = spectrum.shape[0], spectrum.shape[1] // 2
     for i in range(n):

@@ -36,9 +36,10 @@ class FloorDaylight(NamedTuple):
     The light on a floor at depth z with the unit normal n is
 
         E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0)
-                  + (n, 1) rest_lx (n, 1)' exp(d rest_per_m[0] + min(max(d, low), high)^2 rest_per_m[1]),
+                  + (n, 1) rest_lx (n, 1)' exp(d k1 + min(max(d, low), high)^2 k2),
 
-    with d = z - reference_depth_m and (low, high) the range of the fit. A negative quadratic form counts as 0.
+    for each band, with d = z - reference_depth_m, (k1, k2) its row of `rest_per_m`, and (low, high) = fitted_m. A
+    negative quadratic form counts as 0.
 
     Args:
         to_sun: (3,) unit direction to the refracted sun, east, north, up.
@@ -95,8 +96,8 @@ def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, 
         depths_m: (n,) depths at which the change with depth is fitted.
 
     Returns:
-        Quadratic form (4, 4) in (n, 1), with n the floor normal, per lux at the surface, and coefficients (2,) of its
-        change with depth; see `FloorDaylight.rest_lx` and `rest_per_m`.
+        Quadratic form (4, 4) in (n, 1), with n the floor normal in the axes of the sun (see `_turn`), per lux at the
+        surface, and coefficients (2,) of its change with depth; see `FloorDaylight.rest_lx` and `rest_per_m`.
     """
     light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
     square, slope, level = np.polyfit(depths_m - deep_m, light, 2)

@@ -100,7 +100,7 @@ class ForwardScatter:
         In an image of a plane, 1 / depth is linear in column and row.
 
         Returns:
-            Depth [m], inf beyond `FAR_M`, and the fractional row index into `kept`.
+            Depth (rows, cols) [m], inf beyond `FAR_M`, and the fractional row index (rows, cols) into `kept`.
         """
         shape = self.surroundings.shape
         plane, place = np.empty(shape, np.float32), np.empty(shape, np.float32)

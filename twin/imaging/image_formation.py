@@ -150,7 +150,7 @@ class ImageFormation:
 
     @property
     def snows(self) -> bool:
-        """Returns whether marine snow is enabled."""
+        """Whether marine snow is enabled."""
         return self._snow is not None
 
     def components(

@@ -49,7 +49,7 @@ class LampLight:
         )
 
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
-        """Returns the light of a lamp on a particle (..., 3) [lx], and the unit directions from the lamp (..., 3).
+        """Returns the light (..., 3) of a lamp on particles for R, G, B [lx], and unit directions (..., 3) from it.
 
         The light is the illuminance of a plane that faces the lamp, except that scattered light counts equally from all
         directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
@@ -157,7 +157,11 @@ def _path_m() -> Array:
 
 @lru_cache(maxsize=64)
 def _on_rings(beam: Beam) -> Array:
-    """Returns the means (SOFT_STEPS + 1, m) of a beam around each direction, weighted by each of m Gaussians."""
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians.
+
+    The n = SOFT_STEPS + 1 directions are at even steps of sqrt(1 - cos(angle)) from the beam axis, 0 to 1; the standard
+    deviations of the Gaussians are `LAMP_SIGMA_RAD`.
+    """
     edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
     cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
     azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi
@@ -172,7 +176,7 @@ def _from_table(points, position, axis, strength, table, lux, from_lamp):
     """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
 
     Args:
-        position, axis: those of the lamp.
+        position, axis: (3,) position [m] and unit beam axis of the lamp.
         strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
         table: (n, m, 3) all light of the lamp, see `_light`.
     """

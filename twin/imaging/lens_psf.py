@@ -140,7 +140,7 @@ class LensPsf:
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
-    """Returns the MTF of a lens in a band (0 red) at frequencies of any shape [cycles/px].
+    """Returns the MTF of a lens in a band (0 red, 1 green, 2 blue) at frequencies of any shape [cycles/px].
 
     It is that of the aberrations, times that of diffraction if `lens.diffraction` is set and there is a sensor.
     """
@@ -414,7 +414,7 @@ def _defocus_row(above, here, below, diameter, out):
     """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel that has the moments of a disc.
 
     A disc of diameter c has the variance c^2 / 16 along each axis and the fourth moment <x^2 y^2> = c^4 / 384.
-    Diameters above `SMALL_PX` count as `SMALL_PX`.
+    `diameter` (3 W,) [px] has the diameter for each band of each pixel; those above `SMALL_PX` count as `SMALL_PX`.
     """
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]

@@ -1,7 +1,8 @@
 """Reflection of light by the floor: Lambertian, Oren-Nayar or Hapke, and specular highlights.
 
-A material is given by its bidirectional reflectance f [1/sr]: radiance = f * illuminance. With mu_i and mu_o the
-cosines of incidence and of view, c = cos(phase angle g) = i . o, and rho the albedo of the texture:
+A material is given by its bidirectional reflectance f [1/sr]: radiance = f * illuminance. With i and o the unit
+vectors to the light and to the camera, mu_i and mu_o the cosines of incidence and of view, c = i . o the cosine of the
+phase angle g, and rho the albedo of the texture:
 
 Lambertian: f = rho / pi.
 
@@ -10,15 +11,15 @@ Oren & Nayar 1994 (qualitative model, their eq. 30), sigma the standard deviatio
     A = 1 - 0.5 sigma^2 / (sigma^2 + 0.33),  B = 0.45 sigma^2 / (sigma^2 + 0.09)
 where s / max(mu_i, mu_o) equals cos(azimuth difference) sin(alpha) tan(beta) of the paper.
 
-Hapke 1981 (isotropic scatterers; Hapke 1986 for the opposition effect B), for a layer of grains without larger relief:
-    f = w / (4 pi) / (mu_i + mu_o) * (1 + B(c) + H(mu_i) H(mu_o) - 1),
-    H(x) = (1 + 2x) / (1 + 2x gamma),  gamma = sqrt(1 - w),  B = B0 / (1 + tan(g/2) / h)
+Hapke 1981 (isotropic scatterers; Hapke 1986 for the opposition effect B_g), a layer of grains without larger relief:
+    f = w / (4 pi) / (mu_i + mu_o) * (1 + B_g + H(mu_i) H(mu_o) - 1),
+    H(x) = (1 + 2x) / (1 + 2x gamma),  gamma = sqrt(1 - w),  B_g = B0 / (1 + tan(g/2) / h)
 The single-scattering albedo w follows from the albedo: rho is the diffusive reflectance (1 - gamma) / (1 + gamma).
 
 Specular highlights: the share F of the light that meets a microfacet is mirrored, the share 1 - F reflected as above.
-With the distribution D of the normals h of microfacets and the shadowing-masking function G of GGX (Walter et al. 2007,
+With the distribution D of the normals m of microfacets and the shadowing-masking function G of GGX (Walter et al. 2007,
 eqs. 20, 33 and 34; F does not depend on the angle, so that energy is conserved):
-    f_s = F D(h) G(i) G(o) / (4 mu_i mu_o)
+    f_s = F D(m) G(i) G(o) / (4 mu_i mu_o)
 
 Daylight, and lamp light that was scattered on its way to the floor, are reflected as by a Lambertian floor.
 """
@@ -91,7 +92,7 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
         diffuse = (one - gamma * gamma) * np.float32(0.25) * per_pi / (mu_i + mu_o) * (opposition + many)
     if specular == zero:
         return diffuse
-    half_squared = (mu_i + mu_o) * (mu_i + mu_o) / max(two + two * phase, tiny)  # squared cosine of normal and h
+    half_squared = (mu_i + mu_o) * (mu_i + mu_o) / max(two + two * phase, tiny)  # squared cosine of normal and m
     spread = half_squared * (alpha_squared - one) + one
     distribution = alpha_squared * per_pi / (spread * spread)
     mask_i = mu_i + np.sqrt(alpha_squared + (one - alpha_squared) * mu_i * mu_i)

@@ -3,10 +3,17 @@
 One kernel serves the cameras, the shadow maps of lamps and sun, and the view from above that gives the true heights.
 A pixel shows the triangle that the ray through the pixel centre meets first, and the exact depth of this point. Within
 a triangle, 1 / depth is linear in column and row in a perspective view; in a parallel view, depth is linear.
+
+Triangles are about as large as a pixel, so most of the time would be lost by branches that the processor predicts
+wrongly. Each part of a mesh (`terrains.objects.parts`) therefore passes through loops that write lists, almost without
+branches: triangles that cover pixel centres, covered pixel centres, drawn pixels. Parts outside the image, and those of
+which all triangles face away, are left out; neither changes the image.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +21,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from terrains.objects.mesh import Mesh
+from terrains.objects.parts import PART_FACES, UNKNOWN, Parts
+from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 NEAR_M = 0.05  #: depth of the near clipping plane of all cameras
+MARGIN = 1e-6  #: relative margin of tests that leave out parts, far above rounding errors
+MARGIN_PX = 1e-3  #: the same, in the image
 
 
 class Projection(NamedTuple):
@@ -58,8 +69,7 @@ class Target(NamedTuple):
         albedo: (H, W, 3) uint8; None: not drawn.
         normal: (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn.
         label: (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn.
-        uv: (H, W, 3) float32 values interpolated between the `uv` of the vertices that `draw_mesh` was given; None: not
-            drawn.
+        uv: (H, W, 3) float32 values interpolated between `DrawnMesh.uv` of the vertices; None: not drawn.
     """
 
     depth: Depth
@@ -69,74 +79,92 @@ class Target(NamedTuple):
     uv: NDArray[np.float32] | None = None
 
 
-def draw_mesh(
-    mesh: Mesh,
-    camera_from_object: Array,
-    projection: Projection,
-    target: Target,
-    label: int = 0,
-    closed: bool = False,
-    uv: NDArray[np.float32] | None = None,
-) -> None:
-    """Draws a mesh into images, in the pixels where it is nearer than what they show.
+class DrawnMesh(NamedTuple):
+    """A mesh to draw into images.
 
     Args:
-        mesh: the mesh.
+        mesh: triangles.
         camera_from_object: (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera.
+        label: number to write into `Target.label`.
+        closed: whether the mesh is closed, so that the triangles that face away are not drawn.
+        parts: bounds of the parts of the mesh.
+        uv: (n, 3) values of the vertices, drawn into `Target.uv`; None: `Target.uv` is not drawn.
+    """
+
+    mesh: Mesh
+    camera_from_object: Array
+    label: int = 0
+    closed: bool = False
+    parts: Parts = UNKNOWN
+    uv: NDArray[np.float32] | None = None
+
+
+def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Target) -> None:
+    """Draws meshes into images, in the pixels where each is nearer than what they show; bands of rows are parallel.
+
+    Args:
+        drawn: the meshes, in the order in which they are drawn.
         projection: projection of the camera.
         target: images to draw into, modified in place.
-        label: number to write into `target.label`.
-        closed: whether the mesh is closed, so that the triangles that face away are not drawn.
-        uv: (n, 3) values of the vertices, drawn into `target.uv`; None: `target.uv` is not drawn.
     """
-    matrix = np.ascontiguousarray(camera_from_object[:3], np.float64)
-    if uv is None or target.uv is None:
-        uv, target = None, target._replace(uv=None)
-    _draw(*mesh, uv, matrix, projection, *target, np.uint16(label), closed)
+    draw = []
+    for item in drawn:
+        points = np.ascontiguousarray(item.mesh.vertices_m.T)
+        matrix = np.ascontiguousarray(item.camera_from_object[:3], np.float64)
+        images = target._replace(uv=None) if item.uv is None else target
+        uv = None if target.uv is None else item.uv
+        geometry = points, *item.mesh[1:], uv, item.parts, matrix, projection
+        draw.append(partial(_draw, *geometry, *images, item.label, item.closed))
+
+    def draw_rows(first: int, end: int) -> None:
+        for draw_rows_of_mesh in draw:
+            draw_rows_of_mesh(first, end)
+
+    in_row_bands(draw_rows, len(target.depth))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw(vertices, faces, colours, uv, matrix, projection, depth, albedo, normal, label, places, number, closed):
-    """Compiled kernel of `draw_mesh`. The compiler removes the code for images that are None."""
-    focal, cx, cy, near, perspective = projection
-    n = vertices.shape[0]
-    point, place = np.empty((n, 3)), np.empty((n, 3))  # in camera axes; column, row and 1 / depth or -depth
-    for i in range(n):
-        a, b, c = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
-        x = matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c + matrix[0, 3]
-        y = matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c + matrix[1, 3]
-        z = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
-        point[i, 0], point[i, 1], point[i, 2] = x, y, z
-        share = 1 / z if perspective else 1.0
-        place[i, 0], place[i, 1], place[i, 2] = focal * x * share + cx, focal * y * share + cy, share
-        if not perspective:
-            place[i, 2] = -z
-    height, width = depth.shape
-    for f in range(faces.shape[0]):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-        if point[i, 2] < near or point[j, 2] < near or point[k, 2] < near:
-            continue
-        ua, va, ub, vb, uc, vc = place[i, 0], place[i, 1], place[j, 0], place[j, 1], place[k, 0], place[k, 1]
-        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if area == 0 or (closed and area > 0):  # the area is negative if the triangle faces the viewer
-            continue
-        first_u = max(int(np.ceil(max(min(ua, ub, uc), -1.0))), 0)
-        last_u = int(np.floor(min(max(ua, ub, uc), width - 1.0)))
-        first_v = max(int(np.ceil(max(min(va, vb, vc), -1.0))), 0)
-        last_v = int(np.floor(min(max(va, vb, vc), height - 1.0)))
-        if first_u > last_u or first_v > last_v:
-            continue
-        per_area = 1 / area
-        qa, qb, qc = place[i, 2], place[j, 2], place[k, 2]
-        facing = False
-        nx, ny, nz = 0.0, 0.0, 0.0
-        for v in range(first_v, last_v + 1):
-            for u in range(first_u, last_u + 1):
-                wb = ((u - ua) * (vc - va) - (uc - ua) * (v - va)) * per_area
-                wc = ((ub - ua) * (v - va) - (u - ua) * (vb - va)) * per_area
+def _draw(
+    points, faces, colours, uv, parts, matrix, projection, depth, albedo, normal, label, places, number, closed, first,
+    end,
+):  # fmt: skip
+    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n).
+
+    The compiler removes the code for images that are None.
+    """
+    n = faces.shape[0]
+    shown = np.empty((n + PART_FACES - 1) // PART_FACES, np.int32)
+    window = 0, depth.shape[1], first, end
+    n_shown = _list_parts(parts, matrix, projection, window, closed, shown)
+    if n_shown == 0:
+        return
+    point, place = np.empty(points.shape), np.empty(points.shape)
+    _project(points, matrix, projection, point, place)
+    perspective = projection[4]
+    kept = np.empty(PART_FACES + 1, np.int32)
+    capacity = max(PART_FACES, depth.shape[1] // 2 + 1)  # blocks of 2 x 2 pixels, enough for two rows of pixels
+    blocks = np.empty((3, capacity), np.int32)
+    block_face, block_u, block_v = blocks[0], blocks[1], blocks[2]
+    weight_b, weight_c, hits = np.empty((capacity, 4)), np.empty((capacity, 4)), np.empty(4 * capacity + 1, np.int32)
+    for s in range(n_shown):
+        start = shown[s] * PART_FACES
+        n_kept = _list_triangles(faces, start, min(start + PART_FACES, n), place, window, closed, kept)
+        k, row = 0, first
+        while k < n_kept:
+            n_hits, k, row = _list_pixels(
+                faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
+            )
+            f, i, j, m, oriented = np.int32(-1), 0, 0, 0, False
+            qa, qb, qc, nx, ny, nz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for h in range(n_hits):
+                block, pixel = hits[h] >> 2, hits[h] & 3
+                u, v = block_u[block] + (pixel & 1), block_v[block] + (pixel >> 1)
+                wb, wc = weight_b[block, pixel], weight_c[block, pixel]
                 wa = 1 - wb - wc
-                if wa < 0 or wb < 0 or wc < 0:
-                    continue
+                if block_face[block] != f:
+                    f, oriented = block_face[block], False
+                    i, j, m = faces[f, 0], faces[f, 1], faces[f, 2]
+                    qa, qb, qc = place[2, i], place[2, j], place[2, m]
                 q = wa * qa + wb * qb + wc * qc
                 z = 1 / q if perspective else -q
                 if not np.float32(z) < depth[v, u]:
@@ -145,27 +173,186 @@ def _draw(vertices, faces, colours, uv, matrix, projection, depth, albedo, norma
                 if label is not None:
                     label[v, u] = number
                 if normal is not None:
-                    if not facing:
-                        nx, ny, nz = _normal(point[i], point[j], point[k], perspective)
-                        facing = True
+                    if not oriented:
+                        nx, ny, nz = _normal(point, i, j, m, perspective)
+                        oriented = True
                     normal[v, u, 0], normal[v, u, 1], normal[v, u, 2] = nx, ny, nz
+                pa, pb, pc = (wa * qa / q, wb * qb / q, wc * qc / q) if perspective else (wa, wb, wc)
                 if albedo is not None:
-                    pa, pb, pc = (wa * qa / q, wb * qb / q, wc * qc / q) if perspective else (wa, wb, wc)
                     for band in range(3):
-                        mixed = pa * colours[i, band] + pb * colours[j, band] + pc * colours[k, band]
+                        mixed = pa * colours[i, band] + pb * colours[j, band] + pc * colours[m, band]
                         albedo[v, u, band] = np.uint8(mixed + 0.5)
                 if uv is not None:
-                    pa, pb, pc = (wa * qa / q, wb * qb / q, wc * qc / q) if perspective else (wa, wb, wc)
-                    for part in range(3):
-                        places[v, u, part] = pa * uv[i, part] + pb * uv[j, part] + pc * uv[k, part]
+                    for t in range(3):
+                        places[v, u, t] = pa * uv[i, t] + pb * uv[j, t] + pc * uv[m, t]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _normal(a, b, c, perspective):
-    """Returns the unit normal of the triangle a, b, c in camera axes, on the side that the camera sees."""
-    px, py, pz, qx, qy, qz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
+@njit(cache=True, nogil=True, error_model="numpy")
+def _list_parts(parts, matrix, projection, window, closed, shown):
+    """Lists the parts that the image may show by their numbers in `shown`; returns how many there are.
+
+    The other parts have no pixel centre of the `window` (first column, end, first row, end) in the rectangle around
+    their box, or all their triangles face away. A triangle with the corner p and the normal m faces away from a camera
+    at e if m (p - e) >= 0. With the centre c of the part, w = c - e, the angle b between w and the axis, and the angle
+    a of the cone, m (p - e) >= |w| cos(a + b) - behind_m. In a parallel view, w is the direction of view, and m w >= 0
+    suffices.
+    """
+    centre, half, axis, cos_sin, behind = parts
+    focal, cx, cy, near, perspective = projection
+    left, right, top, bottom = window
+    inverse = _inverse(matrix)  # of zeros if the map mirrors, so that triangles that face away are not left out
+    n = 0
+    for p in range(shown.size):
+        shown[n] = p
+        if centre.shape[0] == 0:
+            n += 1
+            continue
+        x, rx = _interval(matrix[0], centre[p], half[p])
+        y, ry = _interval(matrix[1], centre[p], half[p])
+        z, rz = _interval(matrix[2], centre[p], half[p])
+        farthest, nearest = z + rz, max(z - rz, near)
+        x0, x1, y0, y1 = x - rx, x + rx, y - ry, y + ry
+        if perspective:
+            x0, x1 = x0 / (nearest if x0 < 0 else farthest), x1 / (farthest if x1 < 0 else nearest)
+            y0, y1 = y0 / (nearest if y0 < 0 else farthest), y1 / (farthest if y1 < 0 else nearest)
+        u0, u1 = max(np.ceil(focal * x0 + cx - MARGIN_PX), left), min(np.floor(focal * x1 + cx + MARGIN_PX), right - 1)
+        v0, v1 = max(np.ceil(focal * y0 + cy - MARGIN_PX), top), min(np.floor(focal * y1 + cy + MARGIN_PX), bottom - 1)
+        away = False
+        if closed:
+            wx, wy, wz = (x, y, z) if perspective else (0.0, 0.0, 1.0)
+            a = inverse[0, 0] * wx + inverse[0, 1] * wy + inverse[0, 2] * wz
+            b = inverse[1, 0] * wx + inverse[1, 1] * wy + inverse[1, 2] * wz
+            c = inverse[2, 0] * wx + inverse[2, 1] * wy + inverse[2, 2] * wz
+            length_2, along = a * a + b * b + c * c, a * axis[p, 0] + b * axis[p, 1] + c * axis[p, 2]
+            across = np.sqrt(max(length_2 - along * along, 0.0))
+            gap = behind[p] if perspective or behind[p] == np.inf else 0.0
+            gap += MARGIN * np.sqrt(length_2)
+            away = along > 0 and along * cos_sin[p, 0] - across * cos_sin[p, 1] > gap
+        n += np.int64((farthest >= near) & (u0 <= u1) & (v0 <= v1) & (not away))
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _interval(row, centre, half):
+    """Returns centre and half extent of a box along an axis of the camera, given this row of the matrix."""
+    middle = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2] + row[3]
+    return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _inverse(matrix):
+    """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros if it mirrors."""
+    a, b, c = matrix[0, :3], matrix[1, :3], matrix[2, :3]
+    inverse = np.zeros((3, 3))
+    inverse[:, 0], inverse[:, 1], inverse[:, 2] = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+    determinant = np.sum(a * inverse[:, 0])
+    return inverse / determinant if determinant > 0 else np.zeros((3, 3))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(points, matrix, projection, point, place):
+    """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth.
+
+    Columns are NaN for points nearer than the near plane.
+    """
+    focal, cx, cy, near, perspective = projection
+    a, b, c = points
+    n = a.size
+    for k in range(3):
+        m, along = matrix[k], point[k]
+        for i in range(n):
+            along[i] = m[0] * np.float64(a[i]) + m[1] * np.float64(b[i]) + m[2] * np.float64(c[i]) + m[3]
+    x, y, z = point
+    u, v, q = place
+    for i in range(n):
+        q[i] = 1 / z[i] if perspective else 1.0
+    for i in range(n):
+        column = focal * x[i] * q[i] + cx
+        u[i] = np.nan if z[i] < near else column
+    for i in range(n):
+        v[i] = focal * y[i] * q[i] + cy
+    if not perspective:
+        for i in range(n):
+            q[i] = -z[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _list_triangles(faces, start, end, place, window, closed, kept):
+    """Lists those of the triangles `start` to `end` - 1 that may cover pixel centres in `kept`; returns their number.
+
+    Triangles with a corner nearer than the near plane are not listed, nor, with `closed`, those that face away.
+    """
+    u, v = place[0], place[1]
+    n = 0
+    for f in range(start, end):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ua, va, ub, vb, uc, vc = u[i], v[i], u[j], v[j], u[k], v[k]
+        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)  # negative if the triangle faces the viewer
+        u0, u1, v0, v1 = _rectangle(ua, va, ub, vb, uc, vc, window)
+        kept[n] = f
+        n += np.int64(((area < 0) | ((area > 0) & (not closed))) & (u0 <= u1) & (v0 <= v1))
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _rectangle(ua, va, ub, vb, uc, vc, window):
+    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle."""
+    left, right, top, bottom = window
+    u0, u1 = max(np.ceil(min(ua, ub, uc)), np.float64(left)), min(np.floor(max(ua, ub, uc)), np.float64(right - 1))
+    v0, v1 = max(np.ceil(min(va, vb, vc)), np.float64(top)), min(np.floor(max(va, vb, vc)), np.float64(bottom - 1))
+    return u0, u1, v0, v1
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _list_pixels(
+    faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
+):  # fmt: skip
+    """Lists the pixel centres that triangles cover, from row `row` of triangle number `k` of the list `kept` on.
+
+    The rectangle around a triangle is divided into blocks of 2 x 2 pixels, of which most triangles need one. For each
+    block, the function fills its triangle, its first column and row, and the weights of the second and third corner
+    at its pixels. A hit is 4 times the number of a block plus that of a pixel in it.
+
+    Returns:
+        Number of hits; number and row of the triangle that does not fit into the arrays any more, or `n_kept`.
+    """
+    u, v = place[0], place[1]
+    n_blocks, n_hits = 0, 0
+    while k < n_kept:
+        f = kept[k]
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ua, va, ub, vb, uc, vc = u[a], v[a], u[b], v[b], u[c], v[c]
+        ab_u, ab_v, ac_u, ac_v = ub - ua, vb - va, uc - ua, vc - va
+        per_area = 1 / (ab_u * ac_v - ac_u * ab_v)
+        u0, u1, v0, v1 = _rectangle(ua, va, ub, vb, uc, vc, window)
+        y = max(v0, np.float64(row))
+        while y <= v1:
+            if n_blocks + (u1 - u0) / 2 + 1 > block_face.size:
+                return n_hits, k, np.int64(y)
+            x = u0
+            while x <= u1:
+                block_face[n_blocks], block_u[n_blocks], block_v[n_blocks] = f, np.int32(x), np.int32(y)
+                for pixel in range(4):
+                    across, down = x + (pixel & 1) - ua, y + (pixel >> 1) - va
+                    wb, wc = (across * ac_v - ac_u * down) * per_area, (ab_u * down - across * ab_v) * per_area
+                    weight_b[n_blocks, pixel], weight_c[n_blocks, pixel] = wb, wc
+                    inside = (1 - wb - wc >= 0) & (wb >= 0) & (wc >= 0)
+                    hits[n_hits] = 4 * n_blocks + pixel
+                    n_hits += np.int64(inside & (x + (pixel & 1) <= u1) & (y + (pixel >> 1) <= v1))
+                n_blocks += 1
+                x += 2
+            y += 2
+        k, row = k + 1, window[2]
+    return n_hits, k, row
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _normal(point, i, j, k, perspective):
+    """Returns the unit normal of the triangle of points i, j, k (3, n) in camera axes, on the side that is seen."""
+    x, y, z = point[0], point[1], point[2]
+    px, py, pz, qx, qy, qz = x[j] - x[i], y[j] - y[i], z[j] - z[i], x[k] - x[i], y[k] - y[i], z[k] - z[i]
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-    away = nx * a[0] + ny * a[1] + nz * a[2] if perspective else nz
+    away = nx * x[i] + ny * y[i] + nz * z[i] if perspective else nz
     per_n = -1 / np.sqrt(nx * nx + ny * ny + nz * nz)
     per_n = per_n if away > 0 else -per_n
     return nx * per_n, ny * per_n, nz * per_n

@@ -4,11 +4,12 @@ For each light, the objects are drawn into a depth image as seen from the light 
 the points that the camera sees and has about as many pixels as its image. A point is in the shadow where the map shows
 a nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the
 image. Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit
-unless the map is nearer to the light by more than a bias of some pixels.
+unless the map shows a surface that is nearer to the light by more than a bias of some pixels.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
+from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.object_view import Objects
+from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -94,10 +96,11 @@ class ObjectShadows:
                 continue
             nearest = np.full(light.shape, np.inf, np.float32)
             light_from_world = light.light_from_camera @ camera_from_world
-            for item in self._objects.in_view(light_from_world, light.limits, light.projection, time_s):
-                draw_mesh(item.mesh, item.camera_from_object, light.projection, Target(nearest), 0, item.closed)
+            casting = self._objects.in_view(light_from_world, light.limits, light.projection, time_s)
+            draw_meshes(casting, light.projection, Target(nearest))
             matrix = np.ascontiguousarray(light.light_from_camera[:3])
-            _darken(lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection)
+            scene = lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection
+            in_row_bands(partial(_darken, *scene), len(depth))
 
     def _sampled_points(self, depth: Depth) -> Array:
         """Returns points (n, 3) [m] of floor and objects in camera axes, on a grid of pixels with spacing STRIDE_PX."""
@@ -193,45 +196,82 @@ def _looking(rotation: Array, position_m: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _darken(lit, depth, focal, normal, label, nearest, matrix, projection):
-    """Sets `lit` (H, W) to 0 where the map `nearest` shows an object that occludes the light.
+def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
+    """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
 
     A point is occluded if the depth in the map is less than that of the point minus a bias. On the floor, the bias is
     one pixel of the map. On an object, it is BIAS_PX (1 + t) pixels, where t is the tangent of the angle of
     incidence or, if smaller, STEEPEST. Surfaces of objects that face away from the light are not lit either.
     """
-    scale, cx, cy, _, perspective = projection
     height, width = depth.shape
-    for v in range(height):
+    x = (np.arange(width) - 0.5 * (width - 1)) / focal
+    cell, reach, bias = np.empty(width, np.int32), np.empty(width), np.empty(width)
+    in_map = nearest.reshape(-1)
+    for v in range(first, end):
+        y = (v - 0.5 * (height - 1)) / focal
+        _find_cells(depth[v], x, y, matrix, projection, nearest.shape, cell, reach, bias)
         for u in range(width):
-            z = np.float64(depth[v, u])
-            if lit[v, u] == 0 or not np.isfinite(z):
+            if cell[u] < 0:
                 continue
-            x, y = (u - 0.5 * (width - 1)) / focal * z, (v - 0.5 * (height - 1)) / focal * z
-            a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
-            b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
-            c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-            share = 1.0
-            if perspective:
-                if c <= 0:
-                    continue
-                share = 1 / c
-            col, row = np.rint(scale * a * share + cx), np.rint(scale * b * share + cy)
-            if not (0 <= col < nearest.shape[1] and 0 <= row < nearest.shape[0]):
-                continue
-            bias = 1 / (scale * share)
+            factor = 1.0
             if label[v, u]:
-                nx, ny, nz = normal[v, u, 0], normal[v, u, 1], normal[v, u, 2]
-                # direction to the light, in the axes of the view: towards its origin, or against its axis
-                da, db, dc = (-a, -b, -c) if perspective else (0.0, 0.0, -1.0)
-                na = matrix[0, 0] * nx + matrix[0, 1] * ny + matrix[0, 2] * nz
-                nb = matrix[1, 0] * nx + matrix[1, 1] * ny + matrix[1, 2] * nz
-                nc = matrix[2, 0] * nx + matrix[2, 1] * ny + matrix[2, 2] * nz
-                cosine = (na * da + nb * db + nc * dc) / np.sqrt(da * da + db * db + dc * dc)
+                cosine = _cosine(depth[v, u], x[u], y, normal[v, u], matrix, projection[4])
                 if cosine <= 0:
                     lit[v, u] = 0
                     continue
                 tangent = np.sqrt(max(1 - cosine * cosine, 0.0)) / cosine
-                bias *= BIAS_PX * (1 + min(tangent, STEEPEST))
-            if nearest[int(row), int(col)] < c - bias:
+                factor = BIAS_PX * (1 + min(tangent, STEEPEST))
+            if in_map[cell[u]] < reach[u] - bias[u] * factor:
                 lit[v, u] = 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
+    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map.
+
+    Args:
+        depth: (w,) depth of the points in the camera [m].
+        x: (w,) their horizontal tangents in the camera.
+        y: vertical tangent of the row.
+        matrix: (3, 4) map from the axes of the camera to those of the view.
+        projection: projection of the map.
+        shape: rows and columns of the map.
+        cell: filled with the numbers of the pixels.
+        reach: filled with the depths of the points in the view [m].
+        bias: filled with the size of a pixel at these depths [m].
+    """
+    scale, cx, cy, _, perspective = projection
+    rows, cols = shape
+    for u in range(depth.size):
+        z = np.float64(depth[u])
+        right, down = x[u] * z, y * z
+        a = matrix[0, 0] * right + matrix[0, 1] * down + matrix[0, 2] * z + matrix[0, 3]
+        b = matrix[1, 0] * right + matrix[1, 1] * down + matrix[1, 2] * z + matrix[1, 3]
+        c = matrix[2, 0] * right + matrix[2, 1] * down + matrix[2, 2] * z + matrix[2, 3]
+        share = 1 / c if perspective else 1.0
+        col, row = np.rint(scale * a * share + cx), np.rint(scale * b * share + cy)
+        there = (z < np.inf) & (share > 0) & (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
+        cell[u] = np.int32(row if there else 0.0) * np.int32(cols) + np.int32(col if there else 0.0)
+        cell[u] = cell[u] if there else np.int32(-1)
+        reach[u] = c
+        bias[u] = 1 / (scale * share)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _cosine(depth, x, y, normal, matrix, perspective):
+    """Returns the cosine of the angle between a normal (3,) and the direction from its point to the light.
+
+    The tangents `x`, `y` and the depth [m] of the point are those in the camera; see `_find_cells`.
+    """
+    z = np.float64(depth)
+    x, y = x * z, y * z
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    na = matrix[0, 0] * nx + matrix[0, 1] * ny + matrix[0, 2] * nz
+    nb = matrix[1, 0] * nx + matrix[1, 1] * ny + matrix[1, 2] * nz
+    nc = matrix[2, 0] * nx + matrix[2, 1] * ny + matrix[2, 2] * nz
+    if not perspective:
+        return -nc
+    a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+    b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+    c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    return -(na * a + nb * b + nc * c) / np.sqrt(a * a + b * b + c * c)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.objects.detail import Level
 from terrains.objects.floor_mesh import FloorTiles
-from terrains.objects.mesh import Mesh
 from terrains.objects.model import PlacedObject
+from terrains.objects.parts import UNKNOWN
 from twin.core import geometry
 from twin.core.records import Image, StereoRig
-from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_mesh
+from twin.imaging.mesh_raster import NEAR_M, DrawnMesh, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.mesh_texture import TexturedSurface, paint_textures
 from twin.imaging.sway import largest_displacement_m, swayed
 
@@ -23,25 +23,13 @@ Depth = NDArray[np.float32]
 LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image [px]
 
 
-class DrawnMesh(NamedTuple):
-    """A mesh to draw: triangles, transform (4, 4) to the axes of the camera, number of the object, whether closed.
-
-    The transform includes the scale. The number of an object is its index in `Objects.placed`.
-    """
-
-    mesh: Mesh
-    camera_from_object: Array
-    number: int
-    closed: bool
-
-
 class Objects:
     """Objects in the world, with the level of detail that a view needs.
 
     Args:
         placed: the objects.
         current_mps: (3,) velocity of the current, in which plants sway.
-        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: another floor.
+        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: the floor is no mesh.
     """
 
     def __init__(
@@ -59,8 +47,10 @@ class Objects:
         self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
-    def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> Iterator[DrawnMesh]:
-        """Yields the meshes of the objects in view, in the order of the depth of their centres.
+    def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> list[DrawnMesh]:
+        """Returns the meshes of the objects in view, in the order of the depth of their centres.
+
+        Labels are 1 + the index in `placed`.
 
         Args:
             camera_from_world: (4, 4) transform from world axes to those of the camera.
@@ -71,14 +61,17 @@ class Objects:
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
         order = np.flatnonzero(visible)
+        drawn = []
         for k in order[np.argsort(centres[order, 2])]:
             item = self.placed[k]
             nearest_m = max(centres[k, 2] - self._radii_m[k], pixel.near_m)
             pixel_m = (nearest_m if pixel.perspective else 1.0) / pixel.focal_px
-            mesh = _level(item, LEVEL_PX * pixel_m)
+            mesh, _, parts = _level(item, LEVEL_PX * pixel_m)
             if item.model.sways:
-                mesh = swayed(mesh, item, self._current_mps, time_s)
-            yield DrawnMesh(mesh, camera_from_world @ item.world_from_object, int(k), item.model.closed)
+                mesh, parts = swayed(mesh, item, self._current_mps, time_s), UNKNOWN
+            transform, closed = camera_from_world @ item.world_from_object, item.model.closed
+            drawn.append(DrawnMesh(mesh, transform, int(k) + 1, closed, parts, self.uv_of(k)))
+        return drawn
 
     def uv_of(self, number: int) -> NDArray[np.float32] | None:
         """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes.
@@ -100,15 +93,13 @@ def draw_objects(
         target: images to draw into; with textures, none of them is None.
         camera_from_world, limits, projection, time_s: see `Objects.in_view`.
     """
-    for item in objects.in_view(camera_from_world, limits, projection, time_s):
-        uv = objects.uv_of(item.number)
-        draw_mesh(item.mesh, item.camera_from_object, projection, target, item.number + 1, item.closed, uv)
+    draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
     if objects.surface is not None:
         paint_textures(target, projection, objects.surface)
 
 
 class ObjectRenderer:
-    """Draws objects into rendered images of the floor.
+    """Renderer that draws objects into images of the floor.
 
     Args:
         objects: the objects.
@@ -146,7 +137,7 @@ def frustum(rig: StereoRig) -> Array:
     return planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
 
 
-def _level(item: PlacedObject, cell_m: float) -> Mesh:
+def _level(item: PlacedObject, cell_m: float) -> Level:
     """Returns the coarsest level of detail of an object with cells of at most `cell_m` in the world."""
     fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
-    return fine_enough[-1].mesh
+    return fine_enough[-1]

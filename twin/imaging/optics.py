@@ -8,11 +8,11 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera an
 
 with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
 of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`), psi_i the
-scattering angle, p the phase function, b the scattering coefficient and c = a + b the attenuation (`water.Medium`). The
-model has no free scale factors. For lamps, these equations describe single scattering. With multiple scattering, light
-that is scattered on its way arrives too: that of the lamps as a softer beam (`lamp_light`), that of the floor as a blur
-(`forward_scatter`), and the backscatter consists of softened beams and is blurred (`backscatter`). Shadows and caustics
-are computed in other modules.
+scattering angle at the distance s from the camera, p the phase function, b the scattering coefficient and c = a + b the
+attenuation (`water.Medium`). The model has no free scale factors. For lamps, these equations describe single
+scattering. With multiple scattering, light that is scattered on its way arrives too: that of the lamps as a softer beam
+(`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists of softened beams and is
+blurred (`backscatter`). Shadows and caustics are computed in other modules.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class PhaseTable(NamedTuple):
 
     @property
     def beyond(self) -> Array:
-        """(n + 1,) integral of the density over the angle, from each cell boundary to pi [rad/sr]."""
+        """Integral (n + 1,) of the density over the angle, from each cell boundary to pi [rad/sr]."""
         angle = 2 * np.arcsin(np.linspace(0.0, 1.0, len(self.cumulative)) ** 2)
         return np.concatenate([np.cumsum((self.density_per_sr * np.diff(angle))[::-1])[::-1], [0.0]])
 
@@ -100,7 +100,7 @@ class Scatterer(NamedTuple):
 def molecular(angle: Array) -> Array:
     """Returns the phase function of pure sea water [1/sr].
 
-    It is 0.06225 (1 + 0.835 cos^2) (Morel 1974; Mobley 1994, eq. 3.30).
+    It is 0.06225 (1 + 0.835 cos(angle)^2) (Morel 1974; Mobley 1994, eq. 3.30).
 
     Args:
         angle: scattering angles of any shape [rad].

@@ -90,7 +90,7 @@ class PhotoSensor:
     def meter(self, light: Radiance) -> ExposureSetting:
         """Returns this frame's exposure, and meters `light` for the later frames.
 
-        The exposure is metered on the previous frames, that of the first frame on `light`.
+        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
 
         Args:
             light: (H, W, 3) radiance at the raw pixels.

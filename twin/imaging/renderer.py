@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class Renderer:
-    """Renders the floor of a scene from any pose of a pinhole camera (x right, y down, z forward), without the vehicle.
+    """Renderer of the floor of a scene, without the vehicle, for a pinhole camera (x right, y down, z forward).
 
     Owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
 

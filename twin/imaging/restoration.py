@@ -54,7 +54,7 @@ class EstimatedFloor(NamedTuple):
 
 
 class Restoration:
-    """Restores the images of the left camera of a survey.
+    """Restoration of the images of the left camera of a survey.
 
     Args:
         scenario: believed lamps and sensor, and whether the floor casts shadows (`imaging.shadows`).

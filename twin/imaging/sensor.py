@@ -115,7 +115,7 @@ class PlainSensor:
     def meter(self, light: Radiance) -> ExposureSetting:
         """Returns this frame's exposure, and meters `light` (H, W, 3) for the later frames.
 
-        The exposure is metered on the previous frames, that of the first frame on `light`.
+        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
         """
         return ExposureSetting(self._exposure.gain(light))
 

@@ -29,7 +29,8 @@ def shade(
     """Computes the light of the floor and the backscatter in rows `first` to `end` of an image.
 
     An empty array stands for an effect that the image does not have, so one compiled version serves all images without
-    a `material`; for `material` None, the compiler removes the code of materials.
+    a `material`; for `material` None, the compiler removes the code of materials. In the steps of the tables, r is the
+    range from the camera, and the scale is `RANGE_SCALE_M`.
 
     Args:
         albedo: (H, W, 3) uint8, 255 = white.

@@ -101,7 +101,7 @@ def direction_to_casting_sun(daylight: Daylight) -> Array | None:
 
 
 def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns the highest corner of each cell and the highest node of each block of cells [m]."""
+    """Returns the heights [m] of the highest corner of each cell and of the highest node of each block of cells."""
     cells = np.maximum(np.maximum(height[:-1, :-1], height[:-1, 1:]), np.maximum(height[1:, :-1], height[1:, 1:]))
     starts = [np.arange(0, n, BLOCK_CELLS) for n in cells.shape]
     return cells, np.maximum.reduceat(np.maximum.reduceat(cells, starts[0], axis=0), starts[1], axis=1)
@@ -325,8 +325,8 @@ def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end
 def _above_in_cell(height, r, c, x, y, z, dx, dy, dz, t, leave):
     """Returns whether the floor of a cell is above the ray between t and `leave`.
 
-    (x, y) is the start of the ray relative to the cell's south-west node, in cells.
-    Over a triangle, the height of the ray above the floor is linear in t, so it is tested where the ray leaves it.
+    (x, y) is the start of the ray relative to the cell's south-west node, in cells. Over a triangle, the height of the
+    ray above the floor is linear in t, so it is tested where the ray leaves the triangle.
     """
     south_west, south_east = height[r, c], height[r, c + 1]
     north_west, north_east = height[r + 1, c], height[r + 1, c + 1]

@@ -147,8 +147,8 @@ def _blur_weights(depth, x, y, scale, twist, weights):
     """Computes the weights (4, W) of `_blur_row`; returns whether all paths of the row are short (`SHORT_PX`).
 
     The weights of the 3 x 3 kernel have the moments of a uniform distribution along a straight path (a, b) [px]:
-    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80. They are those of the neighbours
-    in the row, in the column, on the falling and on the rising diagonal.
+    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80. Each of the
+    four rows of `weights` is for two neighbours: in the row, in the column, on the falling diagonal, on the rising one.
     """
     half, quarter, one, n_long = np.float32(0.5), np.float32(0.25), np.float32(1.0), 0
     across, down, falling, rising = weights[0], weights[1], weights[2], weights[3]

@@ -177,7 +177,7 @@ class MarineSnow:
     ) -> tuple[Array, Array]:
         """Returns the middle (n, 2) and the extent (n, 2) of the path of each particle in the image [px].
 
-        The arguments are those of `draw`.
+        `seen` are the particles in view; the other arguments are those of `draw`.
         """
         left_from_camera = self._rig.left_from_right if camera else np.eye(4)
         drift = (world_from_left @ left_from_camera)[:3, :3].T @ self._current_mps

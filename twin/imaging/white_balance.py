@@ -49,8 +49,8 @@ class WhiteBalance:
     def factors(self, mean: Array, share: float) -> Array:
         """Returns the factors (3,) of this frame.
 
-        With grey world, the factors are measured on the previous frames (those of the first frame on this frame), and
-        this frame is measured for the later ones.
+        With grey world, the factors are measured on the previous frames, or on this frame if it is the first one; this
+        frame affects the factors of later frames.
 
         Args:
             mean: (3,) mean radiance of this frame in photometric units.

@@ -45,7 +45,7 @@ class Hull(NamedTuple):
 
 
 def angular_first(linear_first: Array) -> Array:
-    """Reorders rows (6, ...) from [surge, sway, heave, roll, pitch, yaw] to [roll, pitch, yaw, surge, sway, heave]."""
+    """Returns rows (6, ...) of [surge, sway, heave, roll, pitch, yaw] as [roll, pitch, yaw, surge, sway, heave]."""
     return np.roll(linear_first, 3, axis=0)
 
 
@@ -59,7 +59,7 @@ def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: 
 
 @njit(cache=True, nogil=True)
 def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: Array, wrench: Array) -> Array:
-    """Solves the equation of motion for the acceleration nu' (6,) in body axes [rad/s2, m/s2].
+    """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
     Args:
         hull: parameters of the hull.
@@ -120,7 +120,7 @@ def free_joint_acceleration(
 
 @njit(cache=True, nogil=True)
 def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
-    """Converts a free joint's velocity (6,), [linear in world, angular in body axes], to a twist (6,) in body axes."""
+    """Returns the twist (6,) in body axes of a free joint's velocity (6,), [linear in world, angular in body axes]."""
     twist = np.zeros(6)
     for k in range(3):
         twist[k] = velocity[3 + k]

@@ -136,6 +136,6 @@ class MujocoVehicle:
 
 
 def _describe(time_s: float, position_m: Array, velocity: Array) -> str:
-    """Formats a state for an error message."""
+    """Returns a state as text for an error message."""
     linear, angular = np.round(velocity, 4).reshape(2, 3).tolist()
     return f"{time_s:.3f} s: at {np.round(position_m, 4).tolist()} m, {linear} m/s, {angular} rad/s"

@@ -52,7 +52,7 @@ class NavigationSensors:
     def read(
         self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Callable[[], Depth] | None
     ) -> Readings:
-        """Simulates the readings of one frame; acoustic fixes and beacons are read at keyframes only.
+        """Returns simulated readings of one frame; acoustic fixes and beacons are read at keyframes only.
 
         Args:
             time_s: time of the frame.
@@ -122,7 +122,7 @@ class PerFrameSensors(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_numbers):
-    """Simulates the readings of the per-frame sensors; the readings of sensors not used for aiding are NaN.
+    """Returns simulated readings of the per-frame sensors; the readings of sensors not used for aiding are NaN.
 
     Args:
         sensors: `PerFrameSensors`.
@@ -151,7 +151,7 @@ def read_pressure_and_attitude(
     aiding: Collection[str],
     rng: np.random.Generator,
 ) -> Readings:
-    """Simulates the pressure sensor and the attitude and heading reference system (AHRS).
+    """Returns simulated readings of the pressure sensor and of the attitude and heading reference system (AHRS).
 
     The pressure sensor is in the housing of the left camera and measures the height of this camera; its reading
     therefore needs no lever-arm correction, which attitude errors would affect. The AHRS measures roll, pitch and yaw
@@ -236,7 +236,7 @@ def detect_beacons(
     noise: SensorNoise,
     rng: np.random.Generator,
 ) -> tuple[BeaconDetection, ...]:
-    """Simulates the detection of the beacons that are inside the left image and not occluded by floor or objects.
+    """Returns simulated detections of the beacons that are inside the left image and not occluded by floor or objects.
 
     Noise is sampled for every beacon, in view or not, so that random numbers do not depend on the beacons in view.
 

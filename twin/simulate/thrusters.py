@@ -118,9 +118,10 @@ def thruster_wrench(thrusters):
 
 
 def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
-    """Discretises the controllable canonical form (A, B) of 1 / denominator for inputs constant over a timestep dt.
+    """Returns the discrete form of 1 / denominator for inputs that are constant over a timestep dt.
 
-    The first n rows of exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
+    With A and B the matrices of its controllable canonical form in continuous time, the first n rows of
+    exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
 
     Args:
         denominator: (n + 1,) polynomial coefficients from the highest power down; the first one is 1.

@@ -128,19 +128,31 @@ class ScatterLaw(NamedTuple):
         return self.gain * np.asarray(texture_scatter) * bound / np.maximum(bound + self.half_px, 1e-12)
 
 
-class BinningFactors(NamedTuple):
-    """Factor on a standard deviation where the estimators bin the images.
+class BinnedDepthLaw(NamedTuple):
+    """Change of a `DepthLaw` for binned images, in their pixels.
+
+    In murky water, weak textures cause errors that more keyframes do not reduce as they reduce noise.
 
     Args:
-        by_2, by_4: factor for images that are binned by 2 and by 4.
+        by_2, by_4: factor on the standard deviation from one keyframe for images that are binned by 2 and by 4.
+        common, gain, noise_gain: replace those of the law.
     """
 
     by_2: float
     by_4: float
+    common: float
+    gain: float
+    noise_gain: float
 
-    def __call__(self, binning: int) -> float:
-        """Returns the factor for a binning of 2 or 4; 1 without binning."""
-        return {1: 1.0, 2: self.by_2, 4: self.by_4}[binning]
+    def changed(self, law: DepthLaw, binning: int) -> DepthLaw:
+        """Returns the law for images that are binned by 2 or 4, or the law itself without binning."""
+        if binning == 1:
+            return law
+        factor = {2: self.by_2, 4: self.by_4}[binning]
+        return DepthLaw(
+            factor * law.floor_px, factor * law.slope, law.lamp_growth, self.common, self.gain, law.half_step,
+            self.noise_gain,
+        )  # fmt: skip
 
 
 class BorderLaw(NamedTuple):
@@ -250,8 +262,7 @@ class ErrorModel(NamedTuple):
             tails over the whole map.
         error_scatter_share: ratio of the scatter over cells of the logarithm of the true standard deviation of depth to
             that of the reported one (`depth_texture_scatter`); both vary together.
-        depth_binned_error: factor on the true standard deviation of depth [px of the binned images] due to binning.
-        depth_binned_sigma: factor on the reported standard deviation of depth [px of the binned images] due to binning.
+        depth_binned_error, depth_binned_sigma: changes of `depth_error` and `depth_sigma` for binned images.
         depth_survey_scatter: standard deviation, over surveys, of the logarithm of the true and the reported standard
             deviation of depth about their laws, due to properties of floor and images that the model does not contain.
         depth_ratio_scatter: standard deviation, over surveys, of the logarithm of the ratio of the true to the reported
@@ -298,8 +309,8 @@ class ErrorModel(NamedTuple):
     depth_sigma: DepthLaw = DepthLaw(0.05, 2.0, 1.0, 0.01, 3.0, 1.0)
     depth_texture_scatter: ScatterLaw = ScatterLaw(0.0, 1.0)
     error_scatter_share: float = 1.0
-    depth_binned_error: BinningFactors = BinningFactors(1.0, 1.0)
-    depth_binned_sigma: BinningFactors = BinningFactors(1.0, 1.0)
+    depth_binned_error: BinnedDepthLaw = BinnedDepthLaw(1.0, 1.0, 0.01, 4.0, 0.0)
+    depth_binned_sigma: BinnedDepthLaw = BinnedDepthLaw(1.0, 1.0, 0.01, 3.0, 0.0)
     depth_survey_scatter: float = 0.0
     depth_ratio_scatter: float = 0.0
     border_error: BorderErrorLaw = BorderErrorLaw(0.0, 3.0)
@@ -311,3 +322,9 @@ class ErrorModel(NamedTuple):
     edge_error: SigmaLaw = SigmaLaw(0.3, 10.0)
     edge_sigma_gain: float = 0.3
     edge_half_px: float = 10.0
+
+    def depth_laws(self, binning: int) -> tuple[DepthLaw, DepthLaw]:
+        """Returns the laws of the true and of the reported standard deviation of depth for a binning of 1, 2 or 4."""
+        changes = (self.depth_binned_error, self.depth_error), (self.depth_binned_sigma, self.depth_sigma)
+        error, sigma = (change.changed(law, binning) for change, law in changes)
+        return error, sigma

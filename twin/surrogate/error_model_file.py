@@ -12,7 +12,7 @@ from twin.errors import TwinError
 from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
 from twin.surrogate.coverage import QUANTITIES, QuantityOutsideFit, Range, quantities_outside_fit
 from twin.surrogate.error_model import (
-    BinningFactors,
+    BinnedDepthLaw,
     BorderErrorLaw,
     BorderLaw,
     DepthLaw,
@@ -23,7 +23,7 @@ from twin.surrogate.error_model import (
 )
 
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
-_LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinningFactors, BorderLaw, BorderErrorLaw)
+_LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinnedDepthLaw, BorderLaw, BorderErrorLaw)
 #: Current name of each renamed key, by its former name.
 _RENAMED = {
     "surveys": "n_surveys",

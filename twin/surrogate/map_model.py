@@ -43,6 +43,7 @@ _LEAST_SLOPE = 0.1  # slope below which errors near walls do not decrease
 #: Law of a depth that more keyframes do not improve.
 ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 _NO_CELLS = np.zeros((0, 0), np.float32)
+_EVEN = np.ones((1, 1))  # relative bounds of an evenly lit image
 _HIDING_SLOPE = 1.0  # rise over run: floor below a line of this slope cannot hide the cell where the line starts
 
 
@@ -77,11 +78,14 @@ class CellErrors(NamedTuple):
         border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
         border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
         error_scatter_share: `ErrorModel.error_scatter_share`.
-        border_distances_px: (r,) ascending distances from the image border at which the next three fields are
+        border_distances_px: (r,) ascending distances from the image border at which the next two fields are
             tabulated.
-        border_error: (r,) factor on the true standard deviation of depth.
-        border_sigma: (r,) factor on the reported standard deviation of depth.
+        border_depth: (r,) factor on the true and on the reported standard deviation of depth.
         border_edge: (r,) factor on the error near walls; see `edge_border_factor`.
+        bound_ratios: (q,) ascending ratios of the Cramér-Rao bound of a cell to that of the whole image, at which the
+            next two fields are tabulated; see `MapModel.bound_ratio`.
+        bound_error: (q,) factor on the true standard deviation of depth.
+        bound_sigma: (q,) factor on the reported standard deviation of depth.
         error_noise_share: (m,) fraction of the true variance of depth that image noise causes
             (`DepthLaw.noise_share`).
         sigma_noise_share: (m,) fraction of the reported variance of depth that image noise causes.
@@ -109,9 +113,11 @@ class CellErrors(NamedTuple):
     border_width_px: Array = np.ones(2)
     error_scatter_share: float = 1.0
     border_distances_px: Array = np.array([0.0, 1.0])
-    border_error: Array = np.ones(2)
-    border_sigma: Array = np.ones(2)
+    border_depth: Array = np.ones(2)
     border_edge: Array = np.ones(2)
+    bound_ratios: Array = np.array([0.0, 1.0])
+    bound_error: Array = np.ones(2)
+    bound_sigma: Array = np.ones(2)
     error_noise_share: Array = np.zeros(2)
     sigma_noise_share: Array = np.zeros(2)
 
@@ -123,6 +129,8 @@ class ObservedCells(NamedTuple):
         row, col: grid position of the first (north-west) cell of the window.
         depth_m: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen.
         border_px: (rows, cols) distance of this point from the nearest border of the two images [px].
+        information: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left
+            image to that of the whole image.
         true, estimated: (4, 4) poses of the keyframe.
     """
 
@@ -130,6 +138,7 @@ class ObservedCells(NamedTuple):
     col: int
     depth_m: Map
     border_px: Map
+    information: Map
     true: Array
     estimated: Array
 
@@ -144,6 +153,8 @@ class MapModel:
         floor: the true floor as a height field, for ray casting.
         depth_m: typical depth of the floor along the optical axis [m].
         view: positions at which true points are measured.
+        relative_bounds: (r, c) Cramér-Rao bound in blocks of the image, divided by that of the whole image; see
+            `matchability.PositionDependence`.
 
     Attributes:
         seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
@@ -159,6 +170,8 @@ class MapModel:
             square root of their number; the maximum over all series of keyframes [px].
         border_distance_px: (rows, cols) largest distance of the cell from the image border over the consecutive
             keyframes of the latest height [px].
+        bound_ratio: (rows, cols) ratio of the Cramér-Rao bound of the consecutive keyframes of the latest height, at
+            the positions of the cell in their images, to that of the whole images; their information is added.
     """
 
     def __init__(
@@ -169,6 +182,7 @@ class MapModel:
         floor: HeightField,
         depth_m: float,
         view: ViewTable = IDEAL_TABLE,
+        relative_bounds: Array = _EVEN,
     ):
         self.grid, self.height_m, self.seen, self._rig = grid, height_m, np.zeros(height_m.shape, np.bool_), rig
         self._slope = np.stack(map_slopes(np.asarray(height_m, np.float64), grid.cell_m), axis=-1).astype(np.float32)
@@ -182,14 +196,15 @@ class MapModel:
         per_m = np.float32(rig.focal_px * rig.baseline_m / depth_m**2)
         self.edge_m = edge_strength(self.roughness_m * per_m, step_slope(height_m, grid.cell_m), window_cells) / per_m
         self.views, run = (np.zeros(height_m.shape, np.int16) for _ in range(2))
-        zeros = (np.zeros(height_m.shape, np.float32) for _ in range(5))
-        self.step_baselines, self.border_px, self.border_distance_px, *rest = zeros
+        zeros = (np.zeros(height_m.shape, np.float32) for _ in range(7))
+        self.step_baselines, self.border_px, self.border_distance_px, self.bound_ratio, *rest = zeros
         self._runs = _Runs(run, *rest)
         self._geotransform = (grid.west_m, grid.north_m, grid.cell_m)
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px - 1), float(rig.height_px - 1), rig.baseline_m,
             view,
         )  # fmt: skip
+        self._information = 1 / np.square(relative_bounds)
 
     @property
     def steepness(self) -> Map:
@@ -212,14 +227,13 @@ class MapModel:
         """
         row, end_row, col, end_col = self._window(true)
         shape = max(end_row - row, 0), max(end_col - col, 0)
-        observed = ObservedCells(
-            row, col, np.full(shape, -1, np.float32), np.zeros(shape, np.float32), true, estimated
-        )  # fmt: skip
+        depth_m, border_px, information = (np.full(shape, value, np.float32) for value in (-1, 0, 0))
         camera, cells = self._camera[:6], (self.height_m, self._slope, self._geotransform)
         _observe(
-            observed.depth_m, observed.border_px, row, col, cells, camera, self._camera[6], self._poses_of(true),
-            estimated @ geometry.inverse(true), (self._floor, self._may_be_hidden),
+            (depth_m, border_px, information), row, col, cells, camera, self._camera[6], self._information,
+            self._poses_of(true), estimated @ geometry.inverse(true), (self._floor, self._may_be_hidden),
         )  # fmt: skip
+        observed = ObservedCells(row, col, depth_m, border_px, information, true, estimated)
         return observed
 
     def sample_patch(
@@ -256,7 +270,8 @@ class MapModel:
         depth_m = _sample_patch(
             height, variance, systematic,
             (self.height_m, self._slope, self.roughness_m, self.edge_m, self._geotransform),
-            self._runs, (self.views, self.step_baselines, self.border_px, self.border_distance_px), observed[:4],
+            self._runs,
+            (self.views, self.step_baselines, self.border_px, self.border_distance_px, self.bound_ratio), observed[:5],
             next_cells, step / self._rig.baseline_m, self._camera[:6], self._camera[6], geometry.inverse(true),
             estimated @ geometry.inverse(true), estimated[:3, 3].copy(), rotation @ cov @ rotation.T,
             window_noise(shape, self.correlated_cells, rng), errors,
@@ -500,13 +515,13 @@ def _mark(seen, height, geotransform, camera, view, poses, floor, row, end_row, 
 
 
 @njit(cache=True, nogil=True)
-def _observe(out, border, row, col, cells, camera, view, poses, estimated_from_true, floor):
-    """Compiled kernel of `MapModel.observe`; writes to `out` and `border`."""
-    height, slope, (west, north, cell) = cells
+def _observe(out, row, col, cells, camera, view, image_information, poses, estimated_from_true, floor):
+    """Compiled kernel of `MapModel.observe`; writes depth, distance from the border and information to `out`."""
+    (height, slope, (west, north, cell)), (depth_out, border, information) = cells, out
     (field, may_be_hidden), m, ideal, baseline = floor, poses[0], view.values.size == 0, camera[5]
-    for i in range(out.shape[0]):
+    for i in range(depth_out.shape[0]):
         y = north - (row + i + 0.5) * cell
-        for j in range(out.shape[1]):
+        for j in range(depth_out.shape[1]):
             x, z = west + (col + j + 0.5) * cell, np.float64(height[row + i, col + j])
             depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
             if not depth > 0:
@@ -514,18 +529,36 @@ def _observe(out, border, row, col, cells, camera, view, poses, estimated_from_t
             if ideal:
                 a = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
                 b = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-                border_px = _border_of(camera, a, b, baseline / depth)
+                seen_a, seen_b, disparity = a, b, baseline / depth
             else:
                 s = slope[row + i, col + j]
                 a, b, depth = _transformed(m, *_source(m, camera, view, estimated_from_true, (x, y, z), (s[0], s[1])))
                 a, b = a / depth, b / depth
                 seen_a, seen_b, disparity = measure_point(view, a, b, baseline / depth)
-                border_px = _border_of(camera, seen_a, seen_b, disparity)
+            border_px = _border_of(camera, seen_a, seen_b, disparity)
             if not border_px >= 0:
                 continue
             if may_be_hidden[row + i, col + j] and _is_hidden(poses, baseline, field, a, b, depth):
                 continue
-            out[i, j], border[i, j] = depth, border_px
+            depth_out[i, j], border[i, j] = depth, border_px
+            information[i, j] = _information_at(image_information, camera, seen_a, seen_b)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _information_at(table, camera, x, y):
+    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation.
+
+    The values hold at the centres of the blocks; beyond the centres of the outermost blocks they are constant.
+    """
+    focal, cx, cy, right, bottom, _ = camera
+    rows, cols = table.shape
+    row = min(max((focal * y + cy + 0.5) / (bottom + 1) * rows - 0.5, 0.0), rows - 1.0)
+    col = min(max((focal * x + cx + 0.5) / (right + 1) * cols - 0.5, 0.0), cols - 1.0)
+    i, j = int(row), int(col)
+    k, n = min(i + 1, rows - 1), min(j + 1, cols - 1)
+    upper = table[i, j] + (col - j) * (table[i, n] - table[i, j])
+    lower = table[k, j] + (col - j) * (table[k, n] - table[k, j])
+    return upper + (row - i) * (lower - upper)
 
 
 class _Runs(NamedTuple):
@@ -535,11 +568,13 @@ class _Runs(NamedTuple):
         views: (rows, cols) number of these keyframes.
         squared_steps: (rows, cols) sum of the squared distances between them, in squared stereo baselines.
         border_px: (rows, cols) largest distance from the image border over these keyframes [px].
+        information: (rows, cols) sum of `ObservedCells.information` over these keyframes.
     """
 
     views: NDArray[np.int16]
     squared_steps: Map
     border_px: Map
+    information: Map
 
 
 @njit(cache=True, nogil=True)
@@ -552,8 +587,9 @@ def _sample_patch(
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
     the lateral error and walls to `systematic`. The mean depth is over the cells that have a height; 0 without any.
     """
-    (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px) = floor, observed
-    (next_row, next_col, next_depth_m), (views, step_baselines, best_border_px, border_distance_px) = following, fused
+    (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px, information) = floor, observed
+    next_row, next_col, next_depth_m = following
+    views, step_baselines, best_border_px, border_distance_px, bound_ratio = fused
     total, count = 0.0, 0
     for i in range(row, row + out.shape[0]):
         y = north - (i + 0.5) * cell
@@ -563,6 +599,7 @@ def _sample_patch(
                 continue
             runs.views[i, j] += 1
             runs.border_px[i, j] = max(runs.border_px[i, j], border_px[i - row, j - col])
+            runs.information[i, j] += information[i - row, j - col]
             p, q = i - next_row, j - next_col
             if 0 <= p < next_depth_m.shape[0] and 0 <= q < next_depth_m.shape[1] and next_depth_m[p, q] > 0:
                 runs.squared_steps[i, j] += step * step
@@ -570,10 +607,12 @@ def _sample_patch(
             n_views, border = runs.views[i, j], runs.border_px[i, j] * np.sqrt(runs.views[i, j])
             border_distance_px[i, j] = runs.border_px[i, j]
             ring, in_ring = _interval(errors.border_distances_px, border_distance_px[i, j])
+            bound_ratio[i, j] = np.sqrt(n_views / runs.information[i, j])
+            q, in_ratios = _interval(errors.bound_ratios, bound_ratio[i, j])
             mean_step = np.sqrt(runs.squared_steps[i, j] / max(n_views - 1, 1))
             views[i, j], step_baselines[i, j] = n_views, mean_step
             best_border_px[i, j] = max(best_border_px[i, j], border)
-            runs.views[i, j], runs.squared_steps[i, j], runs.border_px[i, j] = 0, 0.0, 0.0
+            runs.views[i, j], runs.squared_steps[i, j], runs.border_px[i, j], runs.information[i, j] = 0, 0.0, 0.0, 0.0
             k, fraction = _interval(errors.depths_m, depth)
             per_px = depth * depth / (camera[0] * camera[5])
             rough_px = roughness[i, j] / per_px
@@ -598,7 +637,8 @@ def _sample_patch(
             log_scale = _interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j]
             error_px = np.exp(errors.error_scatter_share * log_scale) * np.sqrt(error_share)
             error_px *= _interpolate(errors.depth_error_px, k, fraction)
-            error_px *= _interpolate(errors.border_error, ring, in_ring)
+            border_depth = _interpolate(errors.border_depth, ring, in_ring)
+            error_px *= border_depth * _interpolate(errors.bound_error, q, in_ratios)
             value += per_px * error_px * depth_noise[i - row, j - col]
             relief_px = relief_error_px(rough_px, errors.relief_error_gain, errors.relief_error_limit_px)
             value += per_px * relief_px * errors.relief_noise[i, j]
@@ -607,7 +647,7 @@ def _sample_patch(
             value += steep * errors.lateral_sigma_px * depth / camera[0] * errors.lateral_noise[i, j]
             out[i - row, j - col] = value
             sigma_px = np.exp(log_scale) * _interpolate(errors.depth_sigma_px, k, fraction)
-            sigma_px *= _interpolate(errors.border_sigma, ring, in_ring)
+            sigma_px *= border_depth * _interpolate(errors.bound_sigma, q, in_ratios)
             variance[i - row, j - col] = sigma_share * (per_px * sigma_px) ** 2
             systematic[i - row, j - col] = surface.pose_variance(
                 x - position[0], y - position[1], z - position[2], sx, sy, cov

@@ -7,7 +7,7 @@ c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of th
 their gradients do not count: the image of a floor with the same mean albedo, but without texture, is subtracted.
 
 Lamps light the centre of the images more than their border, so the bound depends on the position in the image. Its
-ratio to the bound of the whole image is computed from light and noise, as a function of the distance from the border.
+ratio to the bound of the whole image is computed in blocks of the image, from the gradients of a random texture.
 
 In turbid water most corners of the full image are noise. The estimators then bin the images (`image_scale`), and the
 bound is that of the binned images, in their pixels.
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -42,17 +43,36 @@ from twin.imaging.optics import Radiance
 from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
-from twin.surrogate.window_texture import WindowTexture, window_texture
+from twin.surrogate.window_texture import window_texture
 
 #: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
 #: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.
 _CORNERS_BOUND_PX = 0.11
 _DEPTHS = 6  # number of tabulated depths
 _LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, relative to the median of the patches
-_RINGS = 8  # number of classes of pixels by their distance from the image border
-_GRAY = 90  # albedo of the floor for `bound_ratios`, 0 to 255
+_BLOCKS = (6, 8)  # rows and columns of blocks of the image in `PositionDependence`
+_GRAY, _CONTRAST = (
+    90,
+    12,
+)  # mean and standard deviation per octave of the random texture of `position_dependence`, 0 to 255
+_OCTAVES = 5  # number of octaves of this texture
 _PATCHES = 300  # number of patches sampled to estimate the unevenness
 _SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
+
+
+class PositionDependence(NamedTuple):
+    """Dependence of matching on the position in the image, in blocks that divide the image evenly.
+
+    Args:
+        bounds: (rows, cols) Cramér-Rao bound in a block, divided by that of the whole image.
+        gradients: (rows, cols) RMS gradient of an even texture in a block, divided by that of the whole image.
+    """
+
+    bounds: Array
+    gradients: Array
+
+
+NO_DEPENDENCE = PositionDependence(np.ones((1, 1)), np.ones((1, 1)))
 
 
 class Matchability:
@@ -69,9 +89,7 @@ class Matchability:
         binning: side of the squares of pixels that the estimators average to one pixel [px].
         bounds_px: (m,) Cramér-Rao bound c at these depths [px of the binned images]; infinite where marine snow
             prevents all matches.
-        border_px: (r,) distances from the nearest border of the image at which the next field is tabulated [px of the
-            binned images].
-        bound_ratios: (r,) bound at these distances, divided by that of the whole image; see `bound_ratios`.
+        dependence: dependence of the bound on the position in the image, at the medium depth.
         texture: distribution of the bound over the windows of dense matching, at the medium depth.
         unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
             baseline / depth].
@@ -92,8 +110,9 @@ class Matchability:
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
         self._set_image_scale(scenario, illumination, terrain)
-        self.border_px, self.bound_ratios = bound_ratios(scenario, illumination, self.medium_depth_m, self.binning)
-        self.texture = texture_of_windows(scenario, illumination, terrain, self.medium_depth_m, self.binning)
+        self.dependence = position_dependence(scenario, illumination, self.medium_depth_m, self.binning)
+        signal = texture_signal(scenario, illumination, terrain, self.medium_depth_m, self.binning)
+        self.texture = window_texture(signal, self.dependence.gradients)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
         self.lamp_share = lamp_share(scenario, illumination)
 
@@ -227,47 +246,77 @@ def lamp_share(scenario: Scenario, illumination: Illumination) -> float:
     return 1 - sunlit / max(both, np.finfo(float).tiny)
 
 
-def bound_ratios(
+def position_dependence(
     scenario: Scenario, illumination: Illumination, depth_m: float, binning: int = 1
-) -> tuple[Array, Array]:
-    """Returns distances (r,) from the border of the image [px], and the ratio (r,) of the bound there to the whole.
+) -> PositionDependence:
+    """Returns the dependence of matching on the position in the image, for a level floor.
 
-    The gradients of the texture are proportional to the light that the floor reflects, so the bound is proportional to
-    the noise divided by this light. Both are averaged (RMS) over the pixels with nearly the same distance from the
-    nearest border of the image of a level floor of constant albedo. All ratios are 1 if the floor reflects no light.
+    Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The floor has a
+    random texture whose statistics are the same everywhere, so the details of the true floor do not count. Squared
+    gradients and noise are averaged over each block, and smoothed by a polynomial in the position, because few pixels
+    determine a block of binned images. The result is `NO_DEPENDENCE` if the image shows no texture.
 
     Args:
         scenario: description of the survey.
         illumination: optical properties of the water, and daylight in the water.
         depth_m: depth of the floor along the optical axis.
-        binning: number of pixels that are averaged along each side of the images; distances are in binned pixels.
+        binning: number of pixels that are averaged along each side of the images.
     """
     scenario = _without_unmodelled_effects(_with_linear_images(scenario))
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
-    formation = ImageFormation(scenario, illumination, None, rng)
-    depth, camera_pose = _level_floor(scenario, depth_m)
-    gray, black = (
-        formation.radiance(np.full((*depth.shape, 3), level, np.uint8), depth, 0, camera_pose) for level in (_GRAY, 0)
-    )
-    sensor = sensor_of(scenario, rig)
-    setting = sensor.meter(gray)
-    reflected = matching.gray(((gray - black) * 255 * setting.gain).astype(np.float32), binning)
-    first, second = (matching.gray(sensor.image(gray, setting, rng).astype(np.float32), binning) for _ in range(2))
-    ring = np.minimum(_border_distances(reflected.shape) * _RINGS // (min(reflected.shape) / 2), _RINGS - 1).astype(int)
-    n_pixels = np.bincount(ring.ravel(), minlength=_RINGS)
-    noise2, signal2 = (
-        np.bincount(ring.ravel(), np.square(x, dtype=np.float64).ravel(), _RINGS) for x in (first - second, reflected)
-    )
-    of_all, tiny = noise2.sum() / max(signal2.sum(), 1e-30), 1e-12 * n_pixels
-    ratios = np.sqrt((noise2 + tiny) / np.maximum(signal2, tiny) / max(of_all, 1e-12))
-    distances_px = (np.arange(_RINGS) + 0.5) * min(reflected.shape) / 2 / _RINGS
-    return distances_px, ratios if signal2.sum() > tiny.sum() else np.ones(_RINGS)
+    formation, sensor = ImageFormation(scenario, illumination, None, rng), sensor_of(scenario, rig)
+    gradients, noise = np.zeros(_BLOCKS), np.zeros(_BLOCKS)
+    for _ in range(binning):
+        albedo = _random_albedo((rig.height_px, rig.width_px), binning, rng)
+        radiance, untextured = _radiance_of_texture(scenario, formation, albedo, depth_m)
+        setting = sensor.meter(radiance)
+        signal = _texture_signal(radiance, untextured, setting.gain, binning)
+        first, second = (
+            matching.gray(sensor.image(radiance, setting, rng).astype(np.float32), binning) for _ in range(2)
+        )
+        gradients += _block_means(np.diff(signal, axis=1) ** 2)
+        noise += _block_means((first - second) ** 2)
+    if not gradients.min() > 1e-12 * binning or not noise.min() > 0:
+        return NO_DEPENDENCE
+    noise, gradients = (_smooth(values) / values.mean() for values in (noise, gradients))
+    return PositionDependence(np.sqrt(noise / gradients), np.sqrt(gradients))
 
 
-def texture_of_windows(
+def _random_albedo(shape: tuple[int, int], binning: int, rng: np.random.Generator) -> Image:
+    """Returns an albedo image (height_px, width_px, 3) of a grey random texture with equal variance in each octave.
+
+    Args:
+        shape: height and width [px].
+        binning: side of the smallest structures [px].
+        rng: random generator.
+    """
+    albedo = np.full(shape, _GRAY, np.float32)
+    for octave in range(_OCTAVES):
+        side_px = binning * 2**octave
+        coarse = rng.standard_normal([-(-n // side_px) for n in shape], np.float32)
+        albedo += _CONTRAST * cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.repeat(np.clip(albedo, 0, 255).round().astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _block_means(values: NDArray[np.floating]) -> Array:
+    """Returns the means of an image (rows, cols) over the blocks of a `PositionDependence`."""
+    return np.asarray(cv2.resize(values.astype(np.float64), _BLOCKS[::-1], interpolation=cv2.INTER_AREA), np.float64)
+
+
+def _smooth(values: Array) -> Array:
+    """Returns positive values (rows, cols) smoothed by a polynomial of fourth degree fitted to their logarithm."""
+    v, u = (part.ravel() for part in np.meshgrid(*(np.linspace(-1, 1, n) for n in values.shape), indexing="ij"))
+    terms = np.column_stack([u**i * v**k for i in range(5) for k in range(5 - i)])
+    fitted = terms @ np.linalg.lstsq(terms, np.log(values).ravel(), rcond=None)[0]
+    return np.exp(fitted).reshape(values.shape)
+
+
+def texture_signal(
     scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depth_m: float, binning: int = 1
-) -> WindowTexture:
-    """Returns the distribution of the bound over the windows of dense matching, for a level floor; without snow.
+) -> NDArray[np.floating]:
+    """Returns the part (rows, cols) of the grey image of a level floor that its texture causes [grey levels].
+
+    Noise, shadows and marine snow are absent.
 
     Args:
         scenario: description of the survey.
@@ -283,13 +332,7 @@ def texture_of_windows(
     albedo = _albedo(texture, texel_m, rig, depth_m)
     radiance, untextured = _radiance_of_texture(clear, formation, albedo, depth_m)
     gain = sensor_of(clear, rig).meter(radiance).gain
-    return window_texture(_texture_signal(radiance, untextured, gain, binning))
-
-
-def _border_distances(shape: tuple[int, ...]) -> Array:
-    """Returns the distance (rows, cols) of the pixels of an image from its nearest border [px]."""
-    rows, cols = (np.minimum(np.arange(n), np.arange(n)[::-1]) + 0.5 for n in shape)
-    return np.minimum(rows[:, None], cols)
+    return _texture_signal(radiance, untextured, gain, binning)
 
 
 def _reflected_radiance(scenario: Scenario, illumination: Illumination) -> float:

@@ -157,7 +157,7 @@ def surrogate_vision(
     floor, heights = FloorRayCaster(terrain), true_heights(mission.grid, terrain.height_at)
     depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))
     rig = mission.rig.binned(matchability.binning)
-    map_model = MapModel(mission.grid, heights, rig, floor.field, depth_m, view.table)
+    map_model = MapModel(mission.grid, heights, rig, floor.field, depth_m, view.table, matchability.dependence.bounds)
     scene = TrueScene(true_pose, floor, matchability, map_model, view)
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

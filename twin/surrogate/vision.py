@@ -41,7 +41,8 @@ from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
-_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0])  # tabulated distances from the border, in widths of `border_error`
+_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0])  # tabulated distances, in widths of `border_error`
+_BOUND_RATIOS = np.geomspace(0.25, 8.0, 21)  # tabulated ratios of a bound to that of the whole image
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _CORNER_AREA_PX2 = 75.0  # smallest image area per detected corner, in rendered surveys
@@ -508,42 +509,39 @@ class SurrogateVision:
         relief_noise, cell_noise, wall_noise = (window_noise(shape, cells, self._rng) for _ in range(3))
         edge_noise = heavy_tailed(wall_noise)
         level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
-        error_factor = float(np.exp(level + ratio)) * model.depth_binned_error(self.binning)
-        sigma_factor = float(np.exp(level)) * model.depth_binned_sigma(self.binning)
+        error_law, sigma_law = model.depth_laws(self.binning)
         matchability = self.scene.matchability
         bounds_px, window_px = matchability.bounds_px, matchability.window_bounds_px
-        border_px, border_factors = self._border_factors(model)
+        border_px = model.border_error.width_px * _BORDER_STEPS
+        bound_ratios, bound_factors = self._bound_factors(model)
         return CellErrors(
             lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px,
             matchability.depths_m,
-            model.depth_error.sigma_px(window_px, self.lamp_share) * error_factor,
-            model.depth_sigma.sigma_px(window_px, self.lamp_share) * sigma_factor,
+            error_law.sigma_px(window_px, self.lamp_share) * float(np.exp(level + ratio)),
+            sigma_law.sigma_px(window_px, self.lamp_share) * float(np.exp(level)),
             model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
             np.array([model.map_completeness(b) for b in bounds_px]),
-            model.depth_error, model.depth_sigma, model.relief_error_gain, model.relief_error_limit_px,
+            error_law, sigma_law, model.relief_error_gain, model.relief_error_limit_px,
             np.array([model.edge_error(b) for b in bounds_px]), model.edge_sigma_gain, model.edge_half_px,
             model.border_holes.share, model.border_holes.width_px(bounds_px, self.lamp_share),
             model.error_scatter_share,
-            border_px, *border_factors,
-            error_noise_share=model.depth_error.noise_share(window_px),
-            sigma_noise_share=model.depth_sigma.noise_share(window_px),
+            border_px, model.border_error(border_px), edge_border_factor(border_px, self.rig.height_px),
+            bound_ratios, *bound_factors,
+            error_noise_share=error_law.noise_share(window_px),
+            sigma_noise_share=sigma_law.noise_share(window_px),
         )  # fmt: skip
 
-    def _border_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
-        """Returns distances (r,) from the border of the images [px], and the factors (r,) on standard deviations there.
+    def _bound_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
+        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and factors (q,) on depth errors.
 
-        The factors on the true and on the reported standard deviation of depth account for the light, which depends on
-        the position in the image (`Matchability.bound_ratios`), and for the truncated matching windows at the border.
-        The third factor is that on the errors near walls.
+        The two factors are those on the true and on the reported standard deviation of depth.
         """
         scene = self.scene.matchability
         medium_px = scene.medium_bound_px * scene.texture.median_ratio
-        border_px = np.union1d(scene.border_px, model.border_error.width_px * _BORDER_STEPS)
-        at_px = medium_px * np.interp(border_px, scene.border_px, scene.bound_ratios)
-        laws = model.depth_error, model.depth_sigma
-        light = [law.sigma_px(at_px, 0.0) / law.sigma_px(medium_px, 0.0) for law in laws]
-        factors = [factor * model.border_error(border_px) for factor in light]
-        return border_px, [*factors, edge_border_factor(border_px, self.rig.height_px)]
+        laws = model.depth_laws(self.binning)
+        return _BOUND_RATIOS, [
+            law.sigma_px(medium_px * _BOUND_RATIOS, 0.0) / law.sigma_px(medium_px, 0.0) for law in laws
+        ]
 
     def draw_normals(self, n: int) -> Array:
         """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""

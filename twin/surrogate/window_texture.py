@@ -4,6 +4,8 @@ The Cramér-Rao bound of an image contains the RMS gradient of the whole image (
 plane of disparities in a small Gaussian window, so the bound of a pixel contains the RMS gradient g in that window:
 it is the bound of the image times G / g, with the RMS gradient G of the image. Over even texture, such as sand, g is
 nearly the same in all windows. Over reefs, dark patches without texture and bright edges differ by several times.
+Gradients also vary with the light over the image; that part is removed here, because it belongs to the position in the
+image (`matchability.PositionDependence`).
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from twin.core.geometry import Array
 
 WINDOW_PX = 5  #: side of the windows, with about the area of the Gaussian window of `estimate.vision.epipolar`
 _WEAKEST = 0.05  # smallest RMS gradient of a window that is counted, relative to that of the image
@@ -30,16 +34,19 @@ class WindowTexture(NamedTuple):
     scatter: float
 
 
+_EVEN = np.ones((1, 1))  # relative gradients of an evenly lit image
 EVEN_TEXTURE = WindowTexture(1.0, 0.0)
 
 
-def window_texture(signal: NDArray[np.floating]) -> WindowTexture:
+def window_texture(signal: NDArray[np.floating], relative_gradients: Array = _EVEN) -> WindowTexture:
     """Returns the distribution of the bound over the windows of an image; `EVEN_TEXTURE` for an image without texture.
 
     Args:
         signal: (rows, cols) grey levels of the part of the image that the texture causes, without noise.
+        relative_gradients: (r, c) RMS gradients of an even texture in blocks of the image, relative to the whole image.
     """
     squares = np.diff(signal.astype(np.float64), axis=1) ** 2
+    squares /= cv2.resize(np.square(relative_gradients), squares.shape[::-1], interpolation=cv2.INTER_LINEAR)
     whole = float(np.sqrt(squares.mean()))
     inner = WINDOW_PX // 2
     means = cv2.blur(squares, (WINDOW_PX, WINDOW_PX))[inner:-inner, inner:-inner]

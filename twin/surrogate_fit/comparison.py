@@ -24,7 +24,7 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.surrogate.error_model import BinningFactors, BorderErrorLaw, DepthLaw, ErrorModel, ScatterLaw, SigmaLaw
+from twin.surrogate.error_model import BinnedDepthLaw, BorderErrorLaw, DepthLaw, ErrorModel, ScatterLaw, SigmaLaw
 from twin.surrogate.map_model import WALL_SLOPE
 from twin.surrogate.vision import SurrogateVision
 
@@ -43,6 +43,7 @@ _GROSS = 5.0  # error / sigma beyond which an error counts as a gross error
 _HEAVY_P90 = 1.562  # 90th percentile of the absolute value of `map_model.heavy_tailed`
 _NORMAL_P90 = 1.2816  # 90th percentile of a standard normal variable
 _NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
+_NO_CHANGE = BinnedDepthLaw(1.0, 1.0, _NONE.common, _NONE.gain, _NONE.noise_gain)
 UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
 #: Quantities of a class of map cells, in the order of the statistic `map_<error or sigma>_<class>`: variances of the
 #: maps from images and sampled maps [m^2], and conditions of the class.
@@ -209,7 +210,7 @@ class ComparisonVision:
             depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0,
             edge_error=SigmaLaw(0.0, 0.0), edge_sigma_gain=0.0, border_error=BorderErrorLaw(0.0, 1.0),
             depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0, depth_ratio_scatter=0.0,
-            depth_binned_error=BinningFactors(1.0, 1.0), depth_binned_sigma=BinningFactors(1.0, 1.0),
+            depth_binned_error=_NO_CHANGE, depth_binned_sigma=_NO_CHANGE,
         )  # fmt: skip
         unit = _NONE._replace(floor_px=UNIT_PX)
         models = {

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from twin.surrogate.error_model import (
-    BinningFactors,
+    BinnedDepthLaw,
     BorderErrorLaw,
     BorderLaw,
     DepthLaw,
@@ -37,6 +37,12 @@ _LEVEL = ("map_scatter_smooth", "map_scatter_rough")  # first parts of the names
 _LEVEL_TAILS = ("map_tail_smooth", "map_tail_rough")
 _NORMAL_TAIL = 2.4387  # 90th percentile of the absolute value of a normal variable, divided by the median
 _FAR_PX = 20.0  # distance from the image border beyond which matching windows are complete
+#: Limits and typical values of the parameters of a `DepthLaw`.
+_LOWEST_LAW = (0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0)
+_HIGHEST_LAW = (1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 10.0)
+_TYPICAL_LAW = (0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 1.0)
+#: Limits and typical values of the parameters of a `BinnedDepthLaw`.
+_BINNED_LIMITS = (0.3, 0.3, 0.0, 0.0, 0.0), (5.0, 5.0, 0.9, 20.0, 10.0), (1.0, 1.0, 0.1, 3.0, 1.0)
 _SOURCES = ("images", "patches", "relief")
 
 #: Samples of each statistic of one survey, by name; see `ComparisonVision.statistics`.
@@ -415,6 +421,15 @@ def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) 
     return BorderLaw(*x.tolist())
 
 
+class _Limits(NamedTuple):
+    """Limits, typical values and start values (n,) of the parameters of a fit."""
+
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
+    typical: tuple[float, ...]
+    start: tuple[float, ...]
+
+
 class _MapErrors(NamedTuple):
     """Parameters of the errors of a map, or of its reported variances.
 
@@ -424,10 +439,9 @@ class _MapErrors(NamedTuple):
         relief_gain, relief_limit_px: gain, and limit [px of disparity], of the error due to relief
             (`map_model.relief_error_px`).
         edge: law of the standard deviation per `map_model.edge_strength`.
+        binned: change of the law for binned images.
         departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
             classes of cells, because a class may consist of a few cells at one spot of the floor.
-        binned: factors due to binning, the medians of measured / modelled values over the surveys with binned images;
-            the laws are fitted to the other surveys, and `departures` are computed with these factors.
     """
 
     depth: DepthLaw
@@ -435,8 +449,86 @@ class _MapErrors(NamedTuple):
     relief_gain: float
     relief_limit_px: float
     edge: SigmaLaw
+    binned: BinnedDepthLaw
     departures: np.ndarray
-    binned: BinningFactors
+
+    def variance(self, classes: _MapClasses) -> np.ndarray:
+        """Returns the modelled variance (m,) of the classes [m^2]."""
+        relief_px2 = relief_error_px(classes.roughness_px, self.relief_gain, self.relief_limit_px) ** 2
+        common = classes.metres_per_px**2 * relief_px2 + self.lateral_sigma_px**2 * classes.lateral
+        edge = (self.edge.floor_px**2 + (self.edge.slope * classes.bound_px) ** 2) * classes.edge
+        by_binning = [classes.depth_of(self.binned.changed(self.depth, binning)) for binning in (1, 2, 4)]
+        depth = np.select([classes.binning == binning for binning in (1, 2, 4)], by_binning)
+        return classes.pose + depth + common + edge
+
+
+class _MapClasses(NamedTuple):
+    """Variances of maps [m^2] and conditions, of m classes of cells.
+
+    Args:
+        images: (m,) variance in the map from images.
+        sampled: (m,) variance in the map sampled from the compared model.
+        pose: (m,) variance due to pose errors alone.
+        depth: (m,) variance that an error of depth of 1 px adds.
+        lateral: (m,) variance that a lateral shift of 1 px adds.
+        edge: (m,) variance that errors near walls of unit gain add.
+        views, step_baselines: (m,) number of keyframes, and distance between them [stereo baselines].
+        roughness_px: (m,) roughness of the cells [px of disparity].
+        bound_px, window_px: (m,) Cramér-Rao bound of the image, and of the median window [px].
+        lamp_share: (m,) fraction of the reflected light that comes from the lamps.
+        metres_per_px: (m,) height per pixel of disparity.
+        binning: (m,) binning of the images.
+        survey: (m,) number of the survey.
+        weight: (m,) weight with which every survey has the same weight.
+    """
+
+    images: np.ndarray
+    sampled: np.ndarray
+    pose: np.ndarray
+    depth: np.ndarray
+    lateral: np.ndarray
+    edge: np.ndarray
+    views: np.ndarray
+    step_baselines: np.ndarray
+    roughness_px: np.ndarray
+    bound_px: np.ndarray
+    window_px: np.ndarray
+    lamp_share: np.ndarray
+    metres_per_px: np.ndarray
+    binning: np.ndarray
+    survey: np.ndarray
+    weight: np.ndarray
+
+    def depth_of(self, law: DepthLaw) -> np.ndarray:
+        """Returns the variance (m,) that errors of depth with the given law add [m^2]."""
+        share = law.relative_variance(self.views, self.step_baselines, self.window_px)
+        return self.depth * law.sigma_px(self.window_px, self.lamp_share) ** 2 * share
+
+    def where(self, chosen: np.ndarray) -> _MapClasses:
+        """Returns the classes that a mask (m,) selects."""
+        return _MapClasses(*(values[chosen] for values in self))
+
+
+def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClasses:
+    """Returns the classes of cells of all surveys; see `comparison.MAP_STATISTICS`.
+
+    Args:
+        surveys: statistics of n surveys.
+        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
+    """
+    rows, conditions = [], []
+    for number, s in enumerate(surveys):
+        classes = [name for name in s if name.startswith(f"map_{quantity}_")]
+        rows += [s[name] for name in classes]
+        bound, lamp_share = float(np.median(s["bound_px"])), float(np.median(s["lamp_share"]))
+        condition = bound, bound * s["window_ratio"][0], lamp_share, s["metres_per_px"][0], s["binning"][0], number
+        conditions += [(*condition, 1 / np.sqrt(max(len(classes), 1)))] * len(classes)
+    images, pose, depth, lateral, edge, sampled, views, step, rough = np.array(rows).T
+    of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
+    condition = np.array(conditions).T
+    return _MapClasses(
+        images, sampled, pose, of_depth / UNIT_PX**2, of_lateral, of_edge, views, step, rough, *condition
+    )  # fmt: skip
 
 
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
@@ -451,65 +543,60 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
     Variances do not add up: the map computes part of its variance from the heights around a cell, whose errors
     count as relief. The model variance is therefore multiplied by the ratio of the variance in the map sampled from
     the compared model to the model variance with the compared parameters. Repeated fits converge, each with the
-    result of the former as compared model. Residuals are differences of logarithms. Surveys without binning have the
-    same weight; those with binned images have none, and only their binning factors are computed.
+    result of the former as compared model. Residuals are differences of logarithms. All parameters but those of
+    `_MapErrors.binned` are fitted to the surveys without binning, and the latter then to those with binned images.
 
     Args:
         surveys: statistics of n surveys.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
         compared: error model whose values are the start of the fit, and a weak prior of the fitted parameters.
     """
-    rows, conditions, weights, numbers = [], [], [], []
-    binning = np.array([s["binning"][0] for s in surveys])
-    for number, s in enumerate(surveys):
-        classes = [name for name in s if name.startswith(f"map_{quantity}_")]
-        rows += [s[name] for name in classes]
-        bound = float(np.median(s["bound_px"]))
-        condition = bound, bound * s["window_ratio"][0], float(np.median(s["lamp_share"])), s["metres_per_px"][0]
-        conditions += [condition] * len(classes)
-        weights += [float(binning[number] == 1) / np.sqrt(max(len(classes), 1))] * len(classes)
-        numbers += [number] * len(classes)
-    images, pose, depth, lateral, edge, sampled, views, step, rough = np.array(rows).T
-    (bounds, windows, lamps, metres_per_px), weight = np.array(conditions).T, np.array(weights)
     is_error = quantity == "error"
-    of_depth, of_lateral, of_edge = (np.maximum(x - pose, 0) for x in (depth, lateral, edge))
-    per_px2 = of_depth / UNIT_PX**2
-
-    def variance(x: np.ndarray) -> np.ndarray:
-        law = DepthLaw(*x[:7])
-        depth_px2 = law.sigma_px(windows, lamps) ** 2 * law.relative_variance(views, step, windows)
-        relief_px2 = relief_error_px(rough, x[8], x[9]) ** 2
-        common = metres_per_px**2 * relief_px2 + x[7] ** 2 * of_lateral if is_error else 0.0
-        return pose + per_px2 * depth_px2 + common + (x[10] ** 2 + (x[11] * bounds) ** 2) * of_edge
-
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
-    gains = (compared.relief_error_gain, compared.relief_error_limit_px, *edge_law)
-    law = compared.depth_error if is_error else compared.depth_sigma
-    lowest = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0])
-    highest = np.array([1.0, 20.0, 3.0, 0.9, 100.0, 10.0, 10.0, 5.0, 3.0, 1.0, 10.0, 200.0 if is_error else 1e-6])
-    typical = np.array([0.05, 1.0, 1.0, 0.1, 3.0, 1.0, 1.0, 0.2, 0.5, 0.05, 1.0, 10.0])
-    margin = np.minimum(1e-3, (highest - lowest) / 4)
-    start = np.clip([*law, compared.lateral_sigma_px, *gains], lowest + margin, highest - margin)
+    laws = (compared.depth_error, compared.depth_binned_error) if is_error else (
+        compared.depth_sigma, compared.depth_binned_sigma
+    )  # fmt: skip
+    gains = compared.lateral_sigma_px, compared.relief_error_gain, compared.relief_error_limit_px
+    now = _MapErrors(laws[0], *(gains if is_error else (0.0, 0.0, 1.0)), edge_law, laws[1], np.zeros(0))
+    classes = _map_classes(surveys, quantity)
+    ratio = classes.sampled / now.variance(classes)
 
-    binned = compared.depth_binned_error if is_error else compared.depth_binned_sigma
-    by_image = binning[numbers]
-    combined = sampled / variance(np.array([*law, compared.lateral_sigma_px, *gains]))
-    combined /= np.select([by_image == 2, by_image == 4], np.square(binned), 1.0)
+    def departures(found: _MapErrors, chosen: np.ndarray) -> np.ndarray:
+        part = classes.where(chosen)
+        return np.log(found.variance(part) * ratio[chosen] / part.images) / 2
 
-    def residuals(x: np.ndarray) -> np.ndarray:
-        logs = np.log(variance(x) * combined / images) / 2
-        return np.concatenate([weight * logs, _PRIOR * (x - start) / np.maximum(start, typical)])
+    def fitted(model_of: Callable[[np.ndarray], _MapErrors], limits: _Limits, chosen: np.ndarray) -> _MapErrors:
+        lowest, highest, typical, values = (np.array(x) for x in limits)
+        margin = np.minimum(1e-3, (highest - lowest) / 4)
+        start, weight = np.clip(values, lowest + margin, highest - margin), classes.weight[chosen]
 
-    limits = lowest, highest
-    found = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER)
-    ratios = np.log(images / (variance(found.x) * combined)) / 2
-    flown = sorted(set(numbers))
-    departures, by = np.array([np.median(ratios[np.array(numbers) == number]) for number in flown]), binning[flown]
-    factors = [float(np.median(departures[by == k])) if (by == k).any() else 0.0 for k in (2, 4)]
-    departures -= np.select([by == 2, by == 4], factors, 0.0)
-    x = found.x.tolist()
-    binned_factors = BinningFactors(*np.exp(factors).tolist())
-    return _MapErrors(DepthLaw(*x[:7]), x[7], x[8], x[9], SigmaLaw(*x[10:]), departures, binned_factors)
+        def residuals(x: np.ndarray) -> np.ndarray:
+            prior = _PRIOR * (x - start) / np.maximum(start, typical)
+            return np.concatenate([weight * departures(model_of(x), chosen), prior])
+
+        return model_of(least_squares(residuals, start, bounds=(lowest, highest), loss="soft_l1", f_scale=_OUTLIER).x)
+
+    def full(x: np.ndarray) -> _MapErrors:
+        lateral_px, gain, limit_px = x[7:10].tolist() if is_error else (0.0, 0.0, 1.0)
+        law, edge = DepthLaw(*x[:7].tolist()), SigmaLaw(*x[10:].tolist())
+        return _MapErrors(law, lateral_px, gain, limit_px, edge, laws[1], np.zeros(0))
+
+    limits = _Limits(
+        (*_LOWEST_LAW, 0.0, 0.0, 0.01, 0.0, 0.0),
+        (*_HIGHEST_LAW, 5.0, 3.0, 1.0, 10.0, 200.0 if is_error else 1e-6),
+        (*_TYPICAL_LAW, 0.2, 0.5, 0.05, 1.0, 10.0),
+        (*laws[0], *gains, *edge_law),
+    )
+    result = fitted(full, limits, classes.binning == 1)
+    if (binned := classes.binning > 1).any():
+
+        def with_binned(x: np.ndarray) -> _MapErrors:
+            return result._replace(binned=BinnedDepthLaw(*x.tolist()))
+
+        result = fitted(with_binned, _Limits(*_BINNED_LIMITS, laws[1]), binned)
+    logs = -departures(result, np.ones(len(ratio), np.bool_))
+    flown = sorted(set(classes.survey))
+    return result._replace(departures=np.array([np.median(logs[classes.survey == number]) for number in flown]))
 
 
 def _robust_scatter(departures: np.ndarray) -> float:

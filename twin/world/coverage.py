@@ -22,9 +22,9 @@ class Coverage:
     """Observed cells of a grid.
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
-    left image, both cameras see these points, and there is no depth edge between them. With `top_m`, the quad must also
-    reach that surface: floor that the cameras see below an overhang is not observed, as the map has the height of the
-    overhang there.
+    left image, both cameras see these points, and there is no depth edge between them. With `top_m`, the quad must not
+    lie more than the side of a cell below that surface: floor that the cameras see below an overhang is not observed,
+    as the map has the height of the overhang there.
 
     Args:
         grid: grid of the map.

@@ -33,7 +33,7 @@ from terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from terrains.terrain import texture_shape
 from twin.core.records import Array, Image, MapGrid
 from twin.errors import TwinError
-from twin.imaging.mesh_raster import Projection, Target, draw_mesh
+from twin.imaging.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.imaging.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario, TerrainConfig
 from twin.world.coverage import true_heights
@@ -70,7 +70,7 @@ class FloorSurface(NamedTuple):
 
 
 def load_mesh_floor(scenario: Scenario) -> MeshFloor:
-    """Reads the mesh of a scenario and computes its height grids.
+    """Returns the mesh floor of a scenario: reads its mesh and computes the height grids.
 
     Raises:
         TwinError: a key contradicts terrain.kind, or the mesh cannot be read or used as a floor.
@@ -113,7 +113,7 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
 
 
 def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
-    """Returns a mesh without long edges; raises TwinError if this takes too many triangles, or it is too large."""
+    """Returns a mesh without long edges; raises TwinError if this needs too many triangles or the mesh is too large."""
     if not np.isfinite(extent(whole.mesh)).all():
         raise TwinError(FIELD, f"{file.name!r} is too large", "a mesh that covers the planned area")
     try:
@@ -136,7 +136,7 @@ def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
     """Returns the grid whose cell centres are the nodes of the height grid, in the middle of the extent of the mesh.
 
     The spacing is the median length of an edge, but at least FINEST_GRID_M and at most `coarsest_m`, or as large as
-    MOST_NODES requires. Raises TwinError if the mesh is smaller than two nodes.
+    MOST_NODES requires. Raises TwinError if the mesh is too small for two nodes along x or y.
     """
     low, high = extent(mesh)
     size = (high - low)[:2]
@@ -162,8 +162,7 @@ def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
             the height of the lowest surface.
     """
     depth = np.full((grid.rows, grid.cols), np.inf, np.float32)
-    for mesh in meshes:
-        draw_mesh(mesh, axes, _projection(grid, 0), Target(depth))
+    draw_meshes([DrawnMesh(mesh, axes) for mesh in meshes], _projection(grid, 0), Target(depth))
     return depth
 
 
@@ -193,12 +192,12 @@ def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of the mesh from above, and in which cells the mesh is seen.
+    """Returns the colours (rows, cols, 3) of the mesh from above, and whether each cell (rows, cols) shows the mesh.
 
     Args:
         drawn: the tiles of the mesh.
-        grid: the cells; their width is `grid.cell_m`.
-        row_m: their height, nearly equal to the width.
+        grid: the cells, whose width is `grid.cell_m`.
+        row_m: height of the cells, nearly equal to their width.
     """
     stretch = grid.cell_m / row_m
     axes = np.diag([1.0, stretch, 1.0, 1.0]) @ FROM_ABOVE

@@ -305,7 +305,7 @@ def _check_texture_keys(t: TerrainConfig) -> None:
 
 
 def _check_mesh_keys(t: TerrainConfig) -> None:
-    """Raises TwinError if a floor that is no mesh has keys of a mesh."""
+    """Raises TwinError if keys of a mesh are set for a floor that is not a mesh."""
     for key in ("mesh_file", "mesh_up", "mesh_scale"):
         if getattr(t, key) != TerrainConfig.model_fields[key].default:
             raise TwinError(f"terrain.{key}", f"has no effect on terrain.kind = {t.kind!r}", 'terrain.kind = "mesh"')

@@ -92,7 +92,7 @@ def _planned_velocities(plan: SurveyPlan) -> tuple[Array, Array]:
 
 
 def _body_velocities(yaw: Array, velocity: Array) -> Array:
-    """Rotates velocities (n, 3) from the world to the body axes of a level vehicle at yaws (n,) [rad]."""
+    """Returns velocities (n, 3), given in world axes, in the body axes of a level vehicle at yaws (n,) [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = velocity.T
     return np.column_stack([c * x + s * y, c * y - s * x, z])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from terrains.objects.model import PlacedObject
 from twin.core.records import Array, MapGrid
-from twin.imaging.mesh_raster import Projection, Target, draw_mesh
+from twin.imaging.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 
 OVERHANG_M = 0.01  #: least gap between the floor and an object that overhangs it
 _ROWS_PER_BLOCK = 256  # normals and colours, which are not kept, take 15 bytes per cell
@@ -61,12 +61,16 @@ def _fill(block: TopSurface, grid: MapGrid, first: int, objects: Sequence[Placed
     below = Target(np.full(shape, np.inf, np.float32))
     north_m = grid.north_m - first * grid.cell_m
     south_m = north_m - shape[0] * grid.cell_m
+    seen_from_above, seen_from_below = [], []
     for number, item in enumerate(objects):
         y, reach_m = item.centre_m[1], item.radius_m
         if south_m - reach_m <= y <= north_m + reach_m:
-            mesh = item.model.levels[0].mesh
-            draw_mesh(mesh, FROM_ABOVE @ item.world_from_object, view, above, number + 1, item.model.closed)
-            draw_mesh(mesh, FROM_BELOW @ item.world_from_object, view, below)
+            mesh, _, parts = item.model.levels[0]
+            pose, closed = item.world_from_object, item.model.closed
+            seen_from_above.append(DrawnMesh(mesh, FROM_ABOVE @ pose, number + 1, closed, parts))
+            seen_from_below.append(DrawnMesh(mesh, FROM_BELOW @ pose, parts=parts))
+    draw_meshes(seen_from_above, view, above)
+    draw_meshes(seen_from_below, view, below)
     block.height_m[:] = -above.depth
     block.overhung[:] = (block.objects > 0) & (below.depth - floor_m > OVERHANG_M)
 

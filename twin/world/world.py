@@ -63,6 +63,12 @@ class TrueSurface(NamedTuple):
 class World(ABC):
     """Simulated world of a mission. Use as a context manager.
 
+    Args:
+        mission: the survey to fly.
+        stopwatch: timer of the stages of the simulation.
+        vehicle: simulated vehicle at the start of the survey.
+        sensors: navigation sensors of the vehicle.
+
     Attributes:
         warnings: sentences on the limitations of this simulated world, for the log and the report of the survey.
     """

@@ -111,7 +111,7 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
 
 @njit(cache=True, nogil=True)
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
-    """Estimates the light of all lamps that reaches a vertex after one scattering, times the response of the vertex.
+    """Returns an estimate of the light of lamps that reaches a vertex after one scattering, times its `response`.
 
     The estimate is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around lamps
     and sun.
@@ -301,8 +301,8 @@ def bin_of(view, bin_edges_px, x, y, z):
     The last bin has no upper limit and also holds points behind the camera.
 
     Args:
-        view: (5, 3) axes of the camera in the world as rows, its position [m], and (column, row) of the pixel relative
-            to the principal point and the focal length [px].
+        view: (5, 3) axes of the camera in the world as rows 0 to 2, its position [m] as row 3, and in row 4 column and
+            row of the pixel relative to the principal point, then the focal length [px].
         bin_edges_px: (n,) lower edges of the bins, from 0.
         x, y, z: the point in the world [m].
     """

@@ -1,0 +1,125 @@
+"""Frames and readings of the IMU that a run folder keeps, for exports."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from twin.core.records import Array, Exposure, ImuReadings, Readings
+from twin.errors import TwinError
+from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu
+from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, READING_COLUMNS
+from twin.report.run_folder import SCENARIO_FILE, Run
+from twin.scenario.model import Scenario
+from twin.world.mission import motion_rate_hz
+
+
+def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
+    """Returns the frames of a run whose left image was recorded, in the order of time.
+
+    Without frames.csv, as in a replay, these are keyframes; their times are those of the online or the true trajectory.
+
+    Raises:
+        TwinError: frames.csv is damaged or lacks a keyframe.
+    """
+    keyframes = set(run.keyframes.frames.tolist())
+    folder = run.folder / "frames"
+    table = folder / "frames.csv"
+    if table.is_file():
+        listed = _listed(table)
+        if missing := keyframes - {row[0] for row in listed}:
+            raise TwinError(str(table), f"has no line for the keyframe {min(missing)}", "a complete list of the frames")
+    else:
+        path = next((run.trajectories[key] for key in ("online", "truth") if key in run.trajectories), None)
+        times = [] if path is None else path.times_s.tolist()
+        listed = [(k, times[k], None, Readings()) for k in sorted(keyframes) if k < len(times)]
+    found = []
+    for index, time_s, exposure, readings in listed:
+        left, right = (folder / side / f"{index:06d}.png" for side in ("left", "right"))
+        if not left.is_file() and index in keyframes:
+            left, right = (run.image_file(index, side) for side in ("left", "right"))
+        if left.is_file():
+            right = right if right.is_file() else None
+            found.append(RecordedFrame(index, time_s, left, right, index in keyframes, readings, exposure))
+    return tuple(found)
+
+
+def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
+    """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
+    try:
+        with table.open(newline="", encoding="utf-8") as lines:
+            return [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise TwinError(str(table), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
+
+
+def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
+    """Returns index, time, exposure and readings of a line of frames.csv.
+
+    Raises:
+        ValueError: the line has too few or too many cells, or a cell is not a number.
+        KeyError: a column is missing.
+    """
+    if None in row or None in row.values():
+        raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
+    return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
+
+
+def _exposure(row: dict[str, str]) -> Exposure | None:
+    """Returns the exposure of a line of frames.csv; None if its cells are empty."""
+    red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
+    return (float(red), float(green), float(blue)) if red else None
+
+
+def _readings(row: dict[str, str]) -> Readings:
+    """Returns the readings of a line of frames.csv, which has no detected beacons."""
+    cells = [row[name] for name in READING_COLUMNS]
+
+    def vector(first: int) -> Array | None:
+        return np.array([float(cell) for cell in cells[first : first + 3]]) if cells[first] else None
+
+    return Readings(float(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))
+
+
+def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
+    """Returns the readings of the IMU in frames/imu.csv with their rate and noise; None if the run has none.
+
+    Raises:
+        TwinError: the file is damaged, or the scenario has no IMU.
+    """
+    file = folder / "frames" / "imu.csv"
+    if not file.is_file():
+        return None
+    if scenario.imu is None:
+        raise TwinError(
+            str(file), f"belongs to no sensor: {SCENARIO_FILE} has no section [imu]", "the files of one run"
+        )
+    settings = scenario.imu
+    try:
+        values = _imu_table(file)
+    except (OSError, ValueError) as error:
+        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
+    noise = ImuNoise(
+        settings.gyroscope_noise_density, settings.gyroscope_random_walk,
+        settings.accelerometer_noise_density, settings.accelerometer_random_walk,
+    )  # fmt: skip
+    readings = ImuReadings(values[:, 0], values[:, 1:4], values[:, 4:])
+    return RecordedImu(readings, settings.rate_hz or motion_rate_hz(scenario), noise)
+
+
+def _imu_table(file: Path) -> Array:
+    """Returns the numbers (n, 7) of imu.csv; raises ValueError unless all are finite and their times increase."""
+    header, *lines = file.read_text(encoding="utf-8").splitlines() or [""]
+    if header != ",".join(IMU_COLUMNS):
+        raise ValueError(f"its first line is {header[:60]!r}")
+    rows = [line.split(",") for line in lines]
+    wrong = next((k for k, row in enumerate(rows, 2) if len(row) != len(IMU_COLUMNS)), None)
+    if wrong is not None:
+        raise ValueError(f"line {wrong} is incomplete")
+    table = np.array(rows, np.float64).reshape(-1, len(IMU_COLUMNS))
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=-np.inf) <= 0))
+    if len(bad):
+        raise ValueError(f"line {bad[0] + 2} has a value that is not finite, or a time that does not increase")
+    return table
