@@ -1,5 +1,10 @@
 """Recorded data sets: readers, calibration files, rectification, images, and input that is damaged or hostile."""
 
+import os
+import shutil
+import struct
+import zlib
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +14,7 @@ import pytest
 import recorded_datasets as recorded
 from recorded_datasets import RIG
 
+from twin.app.outputs import new_folder
 from twin.core import geometry
 from twin.core.records import Frame
 from twin.datasets import image_files
@@ -16,13 +22,14 @@ from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
 from twin.datasets.frames import RecordedFrames, increasing
-from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, read_rgb
+from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.readers import read_dataset
 from twin.datasets.rectification import rectification
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
 from twin.exchange.euroc import EurocWriter
 from twin.plugin import loading
+from twin.report.run_folder import load_run
 
 RNG = np.random.default_rng(1)
 GRAY = cv2.GaussianBlur(RNG.integers(0, 255, (RIG.height_px, RIG.width_px), np.uint8), (0, 0), 1.5)
@@ -74,6 +81,8 @@ def test_opencv_kalibr_and_colmap_files_give_the_same_calibration(tmp_path, writ
         ("opencv", {"T": np.array([0.0, -0.15, 0])}, "not side by side"),
         ("opencv", {"M2": None}, "M2 is missing or not valid"),
         ("opencv", {"M1": -RIG.matrix}, "focal length of the left camera"),
+        ("opencv", {"M1": np.diag([1e9, 1e9, 1])}, "the focal length of the left camera is 1e.09, 1e.09 px"),
+        ("opencv", {"T": np.array([-1e300, 0, 0])}, "T is missing or not valid"),
         ("opencv", {"R": np.eye(3) * 2}, "not a rotation matrix"),
         ("opencv", {"D1": np.zeros((1, 3))}, "3 coefficients of distortion"),
         ("opencv", {"image_width": 3}, "image size"),
@@ -98,6 +107,16 @@ def test_an_impossible_calibration_is_one_line_with_its_file(tmp_path, write, ch
         ("- 1", "not a YAML table"),
         ("M1: !!opencv-matrix {rows: 100000, cols: 100000, dt: d, data: []}", "not valid YAML"),
         ("x" * 2**21, "too large"),
+        (
+            "a: &a [x, x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in pairwise("abcdefghi")),
+            "more than 100000 values",
+        ),
+        (
+            "a: &a {x: 1}\n"
+            + "".join(f"{b}: &{b} {{<<: [{', '.join([f'*{a}'] * 9)}]}}\n" for a, b in pairwise("abcdefghi")),
+            "more than 100000 values",
+        ),
+        ("M1: &a [*a]", "a value that contains itself"),
     ],
 )
 def test_a_hostile_yaml_file_runs_no_code_and_takes_no_memory(tmp_path, text, message):
@@ -465,3 +484,93 @@ def test_a_stored_image_of_another_size_is_not_used():
     assert image_files.read_rgb(Stored(), (6, 4), image_files.ImageFormat()).shape == (4, 6, 3)
     with pytest.raises(image_files.UnreadableImage, match="another size"):
         image_files.read_rgb(Stored(), (8, 4), image_files.ImageFormat())
+
+
+def test_a_focal_length_far_below_the_image_size_is_refused(tmp_path):
+    file = recorded.write_opencv(
+        tmp_path / "calibration.yaml", M1=np.diag([5.0, 5.0, 1.0]) + RIG.matrix * [[0, 0, 1]] * 3
+    )
+    with pytest.raises(TwinError, match=r"the focal length of the left camera is 5, 5 px .allowed: at least 0.05 of"):
+        read_calibration(file).for_images(RIG.width_px, RIG.height_px)
+
+
+@pytest.mark.parametrize(
+    ("times", "problem"),
+    [
+        ([f"{k}e300" for k in range(3)], "the time of 0001.png is 1e.300 s .allowed: seconds, up to 1e.11"),
+        ([str(1_700_000_000_000_000_000 + k * 10**8) for k in range(3)], "the time of 0000.png is 1.7e.18 s"),
+        (["0.0", "5e-324", "1e-323"], "the median interval between its frames is 4.94066e-324 s"),
+        (["100.0", "100.000000001", "100.000000002"], "the median interval between its frames is 9.99997e-10 s"),
+    ],
+)
+def test_times_that_cannot_be_seconds_are_refused(tmp_path, times, problem):
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(recorded.poses(3)))
+    (folder / "times.txt").write_text("\n".join(times))
+    with pytest.raises(TwinError, match=problem):
+        read_dataset(folder)
+
+
+@pytest.mark.parametrize("digits", [20, 400, 5000])
+def test_a_time_with_too_many_digits_is_refused_with_its_line(euroc, tmp_path, digits):
+    folder = shutil.copytree(euroc, tmp_path / "copy")
+    table = folder / "mav0" / "cam0" / "data.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([*lines[:2], "9" * digits + "," + lines[2].split(",")[1]]))
+    with pytest.raises(TwinError, match=r"cam0/data.csv:3: is not a time and a file name"):
+        read_dataset(folder)
+
+
+def test_hidden_files_are_no_images_and_a_folder_of_other_files_is_named(tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(recorded.poses(1)))
+    (folder / "left" / "._0000.png").write_bytes(b"Mac OS X")
+    assert len(read_dataset(folder)[0].images) == 1
+    for file in folder.glob("*/*0000.png"):
+        file.rename(file.with_suffix(".bmp"))
+    with pytest.raises(TwinError, match=r"has no images of the left camera or of the right one .allowed: .png, .jpg"):
+        read_dataset(folder)
+
+
+def test_folders_in_place_of_files_are_refused(euroc, tmp_path):
+    folder = recorded.write_folder(tmp_path / "plain", recorded.frames(recorded.poses(1)))
+    (folder / "times.txt").unlink()
+    (folder / "times.txt").mkdir()
+    with pytest.raises(TwinError, match="times.txt: does not exist or is not a file"):
+        read_dataset(folder)
+    copy = shutil.copytree(euroc, tmp_path / "copy")
+    truth = copy / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.unlink()
+    truth.mkdir()
+    assert isinstance(read_dataset(copy)[0].truth, TwinError)
+
+
+def test_one_image_of_another_size_at_the_start_is_skipped(tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(recorded.poses(4)))
+    cv2.imwrite(str(folder / "left" / "0000.png"), np.zeros((20, 30, 3), np.uint8))
+    dataset, _ = read_dataset(folder)
+    frames = RecordedFrames(dataset, dataset.calibration)
+    assert len(list(frames)) == 3 and frames.skipped == {"left image: another size": 1}
+
+
+def test_an_image_with_too_many_pixels_is_named_so(tmp_path):
+    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
+    chunk = b"IHDR" + header
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    bomb += struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
+    (tmp_path / "bomb.png").write_bytes(bomb)
+    with pytest.raises(UnreadableImage, match="too many pixels"):
+        image_size(tmp_path / "bomb.png")
+
+
+def test_a_path_that_is_too_long_is_one_line():
+    with pytest.raises(TwinError, match="File name too long"):
+        read_dataset(Path("x" * 5000))
+
+
+def test_a_path_that_is_not_utf8_is_refused_before_opencv_crashes_on_it(tmp_path):
+    folder = os.fsencode(tmp_path) + b"/\xff\xfe"
+    os.mkdir(folder)
+    path = Path(os.fsdecode(folder))
+    for check in (read_dataset, load_run, new_folder):
+        with pytest.raises(TwinError, match=r"udcff.udcfe.*: is not text in UTF-8") as error:
+            check(path)
+        assert str(error.value).isascii()

@@ -345,3 +345,19 @@ def test_pairs_too_far_apart_for_tracking_are_linked_directly(tmp_path):
     found = twin.replay(folder, tmp_path / "run", ReplayOptions(truth=tmp_path / "truth.tum", outputs=()))
     assert found.metrics["links"]["bridged"] == 0 and found.metrics["timing"]["keyframes"] == 6
     assert found.metrics["trajectory"]["final"]["ate_max_m"] < 0.006
+
+
+def test_the_truth_is_sorted_and_of_equal_times_the_first_pose_counts():
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [2, 0, 1, 9]
+    found = replay._ordered(Trajectory(np.array([2.0, 0.0, 1.0, 1.0]), poses), "truth.txt")
+    np.testing.assert_array_equal(found.times_s, [0, 1, 2])
+    np.testing.assert_array_equal(found.positions[:, 0], [0, 1, 2])
+    poses[2, 1, 3] = 1e200
+    with pytest.raises(TwinError, match=r"truth.txt: a coordinate of a true position is 1e.200 m"):
+        replay._ordered(Trajectory(np.arange(4.0), poses), "truth.txt")
+
+
+def test_topics_of_a_data_set_that_is_no_bag_are_refused(euroc):
+    with pytest.raises(TwinError, match="--topics: .* is not a ROS 2 bag"):
+        open_dataset(euroc, ReplayOptions(topics=("/a", "/b")))

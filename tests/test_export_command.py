@@ -1,6 +1,7 @@
 """Recorded frames are kept without loss, read back from the run folder, and their truth is that of the images."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -136,7 +137,8 @@ def test_an_export_has_the_readings_of_the_imu_without_loss(run_with_imu, tmp_pa
         (lambda text: "", "imu.csv: cannot be read: its first line is ''"),
         (lambda text: text.replace("rate_x", "rate_q"), "imu.csv: cannot be read: its first line is 'time_s,rate_q"),
         (lambda text: text.replace("\n0.0,", "\nnan,"), "line 2 has a value that is not finite"),
-        (lambda text: text.replace("\n0.025,", "\n0.005,"), "line 5 has .* a time that does not increase"),
+        (lambda text: text.replace("\n0.025,", "\n0.005,"), "line 5: time_s is 0.005, not larger than before"),
+        (lambda text: text[:-70] + "\n1e300,0,0,0,0,0,0\n", "imu.csv: cannot be read: line .*"),
         (lambda text: text.replace("\n0.025,", "\nx,"), "imu.csv: cannot be read: could not convert string"),
     ],
 )
@@ -396,3 +398,97 @@ def test_images_of_a_killed_run_are_exported_and_formats_with_poses_are_refused(
     assert not (tmp_path / "out").exists()
     (written,) = export(recorded_run, ["euroc"], tmp_path / "out")["euroc"]
     assert len(list((written / "cam0" / "data").iterdir())) == 3
+
+
+def changed_line(number, column, value):
+    """Returns a function that replaces one cell of a table."""
+
+    def change(text):
+        lines = text.splitlines()
+        cells = lines[number - 1].split(",")
+        cells[column] = value
+        lines[number - 1] = ",".join(cells)
+        return "\n".join(lines) + "\n"
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (changed_line(3, 1, "nan"), "line 3: time_s is nan, not larger than before and from 0 to 1e"),
+        (changed_line(3, 1, "inf"), "line 3: time_s is inf"),
+        (changed_line(3, 1, "1e18"), "line 3: time_s is 1e.18"),
+        (changed_line(2, 1, "-5"), "line 2: time_s is -5"),
+        (changed_line(3, 1, "0.0"), "line 3: time_s is 0"),
+        (changed_line(3, 0, "0"), "line 3: index is 0"),
+        (changed_line(2, 0, "-1"), "line 2: index is -1"),
+        (changed_line(3, 6, "nan"), "nan is not a finite number"),
+        (lambda text: text.replace("time_s", "clock"), "the column time_s is missing"),
+    ],
+)
+def test_impossible_values_in_the_list_of_frames_are_refused(recorded_run, change, problem):
+    table = recorded_run / "frames" / "frames.csv"
+    table.write_text(change(table.read_text()))
+    with pytest.raises(TwinError, match=f"frames.csv: cannot be read: {problem}"):
+        run_contents(recorded_run)
+
+
+def test_a_list_of_frames_with_a_byte_order_mark_is_read(recorded_run):
+    table = recorded_run / "frames" / "frames.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes())
+    assert len(run_contents(recorded_run).frames) == 3
+
+
+@pytest.mark.parametrize("name", ["truth", "final"])
+def test_a_trajectory_with_too_few_or_unordered_poses_is_refused(recorded_run, name):
+    file = recorded_run / f"trajectory_{name}.tum"
+    Trajectory(np.arange(2) / 3, np.tile(np.eye(4), (2, 1, 1))).save(file)
+    with pytest.raises(TwinError, match=f"trajectory_{name}.tum: has 2 poses .allowed: 3, one per frame"):
+        run_contents(recorded_run)
+    Trajectory(np.array([0.0, 0.5, 0.5]), np.tile(np.eye(4), (3, 1, 1))).save(file)
+    with pytest.raises(TwinError, match=f"trajectory_{name}.tum: has times that do not increase"):
+        run_contents(recorded_run)
+
+
+def test_files_that_are_missing_in_a_run_folder_are_named(recorded_run, tmp_path):
+    (recorded_run / "scenario.resolved.toml").write_text(
+        dump_toml(Scenario.model_validate({"record": "all", "imu": {}}))
+    )
+    (recorded_run / "frames" / "left" / "000001.png").unlink()
+    found: list[str] = []
+    export(recorded_run, ["euroc"], tmp_path / "out", warn=found.append)
+    assert [note.replace(str(recorded_run), "RUN") for note in found] == [
+        "1 of 3 left images of RUN are missing; their frames are left out.",
+        "RUN/frames/imu.csv is missing: the readings of the IMU are not exported.",
+    ]
+    (recorded_run / "frames" / "right" / "000002.png").unlink()
+    (recorded_run / "frames" / "frames.csv").unlink()
+    assert "frames.csv is missing" in run_contents(recorded_run).notes[0]
+
+
+def test_a_complete_run_folder_has_no_notes(recorded_run):
+    (recorded_run / "scenario.resolved.toml").write_text(dump_toml(Scenario(record="all")))
+    assert run_contents(recorded_run).notes == ()
+
+
+def test_a_file_in_place_of_the_hidden_folder_is_named(recorded_run, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / ".euroc.partial").write_text("mine")
+    with pytest.raises(TwinError, match=r"--out: .*\.euroc\.partial is in the way"):
+        export(recorded_run, ["euroc"], tmp_path / "out")
+    assert (tmp_path / "out" / ".euroc.partial").read_text() == "mine"
+
+
+@pytest.mark.parametrize("origin", ["1e300,1e300", "1e9,1e9", "4e7,1"])
+def test_an_origin_outside_its_crs_is_refused(recorded_run, origin):
+    with pytest.raises(TwinError, match="--origin: .* is outside the CRS"):
+        run_contents(recorded_run, ExportOptions("EPSG:32633", origin))
+
+
+def test_an_image_of_another_size_has_no_true_layers(recorded, tmp_path):
+    shutil.copytree(recorded, tmp_path / "run")
+    image = tmp_path / "run" / "frames" / "left" / "000000.png"
+    cv2.imwrite(str(image), cv2.imread(str(image))[:50, :60])
+    with pytest.raises(TwinError, match=r"left/000000.png: is 60 x 50 px .allowed: 96 x 72 px"):
+        export(tmp_path / "run", ["truth"], tmp_path / "out")

@@ -503,9 +503,11 @@ def replay(
     options = recorded.ReplayOptions(
         calibration, truth, alignment, pattern, topics=pair, estimator=estimator, aiding=aiding
     )
-    name = outputs.file_stem(dataset.resolve().name)
+    name = outputs.path_stem(dataset)
     if preview:
         file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))
+        if file.suffix.lower() not in (".png", ""):
+            raise TwinError("--out", f"{file.suffix[:20]!r} is not the suffix of a sheet", ".png")
         opened = recorded.open_dataset(dataset, options)
         with outputs.writing(file):
             previewing.draw(opened, file)
@@ -592,7 +594,10 @@ def export(
     target = folder / "export" if out is None else out
     options = export_command.ExportOptions(crs, origin, jpeg)
     with console.replay_bar() as progress, outputs.writing(target):
-        written = export_command.export(folder, to, target, options, progress)
+        warnings: list[str] = []
+        written = export_command.export(folder, to, target, options, progress, warnings.append)
+    for warning in warnings:
+        print(f"Warning: {warning}", file=sys.stderr)
     for name, paths in written.items():
         print(f"{name}: {', '.join(map(str, paths))}")
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from twin.app.camera_models import believed_calibration, true_calibration
 from twin.app.outputs import new_folder
-from twin.app.recorded_frames import recorded_frames, recorded_imu
+from twin.app.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, Image
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
-from twin.exchange.run_contents import RecordedFrame, RunContents
+from twin.exchange.run_contents import POSES, RecordedFrame, RunContents
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
 from twin.scenario.file import load_scenario
@@ -49,6 +49,7 @@ def export(
     out: Path,
     options: ExportOptions = ExportOptions(),  # noqa: B008 (immutable)
     progress: Callable[[str, float], None] = lambda _, __: None,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, list[Path]]:
     """Writes a run in several formats, each into the subfolder of `out` with the name of the format.
 
@@ -61,6 +62,7 @@ def export(
         out: folder of the exported files.
         options: CRS, origin and compression.
         progress: called with the name of a format and the completed fraction of it, 0 to 1.
+        warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
 
     Returns:
         The files or folders written, by format.
@@ -82,6 +84,8 @@ def export(
         with _completed(out / name) as unfinished:
             files = FORMATS[name].write(replace(contents, progress=partial(progress, name)), unfinished)
         written[name] = [out / name / file.relative_to(unfinished) for file in files]
+    for note in contents.notes:
+        warn(note)
     return written
 
 
@@ -96,6 +100,8 @@ def _completed(folder: Path) -> Iterator[Path]:
         OSError: a folder cannot be created, removed or renamed.
     """
     unfinished = folder.with_name(f".{folder.name}.partial")
+    if unfinished.is_symlink() or unfinished.is_file():
+        raise TwinError("--out", f"{unfinished} is in the way", "a folder without this file")
     if unfinished.exists():  # of an export that was killed
         shutil.rmtree(unfinished)
     unfinished.mkdir(parents=True)
@@ -127,6 +133,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         rig = scenario.believed_rig()
     assert rig is not None
     frames = recorded_frames(run)
+    _check_poses(run, frames)
     elevation = _elevation(run)
     return RunContents(
         folder=folder,
@@ -145,7 +152,21 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         georeference=_georeference(folder, options),
         true_layers=_true_layers(folder, scenario, frames),
         jpeg_quality=_quality(options.jpeg_quality),
+        notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
     )
+
+
+def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
+    """Raises TwinError unless the true and the final trajectory have a pose for each frame, at increasing times."""
+    needed = max((one.index for one in frames), default=-1) + 1
+    for name in POSES:
+        if (path := run.trajectories.get(name)) is not None:
+            file = str(run.folder / f"trajectory_{name}.tum")
+            if len(path) < needed:
+                raise TwinError(file, f"has {len(path)} poses", f"{needed}, one per frame")
+            times_s = path.times_s
+            if not (np.isfinite(times_s).all() and (np.diff(times_s) > 0).all() and (times_s >= 0).all()):
+                raise TwinError(file, "has times that do not increase", "an undamaged file, written by `twin run`")
 
 
 def _true_layers(folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...]):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from twin.core.paths import path_problem
+from twin.core.paths import path_problem, resolved
 from twin.errors import TwinError
 
 #: Largest number of bytes of the name of a scenario or study that a file name contains.
@@ -58,6 +58,11 @@ def file_stem(name: str) -> str:
     return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
 
 
+def path_stem(path: Path) -> str:
+    """Returns the name of an input file or folder for use in a file name (`file_stem`)."""
+    return file_stem(resolved(path).name)
+
+
 def is_empty(folder: Path) -> bool:
     """Returns whether a path is an empty folder."""
     return folder.is_dir() and not any(folder.iterdir())
@@ -67,7 +72,7 @@ def _check_path(path: Path, option: str, allowed: str) -> None:
     """Raises TwinError if the file system rejects a path (see `path_problem`); the path need not exist."""
     if problem := path_problem(path):
         shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
-        raise TwinError(option, f"{shown!r}: {problem}", allowed)
+        raise TwinError(option, f"{ascii(shown)}: {problem}", allowed)
 
 
 def _check_writable(path: Path, option: str) -> None:

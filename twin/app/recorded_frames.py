@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, READING_CO
 from twin.report.run_folder import SCENARIO_FILE, Run
 from twin.scenario.model import Scenario
 from twin.world.mission import motion_rate_hz
+
+_LARGEST = 1e9  # largest number and largest time [s] of a frame
 
 
 def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
@@ -49,19 +53,33 @@ def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
 def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
     """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
     try:
-        with table.open(newline="", encoding="utf-8") as lines:
-            return [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        with table.open(newline="", encoding="utf-8-sig") as lines:
+            rows = [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
+        _check_order("index", [row[0] for row in rows])
+        _check_order("time_s", [row[1] for row in rows])
+    except (OSError, ValueError, TypeError, csv.Error) as error:
         raise TwinError(str(table), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
+    return rows
+
+
+def _check_order(name: str, values: Sequence[float]) -> None:
+    """Raises ValueError unless the values of a column of a table increase from line to line, from 0 or later on."""
+    column = np.array(values, np.float64)
+    wrong = np.flatnonzero(~((np.diff(column, prepend=-1.0) > 0) & (column >= 0) & (column <= _LARGEST)))
+    if len(wrong):
+        shown = f"{column[wrong[0]]:g}"
+        raise ValueError(f"line {wrong[0] + 2}: {name} is {shown}, not larger than before and from 0 to {_LARGEST:g}")
 
 
 def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
     """Returns index, time, exposure and readings of a line of frames.csv.
 
     Raises:
-        ValueError: the line has too few or too many cells, or a cell is not a number.
-        KeyError: a column is missing.
+        ValueError: a column is missing, the line has too few or too many cells, or a cell is not a finite number.
     """
+    missing = [name for name in ("index", "time_s", *EXPOSURE_COLUMNS, *READING_COLUMNS) if name not in row]
+    if missing:
+        raise ValueError(f"the column {missing[0]} is missing")
     if None in row or None in row.values():
         raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
     return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
@@ -70,7 +88,7 @@ def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readin
 def _exposure(row: dict[str, str]) -> Exposure | None:
     """Returns the exposure of a line of frames.csv; None if its cells are empty."""
     red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
-    return (float(red), float(green), float(blue)) if red else None
+    return (_finite(red), _finite(green), _finite(blue)) if red else None
 
 
 def _readings(row: dict[str, str]) -> Readings:
@@ -78,9 +96,34 @@ def _readings(row: dict[str, str]) -> Readings:
     cells = [row[name] for name in READING_COLUMNS]
 
     def vector(first: int) -> Array | None:
-        return np.array([float(cell) for cell in cells[first : first + 3]]) if cells[first] else None
+        return np.array([_finite(cell) for cell in cells[first : first + 3]]) if cells[first] else None
 
-    return Readings(float(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))
+    return Readings(_finite(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))
+
+
+def _finite(cell: str) -> float:
+    """Returns the number in a cell; raises ValueError if it is not finite."""
+    if not math.isfinite(number := float(cell)):
+        raise ValueError(f"{cell} is not a finite number")
+    return number
+
+
+def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame]) -> list[str]:
+    """Returns sentences on files that a finished run of the scenario has and this folder has not."""
+    if scenario.record == "none" or scenario.imaging.fidelity != "rendered":
+        return []
+    table, found = run.folder / "frames" / "frames.csv", []
+    if not table.is_file():
+        found.append(f"{table} is missing: only keyframes are exported, without readings of sensors.")
+    elif scenario.record == "all" and (lost := len(_listed(table)) - len(frames)):
+        n = lost + len(frames)
+        found.append(f"{lost} of {n} left images of {run.folder} are missing; their frames are left out.")
+    keyframes = set(run.keyframes.frames.tolist())
+    if lost := len(keyframes - {frame.index for frame in frames if frame.right is not None}):
+        found.append(f"{lost} of {len(keyframes)} keyframes of {run.folder} lack an image.")
+    if scenario.imu is not None and not (run.folder / "frames" / "imu.csv").is_file():
+        found.append(f"{run.folder / 'frames' / 'imu.csv'} is missing: the readings of the IMU are not exported.")
+    return found
 
 
 def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
@@ -111,7 +154,7 @@ def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
 
 def _imu_table(file: Path) -> Array:
     """Returns the numbers (n, 7) of imu.csv; raises ValueError unless all are finite and their times increase."""
-    header, *lines = file.read_text(encoding="utf-8").splitlines() or [""]
+    header, *lines = file.read_text(encoding="utf-8-sig").splitlines() or [""]
     if header != ",".join(IMU_COLUMNS):
         raise ValueError(f"its first line is {header[:60]!r}")
     rows = [line.split(",") for line in lines]
@@ -119,7 +162,8 @@ def _imu_table(file: Path) -> Array:
     if wrong is not None:
         raise ValueError(f"line {wrong} is incomplete")
     table = np.array(rows, np.float64).reshape(-1, len(IMU_COLUMNS))
-    bad = np.flatnonzero(~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=-np.inf) <= 0))
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if len(bad):
-        raise ValueError(f"line {bad[0] + 2} has a value that is not finite, or a time that does not increase")
+        raise ValueError(f"line {bad[0] + 2} has a value that is not finite")
+    _check_order("time_s", table[:, 0].tolist())
     return table

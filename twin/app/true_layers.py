@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import cv2
 import numpy as np
@@ -55,11 +55,15 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
         TwinError: the file is damaged or lacks the frame with the number `last`.
     """
     try:
+        if not is_zipfile(file):
+            raise ValueError("not an archive of NumPy")
         with np.load(file, allow_pickle=False) as arrays:
             poses, twists = np.asarray(arrays["world_from_camera"]), np.asarray(arrays["twist_body"])
         n = len(poses)
-        if poses.shape != (n, 4, 4) or twists.shape != (n, 6) or n <= last or not np.isfinite(poses).all():
+        if poses.shape != (n, 4, 4) or twists.shape != (n, 6) or n <= last:
             raise ValueError(f"{n} poses, {last + 1} needed")
+        if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
+            raise ValueError("a pose or a velocity is not finite")
         return poses, twists
     except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
         raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
@@ -74,6 +78,9 @@ def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, t
         for number, frame in enumerate(frames):
             pose, twist = poses[frame.index], twists[frame.index]
             recorded = _read(frame.left)
+            if recorded.shape[1::-1] != (mission.rig.width_px, mission.rig.height_px):
+                size = f"{mission.rig.width_px} x {mission.rig.height_px} px, the size of the images of the run"
+                raise TwinError(str(frame.left), f"is {recorded.shape[1]} x {recorded.shape[0]} px", size)
             identical = None
             if frame.index == number < _N_COMPARED:  # the noise of later frames depends on all frames before
                 again = world.camera.capture(pose, frame.right is not None, twist).left

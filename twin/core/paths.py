@@ -27,15 +27,18 @@ def resolved(path: Path) -> Path:
 def path_problem(path: Path) -> str | None:
     """Returns why the file system rejects a path, or None; the path need not exist.
 
-    The reasons are a null byte, excessive length, and a loop of links, or a missing permission in the folders above.
+    The reasons are a null byte, bytes that are not UTF-8, excessive length, a loop of links, a link to a missing file,
+    or a missing permission in the folders above.
     """
     text = str(path)
     if "\0" in text:
         return "contains a null byte"
+    if not text.isprintable() and any("\ud800" <= character <= "\udfff" for character in text):
+        return "is not text in UTF-8"  # OpenCV crashes on such a path
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
-        return None
+        return "is a link to a missing file" if path.is_symlink() else None
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)
     return None

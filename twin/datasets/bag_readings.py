@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Callable
 from itertools import islice
@@ -154,7 +155,7 @@ def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str
 def _states_orientation(message: Any) -> bool:
     """Returns whether a message Imu has a unit quaternion whose covariance does not mark it as not measured (-1)."""
     q = message.orientation
-    norm = np.linalg.norm([q.w, q.x, q.y, q.z])
+    norm = math.hypot(q.w, q.x, q.y, q.z)
     return bool(message.orientation_covariance[0] >= 0 and abs(norm - 1) <= _UNIT_QUATERNION)
 
 
@@ -232,7 +233,7 @@ def _attitude(message: Any, place: str) -> tuple[Array, Array]:
     quaternion = np.array([q.w, q.x, q.y, q.z])
     if not np.isfinite(quaternion).all():
         return np.full(3, np.nan), variances
-    if abs(np.linalg.norm(quaternion) - 1) > _UNIT_QUATERNION:
+    if abs(math.hypot(*quaternion) - 1) > _UNIT_QUATERNION:
         shown = ", ".join(f"{value:g}" for value in quaternion)
         raise TwinError(place, f"the orientation is {shown} (w, x, y, z)", "a unit quaternion")
     return geometry.rpy_from_rotation(geometry.rotation_from_wxyz(quaternion)), variances

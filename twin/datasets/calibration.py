@@ -14,6 +14,7 @@ from twin.errors import TwinError
 
 _MOST_PX = 16384  # largest side of an image
 _LONGEST_BASELINE_M = 10.0
+_SHORTEST_FOCAL = 0.05  # smallest focal length as a fraction of the image size; a fisheye lens of 180 degrees has 0.3
 _ORTHONORMAL = 1e-3  # largest deviation of a rotation matrix from an orthonormal one (calibration files round)
 
 
@@ -67,6 +68,10 @@ class StereoCalibration:
             if given is not None and given != size:
                 problem = f"the {name} camera is calibrated for images of {given[0]} x {given[1]} px"
                 raise TwinError(str(self.file), problem, f"{width_px} x {height_px} px, the size of the images")
+            fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
+            if min(fx / width_px, fy / height_px) < _SHORTEST_FOCAL:
+                problem = f"the focal length of the {name} camera is {fx:g}, {fy:g} px"
+                raise TwinError(str(self.file), problem, f"at least {_SHORTEST_FOCAL:g} of the image size")
             cx, cy = camera.matrix[0, 2], camera.matrix[1, 2]
             if not (0 < cx < width_px and 0 < cy < height_px):
                 problem = f"the principal point ({cx:.1f}, {cy:.1f}) px of the {name} camera is outside the images"
@@ -119,7 +124,8 @@ def _check_camera(file: str, name: str, camera: RecordedCamera) -> None:
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.isfinite(distortion).all():
         raise TwinError(file, f"the matrix or the distortion of the {name} camera is not a set of finite numbers")
     if not (0 < matrix[0, 0] < 1e6 and 0 < matrix[1, 1] < 1e6):
-        raise TwinError(file, f"the focal length of the {name} camera is not positive", "focal lengths in pixels")
+        shown = f"{matrix[0, 0]:g}, {matrix[1, 1]:g}"
+        raise TwinError(file, f"the focal length of the {name} camera is {shown} px", "positive numbers up to 1e6 px")
     allowed = (0, 4) if camera.kind == "fisheye" else (0, 4, 5, 8, 12, 14)
     if len(distortion) not in allowed:
         counts = ", ".join(map(str, allowed))

@@ -17,6 +17,7 @@ from twin.errors import TwinError
 #: Names of the keys of an OpenCV file, in lower case without underscores: camera matrices and distortions.
 _MATRIX_KEYS = [("m1", "k1", "cameramatrix1", "leftcameramatrix"), ("m2", "k2", "cameramatrix2", "rightcameramatrix")]
 _DISTORTION_KEYS = [("d1", "distcoeffs1", "leftdistortion"), ("d2", "distcoeffs2", "rightdistortion")]
+_LARGEST = 1e12  # largest absolute value of a number in a calibration file
 _SIZE_KEYS = ("imagesize", "size", "resolution")
 _FISHEYE = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannala_brandt")
 _RADTAN = ("radtan", "plumb_bob", "radial-tangential", "rational_polynomial", "pinhole", "none", "opencv")
@@ -193,7 +194,7 @@ def _table(value: Any, file: Path) -> Mapping[str, Any]:
 
 
 def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Returns a list of finite numbers as an array, of a shape if it is given.
+    """Returns a list of numbers as an array, of a shape if it is given.
 
     Raises:
         TwinError: the value is not such a list, or has another number of numbers; the message names the key.
@@ -203,7 +204,7 @@ def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = N
     except (TypeError, ValueError):
         array = np.array(np.nan)
     count = None if shape is None else int(np.prod(shape))
-    if value is None or not np.isfinite(array).all() or (count is not None and array.size != count):
+    if value is None or not (np.abs(array) < _LARGEST).all() or (count is not None and array.size != count):
         raise TwinError(str(file), f"{key} is missing or not valid", f"{count or 'finite'} numbers")
     return array if shape is None else array.reshape(shape)
 

@@ -20,6 +20,7 @@ from twin.errors import TwinError
 #: Largest time between the two images of a stereo pair: as a fraction of the median interval between left images, and
 #: absolute [s].
 _PAIR_SHARE, _PAIR_MOST_S = 0.25, 0.01
+_LATEST_S, _SHORTEST_S = 1e11, 1e-5  # latest time, and shortest median interval of the frames of a data set [s]
 T = TypeVar("T")
 
 
@@ -100,6 +101,20 @@ class Reader(Protocol):
             TwinError: another file of the data set is missing or damaged.
         """
         ...
+
+
+def check_times(dataset: Dataset) -> None:
+    """Raises TwinError unless the times of the frames may be seconds."""
+    times_s = np.array([frame.time_s for frame in dataset.images], np.float64)
+    wrong = np.flatnonzero(~(np.abs(times_s) <= _LATEST_S))
+    if len(wrong):
+        problem = f"the time of {dataset.images[int(wrong[0])].left.name[:100]} is {times_s[wrong[0]]:g} s"
+        raise TwinError(str(dataset.folder), problem, f"seconds, up to {_LATEST_S:g}")
+    intervals = np.abs(np.diff(times_s))
+    intervals = intervals[intervals > 0]
+    if len(intervals) and (interval_s := float(np.median(intervals))) < _SHORTEST_S:
+        problem = f"the median interval between its frames is {interval_s:g} s"
+        raise TwinError(str(dataset.folder), problem, f"times in seconds, at least {_SHORTEST_S:g} s apart")
 
 
 def value_or_error(read: Callable[[], T]) -> T | TwinError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ class EurocReader:
         body = value_or_error(lambda: _body_from_left(root))
         body_from_left = None if isinstance(body, TwinError) else body
         truth, notes = None, ()
-        file = next((root / name / "data.csv" for name in _TRUTH if (root / name / "data.csv").is_file()), None)
+        file = next((root / name / "data.csv" for name in _TRUTH if (root / name / "data.csv").exists()), None)
         if file is not None and body_from_left is not None:
             truth = value_or_error(lambda: camera_truth(file, body_from_left))
         elif file is not None:
@@ -87,7 +88,7 @@ def _image_times(camera: Path) -> list[ImageTime]:
     """
     images, source = [], camera / "data.csv"
     for number, parts in text_rows(source):
-        if len(parts) < 2 or not parts[0].strip().isdecimal():
+        if len(parts) < 2 or not re.fullmatch(r"\d{1,19}", parts[0].strip()):
             raise TwinError(f"{source}:{number}", "is not a time and a file name", "timestamp [ns],filename")
         images.append(ImageTime(int(parts[0]) * 1e-9, inside(camera / "data", parts[1].strip(), source)))
     return images

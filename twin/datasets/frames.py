@@ -18,6 +18,7 @@ from twin.datasets.rectification import Rectification, rectification
 from twin.errors import TwinError
 
 _OUT_OF_ORDER = "time out of order"
+_N_SIZES = 5  # number of readable images whose sizes are compared
 _NOMINAL_HZ = 1.0  # frame rate of a data set without two frames at different times
 
 
@@ -41,7 +42,7 @@ class RecordedFrames:
 
     def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
         self.dataset = dataset
-        self.size_px = _first_size(dataset)
+        self.size_px = _usual_size(dataset)
         self.rectification: Rectification = rectification(
             calibration.for_images(*self.size_px), _frame_rate_hz(dataset)
         )
@@ -131,15 +132,24 @@ def increasing(times_s: Array) -> NDArray[np.bool_]:
     return kept
 
 
-def _first_size(dataset: Dataset) -> tuple[int, int]:
-    """Returns (width, height) of the first readable left image [px]; raises TwinError if no image is readable."""
-    problem = ""
+def _usual_size(dataset: Dataset) -> tuple[int, int]:
+    """Returns the most frequent (width, height) of the first readable left images [px].
+
+    Raises:
+        TwinError: no image is readable.
+    """
+    sizes, problem = Counter[tuple[int, int]](), ""
     for frame in dataset.images:
         try:
-            return image_size(frame.left)
+            sizes[image_size(frame.left)] += 1
         except UnreadableImage as error:
             problem = problem or f"{frame.left.name}: {error}"
-    raise TwinError(str(dataset.folder), f"has no readable left image ({problem})", "PNG, JPEG or TIFF")
+        if sizes.total() == _N_SIZES:
+            break
+    if not sizes:
+        allowed = "grey or RGB images with 8 or 16 bits; files: PNG, JPEG or TIFF"
+        raise TwinError(str(dataset.folder), f"has no readable left image ({problem})", allowed)
+    return sizes.most_common(1)[0][0]
 
 
 def _frame_rate_hz(dataset: Dataset) -> float:

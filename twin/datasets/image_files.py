@@ -81,7 +81,10 @@ def image_size(image: ImageSource) -> tuple[int, int]:
     Raises:
         UnreadableImage: the image is missing, damaged, too large or of an unknown encoding.
     """
-    return encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
+    width, height = encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
+    if width * height > _MOST_PIXELS:
+        raise UnreadableImage("too many pixels")
+    return width, height
 
 
 def encoded_size(data: bytes) -> tuple[int, int]:
@@ -154,7 +157,9 @@ def _header(data: bytes) -> tuple[int, int, str]:
             warnings.simplefilter("ignore")  # on damaged metadata, which are not used
             image = PillowImage.open(io.BytesIO(data), formats=("PNG", "JPEG", "TIFF"))
         return image.width, image.height, str(image.format)
-    except (OSError, ValueError, SyntaxError, PillowImage.DecompressionBombError):
+    except PillowImage.DecompressionBombError:
+        raise UnreadableImage("too many pixels") from None
+    except (OSError, ValueError, SyntaxError):
         raise UnreadableImage("no image" if data else "empty file") from None
 
 

@@ -88,6 +88,8 @@ def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
     projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
     try:
         left, right = (np.array(projections[f"P{k}"], float).reshape(3, 4) for k in (number, number + 1))
+        if not (np.isfinite([left, right]).all() and left[2, 2] and right[2, 2]):
+            raise ValueError
         in_left, in_right = (np.linalg.solve(p[:, :3], p[:, 3]) for p in (left, right))
     except (KeyError, ValueError, np.linalg.LinAlgError):
         allowed = f"P{number} and P{number + 1}, each with 12 numbers"

@@ -32,10 +32,13 @@ class PlainFolderReader:
         """Returns the data set in a folder.
 
         Raises:
-            TwinError: the list of times is damaged, or an image folder is not valid (`image_files`).
+            TwinError: there are no images, the list of times is damaged, or an image folder is not valid
+                (`image_files`).
         """
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
+        if not names:
+            raise TwinError(str(folder), "has no images of the left camera or of the right one", ", ".join(SUFFIXES))
         times_s, notes = _times(folder / "times.txt", names)
         frames = [
             StereoImages(time_s, left[name], right.get(name))
@@ -58,7 +61,7 @@ def _calibration(folder: Path) -> StereoCalibration | None:
 
 
 def image_files(folder: Path) -> dict[str, Path]:
-    """Returns the image files of a folder, by file name without suffix.
+    """Returns the image files of a folder, by file name without suffix; hidden files (".NAME") are ignored.
 
     Raises:
         TwinError: an image is a symbolic link that leads out of the folder, or two images have the same name without
@@ -67,7 +70,8 @@ def image_files(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         return {}
     found: dict[str, Path] = {}
-    for file in sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES):
+    files = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    for file in sorted(files):
         if file.stem in found:
             raise TwinError(str(folder), f"has several images called {file.stem[:100]!r}", "one suffix per name")
         found[file.stem] = inside(folder, file.name, folder)
@@ -85,7 +89,7 @@ def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
     Raises:
         TwinError: times.txt is damaged or does not have one time per image.
     """
-    if file.is_file():
+    if file.exists():
         times_s = read_table(file, 1)[:, 0].tolist()
         if len(times_s) != len(names):
             raise TwinError(str(file), f"has {len(times_s)} times", f"{len(names)}, one per image")

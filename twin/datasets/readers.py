@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from twin.core.paths import path_problem
 from twin.datasets.bag_reader import BagReader, BagTopics
-from twin.datasets.dataset import Dataset, Reader
+from twin.datasets.dataset import Dataset, Reader, check_times
 from twin.datasets.euroc import EurocReader
 from twin.datasets.kitti import KittiReader
 from twin.datasets.plain_folder import PlainFolderReader
@@ -88,6 +89,8 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
         TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera, or a
             file of the data set is damaged.
     """
+    if problem := path_problem(folder):
+        raise TwinError(ascii(str(folder))[1:201], problem, "the folder or the bag of a data set")
     if not folder.exists():
         raise TwinError(str(folder), "does not exist", "the folder or the bag of a data set")
     if folder.is_dir() and not any(folder.iterdir()):
@@ -98,6 +101,7 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
             dataset = reader.read(folder)
             if not dataset.images:
                 raise TwinError(str(folder), "has no images of the left camera", reader.layout)
+            check_times(dataset)
             return dataset, reader.name
     layouts = "; ".join(f"{reader.name}: {reader.layout}" for reader in readers)
     raise TwinError(str(folder), "has no layout that a reader knows", layouts)

@@ -12,6 +12,9 @@ from twin.core.geometry import Array
 from twin.datasets.text_files import read_numbered_table, read_yaml
 from twin.errors import TwinError
 
+#: Smallest and largest standard deviation of a reading, as fractions of the largest value.
+_SIGMA_SHARES = 1e-12, 1e6
+
 
 class SensorQuantity(NamedTuple):
     """A measured quantity.
@@ -121,10 +124,11 @@ def checked_series(
         problem = f"the {quantity.name} is {values[k, column]:g} {quantity.unit}"
         allowed = f"-{quantity.largest:g} to {quantity.largest:g} {quantity.unit}"
         raise TwinError(recorded.place(int(kept[k])), problem, allowed)
-    if not (np.isfinite(sigmas).all() and (sigmas > 0).all()):
+    low, high = (share * quantity.largest for share in _SIGMA_SHARES)
+    if not ((sigmas >= low) & (sigmas <= high)).all():
         shown = ", ".join(f"{sigma:g}" for sigma in sigmas)
         problem = f"the standard deviations of the {quantity.name} are {shown}"
-        raise TwinError(recorded.place(0), problem, "positive numbers")
+        raise TwinError(recorded.place(0), problem, f"positive numbers, {low:g} to {high:g} {quantity.unit}")
     return SensorSeries(times_s, values, sigmas)
 
 
@@ -146,8 +150,8 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
     notes: list[str] = []
     for quantity in (HEIGHT, ATTITUDE, VELOCITY):
         file = root / quantity.folder / "data.csv"
-        sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.is_file() else None
-        if file.is_file() and sigmas is None:
+        sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.exists() else None
+        if file.exists() and sigmas is None:
             notes.append(f"The readings in {quantity.folder} are not used: sensor.yaml states no `sigma`.")
         found.append(None if sigmas is None else _read_csv(file, quantity, sigmas, notes))
     height, attitude, velocity = found

@@ -47,6 +47,7 @@ from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder, SurveyRecord
 _SEGMENT_SHARE, _SEGMENT_KEYFRAMES = 0.3, (10, 100)
 ESTIMATOR_OPTION = "--estimator"  # option of `twin replay` that names a plug-in
 _MOST_RESIDUAL = 2.0  # largest RMS of the residuals of readings [standard deviations] without a warning
+_FARTHEST_M = 1e8  # largest coordinate of a true position; in UTM and ECEF they are up to 1e7 m
 _MOST_UNUSED = 0.1  # largest fraction of unusable frames of a complete replay
 _ALL_TRACKS = 1000  # every earlier node may be linked to a new one: there is no plan that says where loops close
 
@@ -282,6 +283,8 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
     left, right = options.topics or (None, None)
     dataset, reader = read_dataset(folder, BagTopics(left, right, str(options.truth) if in_bag else None))
+    if options.topics is not None and not is_bag(folder):
+        raise TwinError("--topics", f"{folder} is not a ROS 2 bag", "no topics for other data sets")
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
     if isinstance(calibration, TwinError):
         raise calibration
@@ -292,7 +295,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     first = frames.first_pair()
     pair = inspect_pair(first, frames.rectification.rig, options.settings)
     if pair.swapped:
-        problem = "the left and the right images are swapped: the disparities of the first pair are negative"
+        problem = "the left and the right images are swapped, or both upside down: the disparities are negative"
         raise TwinError(str(folder), problem, "left images of the camera on the left")
     plane = floor_plane(pair.points)
     if plane is None:
@@ -327,6 +330,7 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
         raise truth
     if truth is None:
         return None
+    truth = _ordered(truth, str(file or dataset.folder))
     moved = Trajectory(
         truth.times_s - frames.start_s, truth.world_from_camera @ frames.rectification.left_from_rectified
     )
@@ -337,6 +341,19 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
         source = str(file or dataset.folder)
         raise TwinError(source, f"the truth is of another clock: {span}", f"the times of the frames, {given}")
     return moved
+
+
+def _ordered(truth: Trajectory, source: str) -> Trajectory:
+    """Returns true poses in the order of time, the first one where several have the same time.
+
+    Raises:
+        TwinError: a position is impossible.
+    """
+    largest_m = float(np.abs(truth.positions).max(initial=0.0))
+    if not largest_m <= _FARTHEST_M:
+        raise TwinError(source, f"a coordinate of a true position is {largest_m:g} m", f"up to {_FARTHEST_M:g} m")
+    times_s, first = np.unique(truth.times_s, return_index=True)
+    return Trajectory(times_s, truth.world_from_camera[first])
 
 
 def _estimate(opened: OpenedDataset, navigator: Navigator, progress: Progress) -> None:

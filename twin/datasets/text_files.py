@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,11 +19,33 @@ from twin.errors import TwinError
 
 _MOST_BYTES = 256 * 2**20  # largest list of images or poses
 _MOST_YAML_BYTES = 2**20
+_MOST_VALUES = 100_000  # values in a YAML file, aliases expanded
 _MOST_ELEMENTS = 64  # largest matrix of a calibration file
 
 
 class _CalibrationLoader(yaml.SafeLoader):
     """Loader of YAML without code, which also reads the matrices that OpenCV writes."""
+
+    def construct_document(self, node: yaml.Node) -> Any:
+        """Returns the contents of a document; raises YAMLError if its aliases expand to too many values."""
+        if _n_values(node, {}) > _MOST_VALUES:
+            raise yaml.YAMLError(f"it has more than {_MOST_VALUES} values, or a value that contains itself")
+        return super().construct_document(node)
+
+
+def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
+    """Returns the number of values in a node, aliases expanded; infinite for a node that contains itself.
+
+    Args:
+        node: the node.
+        known: numbers of nodes that were counted before, by identity; it is extended.
+    """
+    if id(node) not in known:
+        known[id(node)] = math.inf  # while its children are counted
+        pairs = node.value if isinstance(node, yaml.MappingNode) else ()
+        children = node.value if isinstance(node, yaml.SequenceNode) else [child for pair in pairs for child in pair]
+        known[id(node)] = 1 + sum(_n_values(child, known) for child in children)
+    return known[id(node)]
 
 
 def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
@@ -175,7 +198,10 @@ def inside(folder: Path, name: str, source: Path) -> Path:
     Raises:
         TwinError: the path leads out of the folder.
     """
+    base = resolved(folder)
+    if "\0" not in name and name == Path(name).name != ".." and not (base / name).is_symlink():
+        return base / name  # the common case, without resolving the path again
     path = resolved(folder / name)
-    if "\0" in name or not path.is_relative_to(resolved(folder)):
+    if "\0" in name or not path.is_relative_to(base):
         raise TwinError(str(source), f"{name[:100]!r} leads out of the folder", f"files in {folder}")
     return path

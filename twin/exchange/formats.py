@@ -20,7 +20,10 @@ _MISSING = {
     "poses": ("has neither a true nor a final trajectory", "a run with trajectory_truth.tum or trajectory_final.tum"),
     "map": ("has no elevation map", "a run with dem.tif"),
     "truth": ("has no true trajectory", "a simulated run, or a replay with --truth"),
-    "world": ("has no simulated world", "a run of `twin run` with rendered images"),
+    "world": (
+        "has no simulated world or no frames/truth.npz",
+        "a run of `twin run` with rendered images, whose record is not none",
+    ),
 }
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
+from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
 from twin.core.orthomosaic import OrthoTile
@@ -34,6 +35,7 @@ _ORIGIN_TAGS = ("SCENE_ORIGIN_EASTING", "SCENE_ORIGIN_NORTHING", "SCENE_ORIGIN_E
 _UNIT_TAG = "SCENE_METRES_PER_UNIT"
 _UNKNOWN_DATUM = "same as the source DEM"  # tag of a vertical datum that the source does not name
 _ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include the elevation of the scene origin
+_LARGEST_COORDINATE = 1e8  # of the origin of a scene, in the unit of its CRS
 _DECIMALS = 6  # to which scene coordinates [m] are rounded; CRS coordinates have up to seven digits before the point
 
 
@@ -177,7 +179,7 @@ def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeferenc
         origin: easting and northing in the unit of the CRS, and elevation [m] of the scene origin.
 
     Raises:
-        TwinError: the CRS is unknown or not projected.
+        TwinError: the CRS is unknown or not projected, or the origin is outside of it.
     """
     try:
         known = CRS.from_user_input(crs)
@@ -185,7 +187,18 @@ def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeferenc
         raise TwinError("--crs", f"{crs[:60]!r} is not a CRS: {error}", "such as EPSG:32633") from None
     if not known.is_projected:
         raise TwinError("--crs", f"{crs[:60]!r} is not a projected CRS", "a CRS with eastings and northings")
+    if max(map(abs, origin)) > _LARGEST_COORDINATE or not _is_on_earth(known, origin):
+        raise TwinError("--origin", f"{origin[0]:g}, {origin[1]:g} is outside the CRS", "E,N or E,N,H in the CRS")
     return Georeference(*origin, crs_wkt=known.to_wkt(), metres_per_unit=float(known.linear_units_factor[1]))
+
+
+def _is_on_earth(crs: CRS, origin: tuple[float, float, float]) -> bool:
+    """Returns whether a position in a projected CRS has a latitude and a longitude."""
+    try:
+        (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [origin[0]], [origin[1]])[:2]
+    except Exception:  # rasterio raises errors of GDAL, which it does not export
+        return False
+    return bool(np.isfinite([longitude, latitude]).all())
 
 
 def crs_of(georeference: Georeference | None) -> CRS:

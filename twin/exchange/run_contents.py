@@ -190,6 +190,7 @@ class RunContents:
         imu: readings of the IMU; None if none were recorded.
         jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: copies of the PNG files.
         progress: called with the completed fraction of the format that is being written, 0 to 1.
+        notes: sentences on files of the run that are missing.
     """
 
     folder: Path
@@ -209,6 +210,7 @@ class RunContents:
     imu: RecordedImu | None = None
     jpeg_quality: int | None = None
     progress: Callable[[float], None] = field(default=lambda _: None)
+    notes: tuple[str, ...] = ()
 
     @property
     def pairs(self) -> tuple[RecordedFrame, ...]:

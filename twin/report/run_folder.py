@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 
-from twin.core.paths import is_file
+from twin.core.paths import is_file, path_problem
 from twin.core.records import Array, MapGrid, Trajectory
 from twin.errors import TwinError
 from twin.exchange import geotiff
@@ -111,6 +111,8 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     folder = Path(folder)
+    if problem := path_problem(folder):
+        raise TwinError(ascii(str(folder))[1:201], problem, "the folder of a run")
     if not is_file(folder / SCENARIO_FILE):
         raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
     return Run(
