@@ -90,7 +90,7 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
             file of the data set is damaged.
     """
     if problem := path_problem(folder):
-        raise TwinError(ascii(str(folder))[1:201], problem, "the folder or the bag of a data set")
+        raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder or the bag of a data set")
     if not folder.exists():
         raise TwinError(str(folder), "does not exist", "the folder or the bag of a data set")
     if folder.is_dir() and not any(folder.iterdir()):

@@ -112,7 +112,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
     """
     folder = Path(folder)
     if problem := path_problem(folder):
-        raise TwinError(ascii(str(folder))[1:201], problem, "the folder of a run")
+        raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder of a run")
     if not is_file(folder / SCENARIO_FILE):
         raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
     return Run(
