@@ -14,7 +14,7 @@ import pytest
 import recorded_datasets as recorded
 from recorded_datasets import RIG
 
-from twin.app.outputs import new_folder
+from twin.app.outputs import new_folder, writing
 from twin.core import geometry
 from twin.core.records import Frame
 from twin.datasets import image_files
@@ -574,3 +574,24 @@ def test_a_path_that_is_not_utf8_is_refused_before_opencv_crashes_on_it(tmp_path
         with pytest.raises(TwinError, match=r"udcff.udcfe.*: is not text in UTF-8") as error:
             check(path)
         assert str(error.value).isascii()
+
+
+def test_an_unreadable_folder_is_one_line_with_its_name(tmp_path, monkeypatch):
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(recorded.poses(1)))
+
+    def refused(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "iterdir", lambda path: refused(path) if path.name == "left" else iter([path]))
+    with pytest.raises(TwinError, match="set/left: cannot be read: Permission denied"):
+        read_dataset(folder)
+
+
+def test_an_error_of_another_file_does_not_blame_the_output(tmp_path):
+    cases = {
+        "/run/image.png": "/run/image.png: cannot be read or written: Permission denied",
+        str(tmp_path / "out" / "a"): "--out: .*out cannot be written: Permission denied",
+    }
+    for named, problem in cases.items():
+        with pytest.raises(TwinError, match=problem), writing(tmp_path / "out"):
+            raise PermissionError(13, "Permission denied", named)

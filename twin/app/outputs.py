@@ -45,10 +45,16 @@ def output_file(file: Path, option: str = "--out") -> Path:
 
 @contextmanager
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
-    """Converts an OSError in this context to a TwinError, which states that the user's `path` cannot be written."""
+    """Converts an OSError in this context to a TwinError, which states that the user's `path` cannot be written.
+
+    An error that names a file elsewhere is reported as one of this file.
+    """
     try:
         yield
     except OSError as error:
+        if error.filename is not None and not resolved(Path(str(error.filename))).is_relative_to(resolved(path)):
+            problem = f"cannot be read or written: {error.strerror or error}"
+            raise TwinError(str(error.filename), problem, "a file that permits it") from None
         raise TwinError(option, f"{path} cannot be written: {error.strerror or error}", "a writable path") from None
 
 

@@ -98,7 +98,11 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
     readers = all_readers(topics)
     for reader in readers:
         if reader.recognises(folder):
-            dataset = reader.read(folder)
+            try:
+                dataset = reader.read(folder)
+            except OSError as error:
+                problem = f"cannot be read: {error.strerror or error}"
+                raise TwinError(str(error.filename or folder), problem, "readable files and folders") from None
             if not dataset.images:
                 raise TwinError(str(folder), "has no images of the left camera", reader.layout)
             check_times(dataset)
