@@ -5,13 +5,14 @@ import pytest
 from twin.core.paths import path_problem
 
 
-def test_a_link_to_itself_is_a_problem_and_a_link_to_nothing_is_none(tmp_path):
+def test_links_to_themselves_and_to_missing_files_are_problems_and_new_paths_are_not(tmp_path):
     loop, dangling = tmp_path / "loop", tmp_path / "dangling"
     loop.symlink_to("loop")
     dangling.symlink_to("nothing")
     for path in (loop, loop / "run"):
         assert "symbolic links" in (path_problem(path) or "")
-    for path in (dangling, tmp_path, tmp_path / "new" / "run"):
+    assert "missing file" in (path_problem(dangling) or "")
+    for path in (tmp_path, tmp_path / "new" / "run"):
         assert path_problem(path) is None
 
 
