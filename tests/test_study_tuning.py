@@ -133,6 +133,20 @@ def test_a_plan_without_sampled_keys_is_confirmed_with_as_many_different_surveys
     assert len({survey.scenario_hash for survey in surveys}) == len(surveys) == 4  # tune.confirm
 
 
+def test_a_parameter_with_one_value_does_not_repeat_surveys_in_the_confirmation(tmp_path):
+    text = TUNING.replace("{ uniform = [4.0, 6.0] }", "{ choice = [5.0] }").replace("samples = 2", "samples = 3")
+    study = study_of(tmp_path, text)
+    values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
+    searched = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    for survey in searched.surveys(0, values):
+        searched.add(fly(survey))
+    assert searched.evaluate(0, values).pass_probability == wilson_interval(1, 1)  # three times the same survey
+    confirmation = searched.confirmation(())
+    for survey in confirmation.surveys(0, values):
+        confirmation.add(fly(survey))
+    assert confirmation.evaluate(0, values).pass_probability == wilson_interval(12, 12)  # tune.confirm is 4
+
+
 @pytest.mark.filterwarnings("error")  # scipy warns if a Sobol design has another number of points
 @pytest.mark.parametrize(("method", "n_search"), [("sobol", 2), ("saltelli", 6), ("lhs", 2)])
 @pytest.mark.parametrize("factor", [3, 4])

@@ -114,8 +114,9 @@ class CandidateSurveys:
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
         """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new seeds.
 
-        Sampled keys have new samples. The designs "sobol" and "saltelli" need a power of 2 as number of samples; for
-        another number, the samples are those of "lhs".
+        Sampled keys have new samples, each with its own seeds: with shared seeds, samples of a parameter with few
+        values would repeat surveys, and all samples would be on the same few floors. The designs "sobol" and "saltelli"
+        need a power of 2 as number of samples; for another number, the samples are those of "lhs".
 
         Args:
             rows: rows of the surveys flown so far.
@@ -124,7 +125,7 @@ class CandidateSurveys:
         n_axes = len(axis_names(self.study))
         count = "samples" if sampling.method != "grid" and n_axes > 0 else "seeds"
         n = (getattr(sampling, count) or 1) * self.config.confirm
-        update: dict[str, Any] = {"seed": sampling.seed + _CONFIRM_SEEDS, count: n}
+        update: dict[str, Any] = {"seed": sampling.seed + _CONFIRM_SEEDS, "paired": False, count: n}
         if count == "samples" and sampling.method in _POWER_OF_2 and n & (n - 1):
             points = n * (n_axes + 2) if sampling.method == "saltelli" else n
             update |= {"method": "lhs", "samples": points}
@@ -209,9 +210,19 @@ class CandidateSurveys:
                     self.add(survey)
 
     def scores(self, number: int, values: dict[str, Any]) -> list[SurveyScore]:
-        """Returns the results of a candidate's surveys that were flown or refused; surveys that failed are left out."""
-        flown = [self._scores[key] for key in self.keys(number, values) if key in self._scores]
-        return [score for score in flown if score.status != "failed"]
+        """Returns the results of a candidate's surveys that were flown or refused.
+
+        Surveys that failed are left out. Surveys of the same scenario with the same seed are identical and count once.
+        """
+        known = [(key, self._scores[key]) for key in self.keys(number, values) if self._has_result(key)]
+        return list({(score.scenario_hash or key, key[1]): score for key, score in known}.values())
+
+    def n_failed(self, number: int, values: dict[str, Any]) -> int:
+        """Returns the number of surveys of a candidate without a result: they failed or were not flown."""
+        return sum(not self._has_result(key) for key in self.keys(number, values))
+
+    def _has_result(self, key: tuple[int, int]) -> bool:
+        return key in self._scores and self._scores[key].status != "failed"
 
     def keys(self, number: int, values: dict[str, Any]) -> list[tuple[int, int]]:
         """Returns (sample, seed) of every survey of a candidate."""

@@ -64,6 +64,7 @@ def verification_of(
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
+    n_failed = rendered.n_failed(number, values)
     n_complete = sum(score.status == "complete" for score in scores)
     ratio = PlanRatio(
         values,
@@ -73,9 +74,9 @@ def verification_of(
     return Verification(
         surrogate,
         rendered.evaluate(number, values),
-        rendered.n_surveys,
+        len(scores) + n_failed,
         sum(score.passed for score in scores),
-        rendered.n_surveys - len(scores),
+        n_failed,
         medians,
         ratio,
         search_round,
