@@ -18,7 +18,7 @@ def footprint_grid(result: SurveyResult, rig: StereoRig) -> MapGrid:
     cells.
 
     Args:
-        result: result of a survey with at least one keyframe.
+        result: result of a survey with at least one keyframe, whose final trajectory is in the axes of the map.
         rig: calibration of the images.
     """
     depth_m = result.keyframe_depth_m
